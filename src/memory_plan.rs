@@ -355,7 +355,8 @@ impl ResourceEstimate {
         self.per_gaussian.iter().map(|&(_, bytes)| bytes).sum()
     }
 
-    fn bytes(&self, work: &Workload) -> u64 {
+    /// Bytes that the stage takes for such an input.
+    pub(crate) fn bytes(&self, work: &Workload) -> u64 {
         let fixed: u64 = self.fixed.iter().map(|&(_, bytes)| bytes).sum();
         work.gaussians.saturating_mul(work.input.per_gaussian + self.of_gaussian()).saturating_add(fixed)
     }

@@ -7,8 +7,9 @@ use crate::files::atomic::{Kind, Replace, StagedFile, check_target};
 use crate::journal::Journal;
 use crate::memory_plan::Workload;
 use crate::outputs::rows::RowTable;
-use crate::pipeline::open_to_measure;
-use crate::pipeline::stages::measure::{InputMeta, Measure};
+use crate::pipeline::planning::InputMeta;
+use crate::pipeline::stages::measure::Measure;
+use crate::pipeline::{RunPlan, open_to_measure};
 use crate::pruning::score::UserOverrides;
 use crate::recipe::Recipe;
 use crate::scene::InputOptions;
@@ -22,10 +23,11 @@ pub fn score(input: &InputOptions, output: &Path, recipe: &Recipe, overwrite: Re
     }
     check_target(output, Kind::File, &[&input.path], overwrite)?;
     let journal = &mut Journal::default();
-    let plan =
-        |outlook: InputMeta, _: &Workload| Ok(Measure::new(recipe, outlook.has_cameras, UserOverrides::default()));
-    let (scene, measure, arrived) = open_to_measure(input, plan, journal)?;
-    let scored = measure.run(&scene, arrived, journal)?;
+    let plan = |meta: InputMeta, _: &Workload| {
+        Ok(RunPlan::to_measure(Measure::new(recipe, meta.has_cameras, UserOverrides::default()), meta))
+    };
+    let (scene, plan, arrived) = open_to_measure(input, plan, journal)?;
+    let scored = plan.measure.measure(&scene, arrived, journal)?;
     let scores = scored.scores(&recipe.score)?;
     let rows = scored.rows()?;
     let table = RowTable {

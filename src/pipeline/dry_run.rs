@@ -14,10 +14,11 @@ use crate::journal::records::Forecast;
 use crate::journal::records::LeftOut;
 use crate::memory_plan::{Budget, Plan, Verbosity, Workload};
 use crate::outputs::kind::OutputKind;
-use crate::pipeline::plan::Job;
-use crate::pipeline::stages::measure::{InputMeta, Stages};
+use crate::pipeline::plan::RunPlan;
+use crate::pipeline::planning::InputMeta;
+use crate::pipeline::stage::MeasuredOnArrival;
 use crate::pipeline::stages::write::beside_names;
-use crate::pipeline::throughput::measured;
+use crate::pipeline::throughput::forecast;
 use crate::scene::{InputOptions, open_scene};
 
 /// What a run would do.
@@ -45,6 +46,8 @@ pub struct Foreseen {
     pub gaussians: Option<usize>,
     /// What decides how many.
     pub size_by: String,
+    /// How many Gaussians ranking and refinement would leave.
+    pub counts: String,
     /// Where the result would lie.
     pub output: String,
     /// Its kind.
@@ -73,19 +76,19 @@ pub fn foresee(request: &Request) -> Result<Foreseen> {
     let input = InputOptions { work: None, ..request.input.clone() };
     let mut scene = open_scene(&input)?;
     let outlook = InputMeta::from_scene(&scene);
-    let job = Job::within(request, outlook, &scene.workload())?;
-    job.emit.check(&[&request.input.path])?;
-    job.emit.kind.check_frames(scene.source().info().times.len(), &request.output)?;
-    scene.input.check_output(job.emit.kind, &request.output)?;
-    let needs = |work: &Workload, limits: &_| job.needs(work, limits);
+    let run = RunPlan::within_memory(request, outlook, &scene.workload())?;
+    run.check_target(&request.input.path)?;
+    run.check(&scene)?;
+    let needs = |work: &Workload, limits: &_| run.estimates(work, limits);
     let plan = Plan::fit(scene.workload(), Budget { tell: Verbosity::Nothing, ..input.memory }, needs)?;
     scene.follow(&plan);
-    let forecast = measured(&mut scene, &plan, &job, 0)?;
+    let forecast = forecast(&mut scene, &plan, &run, MeasuredOnArrival::default())?;
     let mut journal = Journal::default();
-    job.write_down(request, &scene.workload(), &scene.limits, &mut journal);
+    run.record_left_out(&scene.workload(), &scene.limits, &mut journal);
     let info = scene.source().info();
     let gaussians = request.target.map(|target| target.count(outlook.gaussians)).transpose()?;
     let output = request.output.to_string_lossy().into_owned();
+    let output_kind = OutputKind::from_path(&request.output, request.kind, outlook.own_output);
     Ok(Foreseen {
         tool: TOOL.to_owned(),
         dry_run: true,
@@ -98,9 +101,10 @@ pub fn foresee(request: &Request) -> Result<Foreseen> {
         cameras: CameraSummary::from_scene(&scene),
         gaussians,
         size_by: size_by(request),
-        would_write: std::iter::once(output.clone()).chain(beside_names(&request.output, job.emit.kind)).collect(),
+        would_write: std::iter::once(output.clone()).chain(beside_names(&request.output, output_kind)).collect(),
         output,
-        output_kind: job.emit.kind,
+        output_kind,
+        counts: run.counts_text(),
         forecast,
         left_out: journal.left_out,
         notes: scene.notes,
@@ -148,6 +152,7 @@ impl Foreseen {
             }
             None => writeln!(out, "would keep {}", self.size_by),
         };
+        let _ = writeln!(out, "{}", self.counts);
         let of: f64 = self.forecast.stages.iter().map(|stage| stage.core_seconds).sum();
         for stage in &self.forecast.stages {
             let part = 100.0 * stage.core_seconds / of.max(1e-9);

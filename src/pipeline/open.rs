@@ -22,8 +22,11 @@ use crate::model::{Camera, Picture, Rig, Schedule, Split};
 use crate::models::stream::{AHEAD, Streamed, frame_block};
 use crate::models::trajectories::OWN_OUTPUT;
 use crate::passes::{HeldFrames, Sampler};
-use crate::pipeline::stages::measure::{InputMeta, Measure, Measured, Stages};
-use crate::pipeline::throughput::measured;
+use crate::pipeline::plan::RunPlan;
+use crate::pipeline::planning::InputMeta;
+use crate::pipeline::stage::{Measured, MeasuredOnArrival};
+use crate::pipeline::stages::measure::Measure;
+use crate::pipeline::throughput::forecast;
 use crate::pruning::contribution::RunningContribution;
 use crate::recipe;
 use crate::scene::{
@@ -39,11 +42,11 @@ use crate::statistics::pass::RunningScan;
 ///
 /// # Errors
 /// Whatever is wrong with input, cameras or budget; those of `plan`, before any frame of a stream is read.
-pub fn open_to_measure<S: Stages>(
+pub fn open_to_measure(
     options: &InputOptions,
-    plan: impl FnOnce(InputMeta, &Workload) -> Result<S>,
+    plan: impl FnOnce(InputMeta, &Workload) -> Result<RunPlan>,
     journal: &mut Journal,
-) -> Result<(Scene, S, Option<Measured>)> {
+) -> Result<(Scene, RunPlan, Option<Measured>)> {
     let start = Clock::start();
     let mut scene = if options.is_stream() {
         let normalized = cameras::Clock::Normalized;
@@ -59,34 +62,32 @@ pub fn open_to_measure<S: Stages>(
         open_scene(options)?
     };
     let stages = plan(InputMeta::from_scene(&scene), &scene.workload())?;
-    let plan = Plan::fit(scene.workload(), options.memory, |work, limits| stages.needs(work, limits))?;
+    let plan = Plan::fit(scene.workload(), options.memory, |work, limits| stages.estimates(work, limits))?;
     scene.follow(&plan);
     // What measuring beforehand reads is no part of the plan.
     let reads = scene.source().reads();
-    foretell(&mut scene, &plan, &stages, 0, options, journal)?;
+    foretell(&mut scene, &plan, &stages, MeasuredOnArrival::default(), options, journal)?;
     journal.opened("read", start, scene.source().info().count, reads);
     Ok((scene, stages, None))
-}
-
-/// How many of the first stages are done by what was measured on arrival.
-pub(super) fn measured_already(arrived: &Option<Measured>) -> usize {
-    usize::from(arrived.is_some()) + arrived.iter().filter(|measured| measured.seen.is_some()).count()
 }
 
 /// Says what is to come, if anybody asked.
 fn foretell(
     scene: &mut Scene,
     plan: &Plan,
-    stages: &impl Stages,
-    done: usize,
+    stages: &RunPlan,
+    measured: MeasuredOnArrival,
     options: &InputOptions,
     journal: &mut Journal,
 ) -> Result<()> {
     let tell = options.memory.tell;
     // Of a part nobody knows how much of the run it is.
     let is_part = options.work.as_ref().is_some_and(|work| work.part.is_some());
+    if tell == Verbosity::Plan && stages.output.is_some() {
+        crate::progress::tell(&stages.text());
+    }
     if tell != Verbosity::Nothing && !is_part {
-        let forecast = measured(scene, plan, stages, done)?;
+        let forecast = forecast(scene, plan, stages, measured)?;
         crate::progress::tell(forecast.text(tell).trim_end());
         journal.forecast = Some(forecast);
     }
@@ -95,13 +96,13 @@ fn foretell(
 
 /// Packs a stream that `loaded` looks at into a scratch container and measures it meanwhile, if there is memory for that
 /// beside the frames held. Gives the statistics if what was assumed held.
-fn receive_measured<S: Stages>(
+fn receive_measured(
     stream: FrameStream<Stdin>,
     loaded: Option<Rig>,
     options: &InputOptions,
-    plan: impl FnOnce(InputMeta, &Workload) -> Result<S>,
+    plan: impl FnOnce(InputMeta, &Workload) -> Result<RunPlan>,
     journal: &mut Journal,
-) -> Result<(Scene, S, Option<Measured>)> {
+) -> Result<(Scene, RunPlan, Option<Measured>)> {
     let has_cameras = loaded.is_some();
     let count = stream.header().count;
     let of_rig = loaded.clone().unwrap_or_else(|| cameras::virtual_rig(DVec3::ZERO, 1.0));
@@ -110,13 +111,13 @@ fn receive_measured<S: Stages>(
     let counting = |frames| Workload::of_stream(&header, block, &of_rig, frames);
     let work = counting(0);
     let stages = plan(InputMeta { gaussians: count, has_cameras, own_output: OWN_OUTPUT }, &work)?;
-    let Measure { scan, visible, .. } = stages.measure();
+    let Measure { scan, visible, .. } = &stages.measure;
     let visible = visible.as_ref().filter(|visible| visible.can_look_on_arrival());
     let held = (block + AHEAD) as u64;
     let fit = |tell: Verbosity, measuring: Option<bool>| {
         Plan::fit(work, Budget { tell, ..options.memory }, |work, limits| {
             let mut all = vec![receiving(work, limits, held, measuring, 0)];
-            all.extend(stages.needs(work, limits));
+            all.extend(stages.estimates(work, limits));
             all
         })
     };
@@ -133,7 +134,7 @@ fn receive_measured<S: Stages>(
         Plan::closest(work, budget, |work, _| vec![receiving(work, &limits, held, measuring, frames)]).peak()
     };
     let mut room = FrameQuota::new(options.memory, |budget, frames| {
-        let later = Plan::closest(counting(frames), budget, |work, limits| stages.needs(work, limits));
+        let later = Plan::closest(counting(frames), budget, |work, limits| stages.estimates(work, limits));
         later.peak().max(receive(budget, None, frames))
     });
     let to_measure =
@@ -173,7 +174,7 @@ fn receive_measured<S: Stages>(
     let mut scene = scene_of(opened, options)?;
     // Now that the frames are counted.
     let counted = Budget { tell: Verbosity::Nothing, ..options.memory };
-    let later = Plan::fit(scene.workload(), counted, |work, limits| stages.needs(work, limits))?;
+    let later = Plan::fit(scene.workload(), counted, |work, limits| stages.estimates(work, limits))?;
     scene.follow(&later);
     if measures && measuring.is_none() && room.arrived() > 0 {
         let note = format!(
@@ -188,7 +189,7 @@ fn receive_measured<S: Stages>(
             None => {
                 let found = measuring.finish(&complete);
                 // Frames were looked at with them before they turned out not to be finite.
-                match stages.measure().score.absent(&found.scanned.rows).is_empty() {
+                match stages.measure.score.absent(&found.scanned.rows).is_empty() {
                     true => Ok(found),
                     false => Err("Gaussians with NaN or infinity are dropped from all frames"),
                 }
@@ -203,8 +204,8 @@ fn receive_measured<S: Stages>(
             }
         }
     }
-    let done = measured_already(&arrived);
-    foretell(&mut scene, &later, &stages, done, options, journal)?;
+    let measured = arrived.as_ref().map(Measured::kinds).unwrap_or_default();
+    foretell(&mut scene, &later, &stages, measured, options, journal)?;
     Ok((scene, stages, arrived))
 }
 

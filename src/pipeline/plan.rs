@@ -1,347 +1,268 @@
-//! What a run does: which stages, with which parameters, and what is left out and why. Made once, before any work.
+//! The plan of a run: its stages with their parameters, what is left out and why, and how many Gaussians ranking and
+//! refinement leave. Made in one place, before any work.
+
+use std::path::Path;
 
 use super::ids::parse_ids;
+use super::planning::{InputMeta, MemoryFallback, Planning};
 use super::request::{Goal, Only, Quality, Request, decibels};
 use super::search::SearchStage;
+use super::stage::{CountPlan, EstimateInput, MeasuredOnArrival, Phase, Stage, StageList};
+use super::stages::STAGES;
+use super::stages::measure::Measure;
+use super::stages::write::Emit;
 use crate::error::{Error, Result};
 use crate::journal::Journal;
-use crate::journal::records::Saved;
 use crate::limits::Limits;
 use crate::memory_plan::{Plan, ResourceEstimate, Workload};
 use crate::outputs::kind::OutputKind;
-use crate::pipeline::stages::archive::ArchiveStage;
-use crate::pipeline::stages::bands::ShDegreeStage;
-use crate::pipeline::stages::choose::Choose;
-use crate::pipeline::stages::degree::Degree;
-use crate::pipeline::stages::field::FieldPrecisionStage;
-use crate::pipeline::stages::measure::{InputMeta, Measure, Stages};
-use crate::pipeline::stages::merge;
-use crate::pipeline::stages::merge::MergeStage;
-use crate::pipeline::stages::reference_views::LEFT_BY_SEARCH;
-use crate::pipeline::stages::scan;
-use crate::pipeline::stages::write::Emit;
-use crate::pruning::prune::Prune;
-use crate::pruning::rounds::Rounds;
 use crate::pruning::score::UserOverrides;
-use crate::pruning::visible;
 use crate::pruning::visible::Visible;
-use crate::recipe::Coverage;
-use crate::refinement;
 use crate::refinement::RefineStage;
 use crate::scene::Scene;
-use crate::statistics::pass::scan_units;
 
-/// The stages of a run, in their order.
-#[derive(Debug, Clone)]
-pub struct Job {
-    /// From frames to scores.
+/// The plan of a run.
+pub struct RunPlan {
+    /// The stages in their order.
+    pub(super) stages: StageList,
+    /// The stages that measure, by which a stream is measured as it arrives.
     pub measure: Measure,
-    /// Ranks anew as the model shrinks.
-    pub rounds: Option<Rounds>,
-    /// Chooses an SH degree for so many bytes.
-    pub degree: Option<Degree>,
-    /// Says how many survive.
-    pub prune: Prune,
-    /// Merges survivors.
-    pub merge: Option<MergeStage>,
-    /// Lets pictures choose.
-    pub choose: Option<Choose>,
-    /// Moves what is stored of what is left.
-    pub refine: Option<RefineStage>,
-    /// Rounds the field of what is left.
-    pub field: Option<FieldPrecisionStage>,
-    /// Drops bands of spherical harmonics that nobody sees.
-    pub bands: Option<ShDegreeStage>,
-    /// Finds the size, instead of all from `prune` on.
+    /// What is written; none where only statistics are asked for.
+    pub output: Option<Emit>,
+    /// Repeats the stages of [`Phase::Reduce`] until a quality is reached.
     pub search: Option<SearchStage>,
-    /// Says on which grids an archive's values lie.
-    pub archive: Option<ArchiveStage>,
-    /// Writes.
-    pub emit: Emit,
-    /// Part of the Gaussians that stays at most.
-    left: f64,
-    has_cameras: bool,
-    spared: MemoryFallback,
+    /// Exact number of Gaussians in the output, where it is asked for.
+    pub target: Option<usize>,
+    gaussians: usize,
+    merges: bool,
+    refine: Option<RefineStage>,
+    fallback: MemoryFallback,
 }
 
-/// Parts of refinement that are left out because they do not fit within the memory limit.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-enum MemoryFallback {
-    /// No part is left out.
-    #[default]
-    Nothing,
-    /// Parameter deltas are constant in time.
-    ConstantInTime {
-        /// Memory with which deltas could vary in time, bytes.
-        required_bytes: u64,
-    },
-    /// SH coefficients above degree 0 are not refined either.
-    WithoutHarmonics {
-        /// Memory with which they could be, bytes.
-        required_bytes: u64,
-    },
-    /// Nothing is refined.
-    WithoutRefinement {
-        /// Memory with which it could be, bytes.
-        required_bytes: u64,
-    },
-}
-
-impl Job {
-    /// The stages that `request` takes.
+impl RunPlan {
+    /// Returns the plan of a run that compresses as `request` says, whatever memory it takes.
     ///
     /// # Errors
-    /// A recipe out of range; a target or ids that such an input does not have.
-    pub fn new(request: &Request, outlook: InputMeta) -> Result<Job> {
-        Job::sparing(request, outlook, MemoryFallback::Nothing)
+    /// A recipe out of range; a target or ids that such an input does not have; options that exclude each other.
+    pub fn new(request: &Request, input: InputMeta) -> Result<RunPlan> {
+        RunPlan::with_fallback(request, input, MemoryFallback::Nothing)
     }
 
-    /// [`Job::new`] without what is `spared`.
-    fn sparing(request: &Request, outlook: InputMeta, spared: MemoryFallback) -> Result<Job> {
-        let target = request.target.map(|target| target.count(outlook.gaussians)).transpose()?;
-        Job::down_to(request, outlook, target, spared)
+    /// Returns the plan of a run that measures and scores.
+    pub fn to_measure(measure: Measure, input: InputMeta) -> RunPlan {
+        let mut plan = RunPlan::empty(measure.clone(), input.gaussians);
+        plan.stages.add(Phase::Rank, measure);
+        plan
     }
 
-    /// [`Job::new`] within the request's budget of memory: all times change alike, else harmonics above the first stay as they
-    /// are too, else nothing is refined, where it does not reach for more. If it does not reach for that either, what is
-    /// asked for stays, to be refused.
+    /// Returns the plan of a run within the memory limit of `request`. Where refinement does not fit, parameter deltas are
+    /// constant in time; else SH coefficients above degree 0 are not refined either; else nothing is refined. Where not even
+    /// that fits, the plan is the whole one, which is then refused with the smallest sufficient limit.
     ///
     /// # Errors
-    /// Those of [`Job::new`].
-    pub fn within(request: &Request, outlook: InputMeta, work: &Workload) -> Result<Job> {
-        let of = |spared| Job::sparing(request, outlook, spared);
-        let budget = request.input.memory;
-        let asked = of(MemoryFallback::Nothing)?;
-        if !asked.refines() || Plan::fits(*work, budget, |work, limits| asked.needs(work, limits)) {
-            return Ok(asked);
+    /// Those of [`RunPlan::new`].
+    pub fn within_memory(request: &Request, input: InputMeta, work: &Workload) -> Result<RunPlan> {
+        let with = |fallback| RunPlan::with_fallback(request, input, fallback);
+        let fits =
+            |plan: &RunPlan| Plan::fits(*work, request.input.memory, |work, limits| plan.estimates(work, limits));
+        let least = |plan: &RunPlan| Plan::closest(*work, 1, |work, limits| plan.estimates(work, limits)).peak();
+        let whole = with(MemoryFallback::Nothing)?;
+        if whole.refine.is_none() || fits(&whole) {
+            return Ok(whole);
         }
-        let least = |job: &Job| Plan::closest(*work, 1, |work, limits| job.needs(work, limits)).peak();
-        let of_all = least(&asked);
-        let alike = of(MemoryFallback::ConstantInTime { required_bytes: of_all })?;
-        let of_alike = least(&alike);
-        if of_alike < of_all && Plan::fits(*work, budget, |work, limits| alike.needs(work, limits)) {
-            return Ok(alike);
+        let of_whole = least(&whole);
+        let constant = with(MemoryFallback::ConstantInTime { required_bytes: of_whole })?;
+        let of_constant = least(&constant);
+        if of_constant < of_whole && fits(&constant) {
+            return Ok(constant);
         }
-        let bands = of(MemoryFallback::WithoutHarmonics { required_bytes: of_alike })?;
-        if work.sh_degree > 0 && Plan::fits(*work, budget, |work, limits| bands.needs(work, limits)) {
-            return Ok(bands);
+        let low_degree = with(MemoryFallback::WithoutHarmonics { required_bytes: of_constant })?;
+        if work.sh_degree > 0 && fits(&low_degree) {
+            return Ok(low_degree);
         }
-        let none = of(MemoryFallback::WithoutRefinement { required_bytes: least(&bands) })?;
-        Ok(if Plan::fits(*work, budget, |work, limits| none.needs(work, limits)) { none } else { asked })
+        let unrefined = with(MemoryFallback::WithoutRefinement { required_bytes: least(&low_degree) })?;
+        Ok(if fits(&unrefined) { unrefined } else { whole })
     }
 
-    /// [`Job::sparing`] down to `target` Gaussians, whatever the request's own target.
-    fn down_to(request: &Request, outlook: InputMeta, target: Option<usize>, spared: MemoryFallback) -> Result<Job> {
+    fn empty(measure: Measure, gaussians: usize) -> RunPlan {
+        RunPlan {
+            stages: StageList::default(),
+            measure,
+            output: None,
+            search: None,
+            target: None,
+            gaussians,
+            merges: false,
+            refine: None,
+            fallback: MemoryFallback::Nothing,
+        }
+    }
+
+    fn with_fallback(request: &Request, input: InputMeta, fallback: MemoryFallback) -> Result<RunPlan> {
         let Request { recipe, only, .. } = request;
+        let target = request.target.map(|target| target.count(input.gaussians)).transpose()?;
         recipe.validate().map_err(Error::usage)?;
-        if request.goal.is_some() && (*only == Only::Merge || request.target.is_some()) {
-            return Err(Error::usage(
-                "a quality or a size on disk is found by pruning: not with --merge-only, nor beside a target",
-            ));
-        }
-        let ids =
-            |spec: &Option<String>| spec.as_deref().map_or(Ok(Vec::new()), |ids| parse_ids(ids, outlook.gaussians));
+        let output = checked_output(request, input.own_output)?;
+        let ids = |spec: &Option<String>| spec.as_deref().map_or(Ok(Vec::new()), |ids| parse_ids(ids, input.gaussians));
         let user =
             UserOverrides { keep: ids(&request.keep_ids)?, drop: ids(&request.drop_ids)?, keep_box: request.keep_box };
-        let measure = Measure::new(recipe, outlook.has_cameras, user);
-        let looks = measure.visible.is_some();
         let prunes = *only != Only::Merge;
-        let part = target.map(|target| target as f64 / outlook.gaussians.max(1) as f64);
-        let refine = RefineStage::from_recipe(recipe, part, looks && prunes).and_then(|refine| match spared {
+        let looks = Visible::from_recipe(&recipe.scan, input.has_cameras).is_some();
+        let mut planning =
+            Planning { request, input, output, target, user, looks, prunes, merges: false, refine: None, fallback };
+        let refine = RefineStage::from_recipe(recipe, planning.part(), planning.prunes_by_views());
+        planning.refine = refine.and_then(|refine| match fallback {
             MemoryFallback::Nothing => Some(refine),
             MemoryFallback::ConstantInTime { .. } => Some(refine.without_course()),
             MemoryFallback::WithoutHarmonics { .. } => Some(refine.without_course().without_bands()),
             MemoryFallback::WithoutRefinement { .. } => None,
         });
-        if request.kind.is_none() {
-            OutputKind::check_name(&request.output)?;
-        }
-        let kind = OutputKind::from_path(&request.output, request.kind, outlook.own_output);
-        let is_archive = kind == OutputKind::Archive;
-        if request.archive_psnr.is_some() && !is_archive {
-            return Err(Error::usage("--archive-psnr is for archives: write to NAME.gsz, or --as archive"));
-        }
-        if let Some(psnr) = request.archive_psnr {
-            decibels("archive_psnr", psnr).map_err(Error::usage)?;
-        }
-        let goal = match &request.goal {
-            Some(Goal::Quality(Quality::Psnr(least))) if is_archive => {
-                Some(Goal::Quality(Quality::Psnr(least + LEFT_BY_SEARCH)))
-            }
-            Some(Goal::Quality(Quality::Loss { .. })) if is_archive => {
-                return Err(Error::usage(
-                    "the size of an archive is found by --target-ratio, --target-count, --min-psnr or --target-size\n  \
-                     give one of these, or write a model folder",
-                ));
-            }
-            Some(Goal::Bytes(_)) if request.archive_psnr.is_some() => {
-                return Err(Error::usage("--archive-psnr and --target-size both say how coarse: expected one of them"));
-            }
-            goal => goal.clone(),
+        // Refinement gains more at a count than merging ever did; prune steps rank anew, whatever ranked before.
+        let prunes_alone = *only == Only::Prune || request.goal.is_some() || (planning.refine.is_some() && prunes);
+        planning.merges = !prunes_alone && !recipe.merge.passes.is_empty();
+
+        let mut plan = RunPlan::empty(Measure::from_planning(&planning), input.gaussians);
+        plan.search = SearchStage::from_planning(&planning);
+        plan.output = Some(Emit::from_planning(&planning));
+        plan.target = target;
+        plan.stages.counts = CountPlan {
+            refinement_starts_at: planning.refine.as_ref().and_then(RefineStage::starts_at),
+            searches: plan.search.is_some(),
         };
-        let searches = matches!(request.goal, Some(Goal::Quality(_)));
-        // What refining gains at a count is more than merging ever did; cuts rank anew, whatever ranked before.
-        let prunes_alone = *only == Only::Prune || request.goal.is_some() || (refine.is_some() && prunes);
-        let merges = !prunes_alone && !recipe.merge.passes.is_empty();
-        let prune = Prune { prunes, merges, target };
-        let emit = Emit::new(request, outlook.own_output, merges);
-        let field = FieldPrecisionStage::from_request(request, emit.kind);
-        let bands = ShDegreeStage::from_request(request, emit.kind);
-        Ok(Job {
-            rounds: Rounds::from_recipe(&recipe.select, part).filter(|_| looks && prunes),
-            degree: Degree::from_request(request, refine.as_ref()),
-            merge: merges.then(|| MergeStage::after(&prune, recipe)),
-            prune,
-            choose: (looks && prunes && merges && recipe.select.choose_by_views)
-                .then_some(Choose { has_target: target.is_some() }),
-            search: match &goal {
-                Some(Goal::Quality(quality)) => {
-                    let (refine, field, bands) = (refine.clone(), field.clone(), bands.clone());
-                    Some(SearchStage {
-                        quality: quality.clone(),
-                        pictures: recipe.refine.refine_pictures,
-                        refine,
-                        field,
-                        bands,
-                    })
-                }
-                _ => None,
-            },
-            refine: refine.filter(|_| !searches),
-            field: field.filter(|_| !searches),
-            bands: bands.filter(|_| !searches),
-            archive: is_archive.then_some(ArchiveStage { psnr: request.archive_psnr }),
-            emit,
-            left: part.unwrap_or(1.0).min(1.0),
-            measure,
-            has_cameras: outlook.has_cameras,
-            spared,
-        })
+        (plan.merges, plan.refine, plan.fallback) = (planning.merges, planning.refine.clone(), fallback);
+        STAGES.iter().for_each(|add| add(&planning, &mut plan.stages));
+        Ok(plan)
     }
 
-    /// Whether anything is refined.
-    fn refines(&self) -> bool {
-        self.refine.is_some() || self.search.as_ref().is_some_and(|search| search.refine.is_some())
+    /// Returns what all stages take.
+    pub fn estimates(&self, work: &Workload, limits: &Limits) -> Vec<ResourceEstimate> {
+        self.remaining_estimates(work, limits, MeasuredOnArrival::default())
     }
 
-    /// [`Job::down_to`] `target` of the same request and within the same budget.
+    /// Returns what the stages take that are not done yet.
+    pub fn remaining_estimates(
+        &self,
+        work: &Workload,
+        limits: &Limits,
+        measured: MeasuredOnArrival,
+    ) -> Vec<ResourceEstimate> {
+        self.estimates_of(self.estimate_input(work, limits, measured), |_| true)
+    }
+
+    /// Returns what the stages take at best that are not done yet: where views hardly differ without a part `hardly_seen` of
+    /// the Gaussians.
+    pub fn shortest_estimates(
+        &self,
+        work: &Workload,
+        limits: &Limits,
+        measured: MeasuredOnArrival,
+        hardly_seen: f64,
+    ) -> Vec<ResourceEstimate> {
+        let input = self.estimate_input(work, limits, measured);
+        self.estimates_of(input, |stage| !stage.may_be_skipped(input, hardly_seen))
+    }
+
+    fn estimate_input<'a>(
+        &self,
+        work: &'a Workload,
+        limits: &'a Limits,
+        measured: MeasuredOnArrival,
+    ) -> EstimateInput<'a> {
+        let left = self.target.map_or(1.0, |target| target as f64 / self.gaussians.max(1) as f64).min(1.0);
+        EstimateInput { work, limits, left, measured }
+    }
+
+    fn estimates_of(&self, input: EstimateInput<'_>, runs: impl Fn(&dyn Stage) -> bool) -> Vec<ResourceEstimate> {
+        let of = |phase: Phase| -> Vec<ResourceEstimate> {
+            self.stages.of(phase).filter(|stage| runs(*stage)).flat_map(|stage| stage.estimates(input)).collect()
+        };
+        let reduce = match &self.search {
+            Some(search) => vec![search.estimate(input, &of(Phase::Reduce))],
+            None => of(Phase::Reduce),
+        };
+        [of(Phase::Rank), reduce, of(Phase::Write)].concat()
+    }
+
+    /// Returns whether it is only found on the way how much there is to do.
+    pub fn is_open_ended(&self) -> bool {
+        self.search.is_some() || self.stages.is_open_ended()
+    }
+
+    /// Returns the stages that several processes can divide among themselves, as a work folder names them, with their units.
+    pub fn shardable_units(&self, scene: &Scene) -> Vec<String> {
+        self.stages.all().flat_map(|stage| stage.shardable_units(scene, &self.stages.counts)).collect()
+    }
+
+    /// Returns how many Gaussians ranking and refinement leave, for a person.
+    pub fn counts_text(&self) -> String {
+        self.stages.counts.text(self.target, self.gaussians, self.merges)
+    }
+
+    /// Returns the plan for a person: counts, parameters of the stages, and what is left out.
+    pub fn text(&self) -> String {
+        let parameters = self.stages.all().map(|stage| stage.parameters()).filter(|text| !text.is_empty());
+        let search = self.search.as_ref().map(SearchStage::parameters);
+        let left_out = self.stages.left_out();
+        let lines = parameters.chain(search).chain(left_out).map(|line| format!("\n  {line}"));
+        self.counts_text() + &lines.collect::<String>()
+    }
+
+    /// Confirms, before the input is opened, that a run which reads `input` may write its result.
     ///
     /// # Errors
-    /// Those of [`Job::new`].
-    pub fn again(&self, request: &Request, outlook: InputMeta, target: usize) -> Result<Job> {
-        Job::down_to(request, outlook, Some(target), self.spared)
+    /// Outputs that are there already, or cannot be.
+    pub fn check_target(&self, input: &Path) -> Result<()> {
+        self.output.as_ref().map_or(Ok(()), |output| output.check_target(&[input]))
     }
 
-    /// How many of `all` Gaussians the ranking leaves, if `wanted` are to stay: a refinement lets the last ones go by
-    /// itself.
-    pub fn before_cuts(&self, wanted: usize, all: usize) -> usize {
-        self.refine.as_ref().map_or(wanted, |refine| refine.first(wanted, all))
+    /// Confirms, before any work, that the scene has what the stages need.
+    ///
+    /// # Errors
+    /// Those of the stages.
+    pub fn check(&self, scene: &Scene) -> Result<()> {
+        if let Some(search) = &self.search {
+            search.check(scene)?;
+        }
+        self.stages.all().try_for_each(|stage| stage.check(scene))
     }
 
-    /// The stages that can be divided, as a work folder names them, with their units.
-    pub(super) fn divided(&self, scene: &Scene) -> Vec<String> {
-        let count = scene.source().info().count;
-        let mut stages = vec![format!("{}: {} blocks of Gaussians", scan::NAME, scan_units(scene.source().info()))];
-        if let Some(visible) = &self.measure.visible {
-            let most = match visible.recipe.look_pictures {
-                0 => scene.schedule.pairs(),
-                most => most.min(scene.schedule.pairs()),
-            };
-            stages.push(format!("{}: {most} pictures", visible::NAME));
-        }
-        if let Some(rounds) = &self.rounds {
-            let fewest = self.search.as_ref().map_or_else(
-                || self.before_cuts((rounds.usual * count as f64).ceil() as usize, count),
-                |search| search.fewest(count),
-            );
-            stages.extend(rounds.divided(count, fewest));
-        }
-        if let Some(merge) = &self.merge {
-            stages.extend(merge.recipe.passes.iter().map(|_| format!("{}: pairs of neighbours", merge::PAIRS)));
-        }
-        if self.refines() {
-            stages.push(format!("{}: pictures", refinement::targets::NAME));
-        }
-        stages
-    }
-
-    /// Writes down the stages that the request leaves out of such a workload.
-    pub fn write_down(&self, request: &Request, work: &Workload, limits: &Limits, journal: &mut Journal) {
-        let saved =
-            |need: ResourceEstimate| Saved::Stage { seconds: need.seconds / work.threads as f64, reads: need.reads };
-        if !self.prune.prunes {
-            journal.leave_out("pruning", "--merge-only");
-        }
-        if self.merge.is_none() {
-            let why = match request.only {
-                Only::Prune => "--prune-only",
-                _ if request.recipe.merge.passes.is_empty() => "the recipe has no merge pass",
-                _ if request.goal.is_some() => "a quality or a size on disk is found by pruning",
-                _ => "refining what is left gains more at the same count (--no-refine merges)",
-            };
-            let what = "merging, and its pass over the frames";
-            match request.recipe.merge.passes.is_empty() {
-                true => journal.leave_out(what, why),
-                false => {
-                    let merge = MergeStage::after(&self.prune, &request.recipe);
-                    journal.spare(what, why, saved(merge.need(work, limits)));
-                }
-            }
-        }
-        let takes = |least: u64| format!("memory: expected at least {}MiB for it (--memory)", least.div_ceil(1 << 20));
-        match self.spared {
-            MemoryFallback::Nothing => (),
-            MemoryFallback::ConstantInTime { required_bytes } => {
-                journal.leave_out("refining along time", takes(required_bytes))
-            }
-            MemoryFallback::WithoutHarmonics { required_bytes } => {
-                journal.leave_out("refining along time", takes(required_bytes));
-                journal.leave_out("refining of harmonics above the first", takes(required_bytes));
-            }
-            MemoryFallback::WithoutRefinement { required_bytes } => {
-                journal.leave_out("refinement", takes(required_bytes))
-            }
-        }
-        if request.recipe.scan.coverage == Coverage::Auto && !self.has_cameras {
-            let why = "no cameras given or found: a virtual rig may see only what is in front of the scene";
-            let visible = Visible { recipe: request.recipe.scan.clone() };
-            journal.spare("visible coverage", why, saved(visible.need(work, limits)));
-        }
+    /// Writes down what the run goes without.
+    pub fn record_left_out(&self, work: &Workload, limits: &Limits, journal: &mut Journal) {
+        self.stages.record_left_out(work, limits, journal);
     }
 }
 
-impl Stages for Job {
-    fn measure(&self) -> &Measure {
-        &self.measure
+/// Returns the kind of result that `request` asks for, of an input whose own kind of result is `own`.
+///
+/// # Errors
+/// A name that says nothing; options of which an output or a goal allows one only.
+fn checked_output(request: &Request, own: OutputKind) -> Result<OutputKind> {
+    let Request { goal, archive_psnr, .. } = request;
+    if goal.is_some() && (request.only == Only::Merge || request.target.is_some()) {
+        return Err(Error::usage(
+            "a quality or a size on disk is found by pruning: not with --merge-only, nor beside a target",
+        ));
     }
-
-    fn needs(&self, work: &Workload, limits: &Limits) -> Vec<ResourceEstimate> {
-        let mut needs = self.measure.needs(work, limits);
-        needs.extend(self.rounds.as_ref().map(|stage| stage.need(work, limits)));
-        needs.extend(self.degree.as_ref().map(|stage| stage.need(work, limits)));
-        needs.extend(self.merge.as_ref().map(|stage| stage.need(work, limits)));
-        needs.extend(self.choose.as_ref().map(|stage| stage.need(work, limits, self.left)));
-        needs.extend(self.refine.as_ref().map(|stage| stage.need(work, limits)));
-        needs.extend(self.field.as_ref().map(|stage| stage.need(work, limits, self.left)));
-        // Of degree 0 there is no band to drop.
-        let bands = self.bands.as_ref().filter(|_| work.sh_degree > 0);
-        needs.extend(bands.map(|stage| stage.need(work, limits, self.left)));
-        needs.extend(self.search.as_ref().map(|stage| stage.need(work, limits)));
-        needs.extend(self.archive.as_ref().map(|stage| stage.need(work, limits)));
-        needs.push(self.emit.need(work, limits, self.left));
-        needs
+    if request.kind.is_none() {
+        OutputKind::check_name(&request.output)?;
     }
-
-    /// What is close enough already is not refined.
-    fn easiest(&self, work: &Workload, limits: &Limits, hardly_seen: f64) -> Vec<ResourceEstimate> {
-        match self.left >= 1.0 - hardly_seen {
-            true => Job { refine: None, ..self.clone() }.needs(work, limits),
-            false => self.needs(work, limits),
+    let kind = OutputKind::from_path(&request.output, request.kind, own);
+    let is_archive = kind == OutputKind::Archive;
+    if archive_psnr.is_some() && !is_archive {
+        return Err(Error::usage("--archive-psnr is for archives: write to NAME.gsz, or --as archive"));
+    }
+    if let Some(psnr) = archive_psnr {
+        decibels("archive_psnr", *psnr).map_err(Error::usage)?;
+    }
+    match goal {
+        Some(Goal::Quality(Quality::Loss { .. })) if is_archive => Err(Error::usage(
+            "the size of an archive is found by --target-ratio, --target-count, --min-psnr or --target-size\n  \
+             give one of these, or write a model folder",
+        )),
+        Some(Goal::Bytes(_)) if archive_psnr.is_some() => {
+            Err(Error::usage("--archive-psnr and --target-size both say how coarse: expected one of them"))
         }
-    }
-
-    fn searches(&self) -> bool {
-        self.search.is_some() || self.degree.is_some()
+        _ => Ok(kind),
     }
 }
 
@@ -350,6 +271,7 @@ mod tests {
     use super::*;
     use crate::memory_plan::Budget;
     use crate::model::ALL_HARMONICS;
+    use crate::pipeline::request::Target;
     use crate::pipeline::tests::work;
     use crate::recipe::Recipe;
     use crate::scene::InputOptions;
@@ -367,8 +289,8 @@ mod tests {
     /// Everything compressing does under `preset`.
     fn everything(preset: &str) -> impl Fn(&Workload, &Limits) -> Vec<ResourceEstimate> {
         let recipe = Recipe::preset(preset).unwrap();
-        let job = Job::new(&request(recipe), OUTLOOK).unwrap();
-        move |work, limits| job.needs(work, limits)
+        let plan = RunPlan::new(&request(recipe), OUTLOOK).unwrap();
+        move |work, limits| plan.estimates(work, limits)
     }
 
     #[test]
@@ -392,18 +314,18 @@ mod tests {
         let work = work(200_000);
         let mut within = |bytes: u64| {
             request.input.memory = budget(bytes);
-            let job = Job::within(&request, OUTLOOK, &work).unwrap();
+            let plan = RunPlan::within_memory(&request, OUTLOOK, &work).unwrap();
             let mut journal = Journal::default();
-            job.write_down(&request, &work, &Limits::NONE, &mut journal);
+            plan.record_left_out(&work, &Limits::NONE, &mut journal);
             let left_out =
                 |what: &str| journal.left_out.iter().find(|left| left.what == what).map(|left| left.why.clone());
             let whats = ["refining along time", "refining of harmonics above the first", "refinement"];
             let [time, bands, all] = whats.map(left_out);
             assert_eq!(
-                job.refine.as_ref().is_some_and(|refine| refine.knots > 0),
-                job.spared == MemoryFallback::Nothing
+                plan.refine.as_ref().is_some_and(|refine| refine.knots > 0),
+                plan.fallback == MemoryFallback::Nothing
             );
-            (job.spared, job.refine.map(|refine| refine.sh_degree), time.filter(|_| bands.is_none()).or(bands), all)
+            (plan.fallback, plan.refine.map(|refine| refine.sh_degree), time.filter(|_| bands.is_none()).or(bands), all)
         };
         let least = |spared: MemoryFallback| match spared {
             MemoryFallback::ConstantInTime { required_bytes }
@@ -452,12 +374,38 @@ mod tests {
         let mut recipe = Recipe::preset("paper").unwrap();
         recipe.merge.passes.clear();
         let request = request(recipe);
-        let job = Job::new(&request, OUTLOOK).unwrap();
-        let needs = job.needs(&work(1000), &Limits::NONE);
+        let plan = RunPlan::new(&request, OUTLOOK).unwrap();
+        let needs = plan.estimates(&work(1000), &Limits::NONE);
         assert_eq!(needs.iter().map(|need| need.stage).collect::<Vec<_>>(), ["scan", "score", "emit"]);
         let mut journal = Journal::default();
-        job.write_down(&request, &work(1000), &Limits::NONE, &mut journal);
+        plan.record_left_out(&work(1000), &Limits::NONE, &mut journal);
         assert_eq!(journal.left_out.len(), 1);
         assert_eq!(journal.left_out[0].why, "the recipe has no merge pass");
+    }
+
+    #[test]
+    fn the_plan_says_how_many_gaussians_ranking_and_refinement_leave() {
+        let counts = |recipe: Recipe, ratio: Option<f64>, goal: Option<Goal>| {
+            let target = ratio.map(Target::Ratio);
+            let request = Request { target, goal, ..request(recipe) };
+            let plan = RunPlan::new(&request, OUTLOOK).unwrap();
+            let after = [plan.stages.counts.after_ranking(100, 1000), plan.stages.counts.before_refinement(100, 1000)];
+            (after, plan.text())
+        };
+        let default = || Recipe::preset("default").unwrap();
+        let (refined, text) = counts(default(), Some(0.1), None);
+        assert_eq!(refined, [400, 400]);
+        assert!(
+            text.contains("ranking leaves 400 of 1000 Gaussians (40%), refinement removes 300 of them; 100 stay"),
+            "{text}"
+        );
+        assert!(text.contains("\n  refine: ") && text.contains("\n  left out: merging"), "{text}");
+        let (unrefined, text) = counts(default().unrefined(), Some(0.1), None);
+        assert_eq!(unrefined, [100, 100]);
+        assert!(text.contains("leave 100 of 1000 Gaussians (10%); refinement removes none"), "{text}");
+        // A search ranks once for all of its sizes.
+        let psnr = || Some(Goal::Quality(Quality::Psnr(30.0)));
+        assert_eq!(counts(default(), None, psnr()).0, [400, 400]);
+        assert_eq!(counts(default().unrefined(), None, psnr()).0, [20, 100]);
     }
 }

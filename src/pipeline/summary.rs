@@ -94,6 +94,14 @@ pub struct InputSummary {
 }
 
 impl InputSummary {
+    /// Of the input of an open scene.
+    ///
+    /// # Errors
+    /// A file that cannot be read.
+    pub fn from_scene(scene: &Scene) -> Result<InputSummary> {
+        InputSummary::new(&*scene.input, &scene.path, scene.digest()?)
+    }
+
     /// Of an open input, whose path and digest are given.
     ///
     /// # Errors

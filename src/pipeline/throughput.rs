@@ -14,7 +14,8 @@ use crate::journal::records::Forecast;
 use crate::memory_plan::{LOOK, Plan, REMOVE, RENDER, Throughput, Workload};
 use crate::model::{Camera, Columns, Gaussians};
 use crate::passes::{BLOCK, gather_all};
-use crate::pipeline::stages::measure::Stages;
+use crate::pipeline::plan::RunPlan;
+use crate::pipeline::stage::MeasuredOnArrival;
 use crate::pipeline::time_estimate::core_seconds;
 use crate::render::{Contribution, RemovalError, Renderer};
 use crate::scene::Scene;
@@ -35,21 +36,25 @@ const HARDLY_LOST: f64 = 60.0;
 /// Runs that are expected to take less seconds than this are not measured beforehand.
 const SHORT: f64 = 2.0;
 
-/// What `stages` will take, as `plan` has them, but for the first `done` ones, on `scene`, once it follows that plan; measures
+/// What `stages` will take, as `plan` has them, but for those that are `measured` already, on `scene`, once it follows that plan; measures
 /// first, unless the run is short. The scene's pace is set by that.
 ///
 /// # Errors
 /// Frames that cannot be read.
-pub(super) fn measured(scene: &mut Scene, plan: &Plan, stages: &impl Stages, done: usize) -> Result<Forecast> {
+pub(super) fn forecast(
+    scene: &mut Scene,
+    plan: &Plan,
+    stages: &RunPlan,
+    measured: MeasuredOnArrival,
+) -> Result<Forecast> {
     let work = scene.workload();
-    let expected = core_seconds(&stages.needs(&work, &scene.limits)[done..]) / work.threads as f64;
+    let expected = core_seconds(&stages.remaining_estimates(&work, &scene.limits, measured)) / work.threads as f64;
     let found = if expected < SHORT { Calibration::NONE } else { Calibration::measure(scene, expected)? };
     scene.pace = found.pace;
     let work = scene.workload();
-    let easiest = stages.easiest(&work, &scene.limits, found.hardly_seen);
-    let needs = stages.needs(&work, &scene.limits);
-    let least = core_seconds(&easiest[done..]);
-    Ok(Forecast::new(&work, &needs[done..], least, stages.searches(), plan.peak()))
+    let shortest = stages.shortest_estimates(&work, &scene.limits, measured, found.hardly_seen);
+    let estimates = stages.remaining_estimates(&work, &scene.limits, measured);
+    Ok(Forecast::new(&work, &estimates, core_seconds(&shortest), stages.is_open_ended(), plan.peak()))
 }
 
 /// What was found before a run.

@@ -6,10 +6,8 @@
 //! Pruning for Compact 4D Gaussian Splatting Models", section 3.3.
 
 pub mod contribution;
-pub(crate) mod prune;
 mod ranking;
 pub mod removal;
-pub mod rounds;
 pub mod score;
 pub mod visible;
 

@@ -13,6 +13,7 @@ mod local;
 mod loss;
 pub mod optimizer;
 pub(crate) mod optimizer_state;
+pub(crate) mod prune_steps;
 pub(crate) mod targets;
 
 use std::time::{Duration, Instant};
@@ -160,6 +161,11 @@ impl RefineStage {
     /// does will go.
     fn steps_before(&self, left: usize, wanted: usize) -> usize {
         (self.cut_steps as f64 * (wanted as f64 / left.max(1) as f64).sqrt()).ceil() as usize
+    }
+
+    /// Returns the part of all Gaussians with which refinement begins at least, where it removes the rest in prune steps.
+    pub fn starts_at(&self) -> Option<f64> {
+        self.cuts.then_some(CUTS_FROM)
     }
 
     /// How many of `all` Gaussians to begin with, if `wanted` are to stay.

@@ -27,6 +27,7 @@ pub(super) const APART_EVERY: usize = 8;
 const HELD_EVERY: usize = 4;
 
 /// What pictures are for, by their numbers.
+#[derive(Clone)]
 pub(crate) struct Parted {
     /// To step along.
     pub(crate) stepped: Vec<usize>,

@@ -38,7 +38,8 @@ use crate::journal::Journal;
 use crate::journal::records::TermSummary;
 use crate::model::{Camera, Gaussians, Rows, Schedule, Split};
 use crate::outputs::kind::check_folder_name;
-use crate::pipeline::stages::measure::{Measure, Stages};
+use crate::pipeline::stage::MeasuredOnArrival;
+use crate::pipeline::stages::measure::Measure;
 use crate::pruning::score::{SCORED, Scored, UserOverrides};
 use crate::recipe::{NonFinite, Recipe};
 use crate::scene::Scene;
@@ -94,7 +95,7 @@ fn report_whole(options: &ReportOptions) -> Result<ReportData> {
     let recipe = recipe_to_score_with(&run)?;
     let measure = Measure::new(&recipe, side.scene.has_cameras, UserOverrides::default());
     side.keep_to(options.evaluate.original.memory, |work, limits| {
-        let mut needs = measure.needs(work, limits);
+        let mut needs = measure.needs(work, limits, MeasuredOnArrival::default());
         needs.push(traits::need(work));
         needs.extend(evaluation::needs(work, limits).into_iter().map(|mut need| {
             need.per_gaussian.push(("rows", SCORED + 8));
@@ -110,7 +111,7 @@ fn report_whole(options: &ReportOptions) -> Result<ReportData> {
         // What comes now follows from this too; the comparison is that of `evaluate`.
         side.scene.work.follow_from(CacheKey::new(&(&side.scene.schedule, &recipe)));
     }
-    let scored = measure.run(&side.scene, None, &mut Journal::default())?;
+    let scored = measure.measure(&side.scene, None, &mut Journal::default())?;
     notes.extend(differing_terms(&run, &scored));
     let find_traits = || traits(side.scene.source(), &scored, recipe.scan.alpha_min);
     let traits = side.scene.work.known("traits", side.scene.work.key(&()), find_traits)?;

@@ -27,8 +27,9 @@ use crate::journal::Journal;
 use crate::memory_plan::{Budget, Verbosity, Workload};
 use crate::model::{Rows, Schedule};
 use crate::outputs::kind::check_folder_name;
-use crate::pipeline::stages::measure::{InputMeta, Measure, Stages};
-use crate::pipeline::{Job, Request, Target};
+use crate::pipeline::planning::InputMeta;
+use crate::pipeline::stages::measure::Measure;
+use crate::pipeline::{Request, RunPlan, Target};
 use crate::progress::Progress;
 use crate::pruning::score::UserOverrides;
 use crate::recipe::Recipe;
@@ -188,9 +189,9 @@ pub fn precision(options: &PrecisionOptions) -> Result<PrecisionDiagram> {
         target: Some(options.target),
         ..Request::new(input.clone(), options.output.join(name), options.recipe.clone())
     };
-    let job = Job::within(&request, InputMeta::from_scene(&scene), &scene.workload())?;
+    let plan = RunPlan::within_memory(&request, InputMeta::from_scene(&scene), &scene.workload())?;
     scene.keep_to(input.memory, |work, limits| {
-        let mut needs = job.needs(work, limits);
+        let mut needs = plan.estimates(work, limits);
         for need in &mut needs {
             need.per_gaussian.push(("settings", HELD));
             need.fixed.extend([("judged", Judge::bytes(work.pixels)), ("counts", COUNTS)]);

@@ -12,8 +12,8 @@ use crate::evaluation::precision::{
 };
 use crate::journal::Journal;
 use crate::pipeline::stages::measure::Measure;
+use crate::pipeline::stages::rounds::Rounds;
 use crate::pruning::contribution::VisibleContribution;
-use crate::pruning::rounds::Rounds;
 use crate::pruning::score::{Scored, UserOverrides};
 use crate::pruning::visible::Visible;
 use crate::pruning::{Overrides, select};
@@ -181,7 +181,7 @@ impl Bench<'_> {
         let rounds = Rounds::from_recipe(select, None);
         let rank = || {
             let order = match &rounds {
-                Some(rounds) => rounds.run(self.scene, scored, scored.ranked(), self.kept, &mut Journal::default())?,
+                Some(rounds) => rounds.rank(self.scene, scored, scored.ranked(), self.kept, &mut Journal::default())?,
                 None => scored.ranked(),
             };
             Ok(order.take(self.kept))

@@ -11,8 +11,8 @@ use crate::evaluation::cost::Cost;
 use crate::evaluation::method::MethodKind;
 use crate::evaluation::precision::{BYTES, PICTURES, PrecisionCurve, PrecisionKnob, PrecisionSetting, Source};
 use crate::memory_plan::{Budget, Plan};
-use crate::pipeline::stages::measure::{InputMeta, Stages};
-use crate::pipeline::{Job, Only, Request, Target};
+use crate::pipeline::planning::InputMeta;
+use crate::pipeline::{Only, Request, RunPlan, Target};
 use crate::recipe::{MergePass, Recipe};
 use crate::scene::{InputOptions, open_input};
 
@@ -121,8 +121,8 @@ impl Bench<'_> {
             target: Some(self.target()),
             ..Request::new(trained(self.input), self.scratch.join(self.name), recipe.clone())
         };
-        let job = Job::new(&request, InputMeta::from_scene(self.scene))?;
-        let least = Plan::closest(self.work, 1, |work, limits| job.needs(work, limits)).peak();
+        let plan = RunPlan::new(&request, InputMeta::from_scene(self.scene))?;
+        let least = Plan::closest(self.work, 1, |work, limits| plan.estimates(work, limits)).peak();
         let mut by_memory = Vec::new();
         for part in BUDGETS {
             let mebibytes = (part * least as f64 / f64::from(1 << 20)).ceil();

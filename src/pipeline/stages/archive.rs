@@ -8,8 +8,6 @@
 
 use std::collections::BTreeMap;
 
-use serde::{Deserialize, Serialize};
-
 use super::bounds;
 use crate::archive::{self, ATTRIBUTES, Content, Encoded, Role, STEPS, Steps, TensorSteps};
 use crate::compressed_model::CompressedModel;
@@ -19,10 +17,13 @@ use crate::journal::as_toml::AsToml;
 use crate::limits::{Limits, ReadLimit};
 use crate::memory_plan::{PICTURE_ON_ALL_THREADS, RENDER, ResourceEstimate, Workload};
 use crate::model::Columns;
-use crate::outputs::bounds::Bounds;
+use crate::outputs::kind::OutputKind;
+use crate::pipeline::planning::Planning;
+use crate::pipeline::request::Goal;
+use crate::pipeline::stage::{Archived, EstimateInput, Phase, RunState, Stage, StageList};
 use crate::pipeline::stages::reference_views::{
-    ADDED, ArchiveTarget, BYTES_ADDED, BYTES_HALVINGS, HALVINGS, PIXEL, QualityTarget, ROUNDS, ReferenceViews,
-    balanced, bisected, check_met, measurable, pictures,
+    ADDED, ArchiveTarget, BYTES_ADDED, BYTES_HALVINGS, HALVINGS, LEFT_BY_SEARCH, PIXEL, QualityTarget, ROUNDS,
+    ReferenceViews, balanced, bisected, check_met, measurable, pictures,
 };
 use crate::pipeline::summary::ArchiveSummary;
 use crate::render;
@@ -36,20 +37,43 @@ const COARSEST: f64 = 4.0;
 /// fits leaves .5 and 1.2 dB to the grids of two trained models.
 const GUESSED: f64 = 3.3;
 
-/// What an archive is written from.
-#[derive(Debug, Serialize, Deserialize)]
-pub enum Archived {
-    /// A model, or a cloud.
-    Content(Encoded),
-    /// What is left of frames, within bounds.
-    Frames(Bounds),
-}
-
 /// The making of an archive.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ArchiveStage {
     /// PSNR of its pictures against those of the result before, dB; none: by what it costs against the original's.
     pub psnr: Option<f64>,
+}
+
+/// Adds the stage where an archive is written.
+pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
+    if planning.output == OutputKind::Archive {
+        stages.add(Phase::Write, ArchiveStage { psnr: planning.request.archive_psnr });
+    }
+}
+
+impl Stage for ArchiveStage {
+    fn estimates(&self, EstimateInput { work, limits, .. }: EstimateInput<'_>) -> Vec<ResourceEstimate> {
+        vec![self.need(work, limits)]
+    }
+
+    fn run(&self, run: &mut RunState<'_>) -> Result<()> {
+        let asked = match (&run.goal, &run.request.goal) {
+            (Some(goal), _) => ArchiveTarget::Loss(goal.searched - goal.asked),
+            (None, Some(Goal::Bytes(most))) => ArchiveTarget::Bytes(*most),
+            _ => ArchiveTarget::Nothing,
+        };
+        let (archived, archive) = self.archive(run.scene, &run.result, asked, &mut run.journal)?;
+        if let Some(goal) = &mut run.goal {
+            (goal.searched, goal.held) = (goal.searched - archive.loss, goal.held - archive.loss);
+            run.journal.notes.push(format!(
+                "{LEFT_BY_SEARCH} dB of what was searched for were left for the archive, which takes {:.2}: at least {} dB \
+                 asked for, {:.2} dB by the pictures searched on, {:.2} dB by those held back",
+                archive.loss, goal.asked, goal.searched, goal.held
+            ));
+        }
+        (run.archived, run.archive) = (Some(archived), Some(archive));
+        Ok(())
+    }
 }
 
 /// A group of values with one step.
@@ -110,7 +134,7 @@ impl ArchiveStage {
     ///
     /// # Errors
     /// An input that no archive holds, values or pictures that are not finite, frames that cannot be read, too few bytes.
-    pub fn run(
+    pub fn archive(
         &self,
         scene: &Scene,
         reduction: &CompressedModel,

@@ -13,7 +13,9 @@ use crate::metrics::psnr;
 use crate::model::{Columns, Gaussians, Picture};
 use crate::outputs::kind::OutputKind;
 use crate::passes::{Batch, Subject, show, spread};
+use crate::pipeline::planning::Planning;
 use crate::pipeline::request::Request;
+use crate::pipeline::stage::{EstimateInput, Phase, RunState, Stage, StageList};
 use crate::progress::Progress;
 use crate::pruning::score::scored_memory;
 use crate::recipe::WhichBands;
@@ -45,21 +47,49 @@ pub(crate) fn highest(scene: &Scene, degree: usize, journal: &mut Journal) -> us
 
 /// The bands of spherical harmonics of a result.
 #[derive(Debug, Clone)]
-pub struct ShDegreeStage {
+pub(crate) struct ShDegreeStage {
     /// How much closer pictures stay to those with all bands than to the original's, dB.
     pub margin: f64,
 }
 
+/// Adds the stage where the output may have fewer.
+pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
+    if let Some(stage) = ShDegreeStage::from_request(planning.request, planning.output) {
+        stages.add(Phase::Reduce, stage);
+    }
+}
+
+impl Stage for ShDegreeStage {
+    fn estimates(&self, EstimateInput { work, limits, left, .. }: EstimateInput<'_>) -> Vec<ResourceEstimate> {
+        // Of degree 0 there is no band to drop.
+        (work.sh_degree > 0).then(|| self.need(work, limits, left)).into_iter().collect()
+    }
+
+    fn run(&self, run: &mut RunState<'_>) -> Result<()> {
+        let scene = run.scene;
+        // A degree that was chosen is one that pictures need.
+        if run.template.sh_degree < scene.source().info().sh_degree {
+            return Ok(());
+        }
+        let result = run.take_result();
+        let (count, key) = (result.len(), scene.work.key(&(self.margin, &result)));
+        run.result = run
+            .journal
+            .kept_stage(NAME, count, scene, key, |journal| Ok((self.drop_some(scene, result, journal)?, count)))?;
+        Ok(())
+    }
+}
+
 impl ShDegreeStage {
     /// The stage, of a run whose output may have fewer. An archive has no bytes for bands that nobody sees.
-    pub fn from_request(request: &Request, kind: OutputKind) -> Option<ShDegreeStage> {
+    pub(crate) fn from_request(request: &Request, kind: OutputKind) -> Option<ShDegreeStage> {
         let bands = &request.recipe.bands;
         let drops = kind != OutputKind::Archive && bands.bands == WhichBands::Needed;
         drops.then_some(ShDegreeStage { margin: bands.bands_margin })
     }
 
     /// Three states, and pictures of them. A part `left` of the Gaussians stays.
-    pub fn need(&self, work: &Workload, limits: &Limits, left: f64) -> ResourceEstimate {
+    pub(crate) fn need(&self, work: &Workload, limits: &Limits, left: f64) -> ResourceEstimate {
         let (whole, reader, held) = (work.state(Columns::all()), work.input.reader, work.held(limits, Columns::all()));
         let per_gaussian = vec![
             ("kept", of_left(left, 24)),
@@ -81,23 +111,11 @@ impl ShDegreeStage {
         }
     }
 
-    /// `reduction` with the lowest SH degree that shows in pictures no more than it may.
+    /// Returns `reduction` with the lowest SH degree that shows in pictures no more than it may.
     ///
     /// # Errors
     /// Frames that cannot be read.
-    pub fn run(&self, scene: &Scene, reduction: CompressedModel, journal: &mut Journal) -> Result<CompressedModel> {
-        let count = reduction.len();
-        let key = scene.work.key(&(self.margin, &reduction));
-        journal.kept_stage(NAME, count, scene, key, |journal| Ok((self.drop_some(scene, reduction, journal)?, count)))
-    }
-
-    /// [`ShDegreeStage::run`] as a part of another stage.
-    pub fn drop_some(
-        &self,
-        scene: &Scene,
-        reduction: CompressedModel,
-        journal: &mut Journal,
-    ) -> Result<CompressedModel> {
+    fn drop_some(&self, scene: &Scene, reduction: CompressedModel, journal: &mut Journal) -> Result<CompressedModel> {
         let all = scene.source().info().sh_degree;
         let pictures = spread(&scene.schedule, PICTURES, 1);
         let stay = match scene.input.needs_all_bands() {

@@ -12,6 +12,8 @@ use crate::memory_plan::{PICTURE_ON_ALL_THREADS, RENDER, ResourceEstimate, Workl
 use crate::metrics::{decibels_text, psnr};
 use crate::model::{Columns, Picture};
 use crate::passes::{Batch, Subject, VIEWS_AT_ONCE, ViewStates, show, spread};
+use crate::pipeline::planning::Planning;
+use crate::pipeline::stage::{EstimateInput, Phase, RunState, Stage, StageList};
 use crate::progress::Progress;
 use crate::pruning::Ranking;
 use crate::pruning::score::{Scored, scored_memory};
@@ -33,14 +35,36 @@ pub(crate) const CLUSTERED: u64 = 125;
 
 /// The choice of a run.
 #[derive(Debug, Clone)]
-pub struct Choose {
+pub(crate) struct Choose {
     /// Whether the size of the output is asked for.
     pub has_target: bool,
 }
 
+/// Adds the stage where survivors both are pruned by views and merge.
+pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
+    if planning.prunes_by_views() && planning.merges && planning.request.recipe.select.choose_by_views {
+        stages.add(Phase::Reduce, Choose { has_target: planning.target.is_some() });
+    }
+}
+
+impl Stage for Choose {
+    fn estimates(&self, EstimateInput { work, limits, left, .. }: EstimateInput<'_>) -> Vec<ResourceEstimate> {
+        vec![self.need(work, limits, left)]
+    }
+
+    fn run(&self, run: &mut RunState<'_>) -> Result<()> {
+        let (scored, ranking) = (run.scored()?, run.ranking()?);
+        let merged = Outcome { reduction: run.take_result(), summary: run.merge.take() };
+        let found = self.choose(run.scene, &scored, &ranking, merged, &mut run.journal)?;
+        run.result = CompressedModel { sh_degree: run.template.sh_degree, ..found.reduction };
+        run.merge = found.summary;
+        Ok(())
+    }
+}
+
 impl Choose {
     /// Both alternatives, two states of a frame, and pictures. A part `left` of the Gaussians stays.
-    pub fn need(&self, work: &Workload, limits: &Limits, left: f64) -> ResourceEstimate {
+    pub(crate) fn need(&self, work: &Workload, limits: &Limits, left: f64) -> ResourceEstimate {
         let whole = work.state(Columns::all());
         // Merged trajectories are read of all that merge.
         let merging = if work.input.reduced > 0 { left } else { 1.0 };
@@ -75,7 +99,7 @@ impl Choose {
     ///
     /// # Errors
     /// Frames that cannot be read.
-    pub fn run(
+    pub(crate) fn choose(
         &self,
         scene: &Scene,
         scored: &Scored,
@@ -154,9 +178,10 @@ mod tests {
         let merge = MergeStage { recipe: recipe.merge.clone(), scan: recipe.scan.clone(), prunes: true, target };
         let (ranked, mut journal) = (scored.ranked(), Journal::default());
         let survivors = target.map_or(scored.selection.counts.kept, |_| ranked.order().len());
-        let merged = merge.run(scene, scored, &ranked, survivors, &mut journal).unwrap();
+        let merged = merge.merge(scene, scored, &ranked, survivors, &mut journal).unwrap();
         let before = merged.reduction.clone();
-        let chosen = Choose { has_target: target.is_some() }.run(scene, scored, &ranked, merged, &mut journal).unwrap();
+        let chosen =
+            Choose { has_target: target.is_some() }.choose(scene, scored, &ranked, merged, &mut journal).unwrap();
         (before, chosen, journal)
     }
 

@@ -11,8 +11,9 @@ use crate::error::Result;
 use crate::journal::Journal;
 use crate::limits::Limits;
 use crate::memory_plan::{ResourceEstimate, Workload};
-use crate::pipeline::request::{Goal, Request};
-use crate::pipeline::search::size::ByteLimitFit;
+use crate::pipeline::planning::Planning;
+use crate::pipeline::request::Goal;
+use crate::pipeline::stage::{ByteLimitFit, EstimateInput, Phase, RunState, Stage, StageList};
 use crate::pruning::Ranking;
 use crate::pruning::score::Scored;
 use crate::recipe::WhichBands;
@@ -27,20 +28,40 @@ const STEPS: f64 = 0.2;
 
 /// The choice of a run.
 #[derive(Debug, Clone)]
-pub struct Degree {
+pub(crate) struct Degree {
     /// How a degree is tried.
     refine: RefineStage,
 }
 
-impl Degree {
-    /// The stage, of a run that is asked for so many bytes, refines (`refine`), and may drop bands.
-    pub fn from_request(request: &Request, refine: Option<&RefineStage>) -> Option<Degree> {
-        let chooses = matches!(request.goal, Some(Goal::Bytes(_))) && request.recipe.bands.bands == WhichBands::Needed;
-        refine.filter(|_| chooses).map(|refine| Degree { refine: refine.in_part(STEPS) })
+/// Adds the stage to a run that is asked for so many bytes, refines, and may drop bands.
+pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
+    let request = planning.request;
+    let chooses = matches!(request.goal, Some(Goal::Bytes(_))) && request.recipe.bands.bands == WhichBands::Needed;
+    if let Some(refine) = planning.refine.as_ref().filter(|_| chooses) {
+        stages.set_open_ended();
+        stages.add(Phase::Rank, Degree { refine: refine.in_part(STEPS) });
+    }
+}
+
+impl Stage for Degree {
+    fn estimates(&self, EstimateInput { work, limits, .. }: EstimateInput<'_>) -> Vec<ResourceEstimate> {
+        vec![self.need(work, limits)]
     }
 
+    fn run(&self, run: &mut RunState<'_>) -> Result<()> {
+        if run.fits.len() > 1 {
+            let (scored, ranking) = (run.scored()?, run.ranking()?);
+            let fit = self.best(run.scene, &scored, &ranking, &run.template, &run.fits, &mut run.journal)?;
+            run.template.sh_degree = fit.sh_degree;
+            run.target = Some(fit.gaussians);
+        }
+        Ok(())
+    }
+}
+
+impl Degree {
     /// What refining needs, once for every degree.
-    pub fn need(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
+    pub(crate) fn need(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
         let need = self.refine.need(work, limits);
         let degrees = 1.0 + work.sh_degree as f64;
         ResourceEstimate { stage: NAME, seconds: degrees * need.seconds, reads: degrees * need.reads, ..need }
@@ -50,7 +71,7 @@ impl Degree {
     ///
     /// # Errors
     /// Frames that cannot be read; a scratch file that cannot be written.
-    pub(crate) fn run(
+    fn best(
         &self,
         scene: &Scene,
         scored: &Scored,

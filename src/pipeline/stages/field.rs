@@ -12,7 +12,9 @@ use crate::metrics::psnr;
 use crate::model::{Columns, Picture};
 use crate::outputs::kind::OutputKind;
 use crate::passes::{Batch, Subject, show, spread};
+use crate::pipeline::planning::Planning;
 use crate::pipeline::request::Request;
+use crate::pipeline::stage::{EstimateInput, Phase, RunState, Stage, StageList};
 use crate::progress::Progress;
 use crate::pruning::score::scored_memory;
 use crate::recipe::Precision;
@@ -28,21 +30,43 @@ pub(crate) const PICTURES: usize = 12;
 
 /// The precision of a result's field.
 #[derive(Debug, Clone)]
-pub struct FieldPrecisionStage {
+pub(crate) struct FieldPrecisionStage {
     /// How much closer pictures stay to those of the exact field than to the original's, dB.
     pub margin: f64,
 }
 
+/// Adds the stage where the field may change.
+pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
+    if let Some(stage) = FieldPrecisionStage::from_request(planning.request, planning.output) {
+        stages.add(Phase::Reduce, stage);
+    }
+}
+
+impl Stage for FieldPrecisionStage {
+    fn estimates(&self, EstimateInput { work, limits, left, .. }: EstimateInput<'_>) -> Vec<ResourceEstimate> {
+        vec![self.need(work, limits, left)]
+    }
+
+    fn run(&self, run: &mut RunState<'_>) -> Result<()> {
+        let (scene, result) = (run.scene, run.take_result());
+        let (count, key) = (result.len(), scene.work.key(&(self.margin, &result)));
+        run.result = run
+            .journal
+            .kept_stage(NAME, count, scene, key, |journal| Ok((self.round(scene, result, journal)?, count)))?;
+        Ok(())
+    }
+}
+
 impl FieldPrecisionStage {
     /// The stage, of a run that writes a model and whose field may change.
-    pub fn from_request(request: &Request, kind: OutputKind) -> Option<FieldPrecisionStage> {
+    pub(crate) fn from_request(request: &Request, kind: OutputKind) -> Option<FieldPrecisionStage> {
         let field = &request.recipe.field;
         (kind == OutputKind::Model && field.field == Precision::Half)
             .then_some(FieldPrecisionStage { margin: field.field_margin })
     }
 
     /// Two states, pictures, and the field once more. A part `left` of the Gaussians stays.
-    pub fn need(&self, work: &Workload, limits: &Limits, left: f64) -> ResourceEstimate {
+    pub(crate) fn need(&self, work: &Workload, limits: &Limits, left: f64) -> ResourceEstimate {
         let whole = work.state(Columns::all());
         let per_gaussian = vec![
             ("kept", of_left(left, 24)),
@@ -67,18 +91,12 @@ impl FieldPrecisionStage {
         }
     }
 
-    /// `reduction` with its field in half precision, if that shows in pictures no more than it may.
+    /// Returns `reduction` with its field in half precision, if the input can have that and it shows in pictures no more
+    /// than it may.
     ///
     /// # Errors
     /// Frames that cannot be read.
-    pub fn run(&self, scene: &Scene, reduction: CompressedModel, journal: &mut Journal) -> Result<CompressedModel> {
-        let count = reduction.len();
-        let key = scene.work.key(&(self.margin, &reduction));
-        journal.kept_stage(NAME, count, scene, key, |journal| Ok((self.round(scene, reduction, journal)?, count)))
-    }
-
-    /// [`FieldPrecisionStage::run`] of an input that can, as a part of another stage.
-    pub fn round(&self, scene: &Scene, reduction: CompressedModel, journal: &mut Journal) -> Result<CompressedModel> {
+    fn round(&self, scene: &Scene, reduction: CompressedModel, journal: &mut Journal) -> Result<CompressedModel> {
         if !scene.input.can_round_field()? {
             return Ok(reduction);
         }

@@ -1,58 +1,32 @@
 //! From frames to a selection: the stages `scan`, `visible` and `score`, which `score` and `report` run too.
 
-use super::scan::ScanStage;
+use std::sync::Arc;
+
+use super::scan::{self, ScanStage};
 use crate::error::Result;
 use crate::journal::Journal;
 use crate::limits::Limits;
 use crate::memory_plan::{ResourceEstimate, Workload};
-use crate::outputs::kind::OutputKind;
-use crate::pruning::contribution::VisibleContribution;
+use crate::pipeline::planning::Planning;
+use crate::pipeline::stage::{
+    CountPlan, EstimateInput, Measured, MeasuredOnArrival, Phase, RunState, Stage, StageList,
+};
 use crate::pruning::score;
 use crate::pruning::score::{ScoreStage, Scored, UserOverrides};
-use crate::pruning::visible::Visible;
-use crate::recipe::Recipe;
+use crate::pruning::visible::{self, Visible};
+use crate::recipe::{Coverage, Recipe};
 use crate::scene::Scene;
-use crate::statistics::pass::Scanned;
+use crate::statistics::pass::{Scanned, scan_units};
 
-/// What is known of a scene before its frames are read.
-#[derive(Debug, Clone, Copy)]
-pub struct InputMeta {
-    /// N.
-    pub gaussians: usize,
-    /// Whether the cameras are the scene's own, not a virtual rig.
-    pub has_cameras: bool,
-    /// The kind of result to which neither the user nor its name gives one.
-    pub own_output: OutputKind,
-}
-
-impl InputMeta {
-    /// Of an open scene.
-    pub fn from_scene(scene: &Scene) -> InputMeta {
-        InputMeta {
-            gaussians: scene.source().info().count,
-            has_cameras: scene.has_cameras,
-            own_output: scene.input.own_output(),
-        }
+/// Adds the stages that measure and score.
+pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
+    let scan = &planning.request.recipe.scan;
+    if scan.coverage == Coverage::Auto && !planning.input.has_cameras {
+        let why = "no cameras given or found: a virtual rig may see only what is in front of the scene";
+        let visible = Visible { recipe: scan.clone() };
+        stages.leave_out_stage("visible coverage", why, move |work, limits| visible.need(work, limits));
     }
-}
-
-/// What is done with a scene that begins with measuring it.
-pub trait Stages {
-    /// The stages that measure.
-    fn measure(&self) -> &Measure;
-
-    /// What all its stages need.
-    fn needs(&self, work: &Workload, limits: &Limits) -> Vec<ResourceEstimate>;
-
-    /// What they need at best, where pictures hardly differ without a part `hardly_seen` of the Gaussians.
-    fn easiest(&self, work: &Workload, limits: &Limits, _hardly_seen: f64) -> Vec<ResourceEstimate> {
-        self.needs(work, limits)
-    }
-
-    /// Whether it is only found on the way how much there is to do.
-    fn searches(&self) -> bool {
-        false
-    }
+    stages.add(Phase::Rank, Measure::from_planning(planning));
 }
 
 /// The stages that measure and score.
@@ -66,15 +40,12 @@ pub struct Measure {
     pub score: ScoreStage,
 }
 
-/// What the frames say before anything is scored.
-pub struct Measured {
-    /// Statistics of every Gaussian.
-    pub scanned: Scanned,
-    /// What the pictures show of each, where they were looked at.
-    pub seen: Option<VisibleContribution>,
-}
-
 impl Measure {
+    /// Returns the stages that a run needs.
+    pub(in crate::pipeline) fn from_planning(planning: &Planning<'_>) -> Measure {
+        Measure::new(&planning.request.recipe, planning.input.has_cameras, planning.user.clone())
+    }
+
     /// As `recipe` has it; `has_cameras`: the scene has cameras of its own.
     pub fn new(recipe: &Recipe, has_cameras: bool, user: UserOverrides) -> Measure {
         Measure {
@@ -90,18 +61,26 @@ impl Measure {
         }
     }
 
+    /// Returns what measuring and scoring take, but for what is `measured` already.
+    pub fn needs(&self, work: &Workload, limits: &Limits, measured: MeasuredOnArrival) -> Vec<ResourceEstimate> {
+        let scan = (!measured.scanned).then(|| self.scan.need(work, limits));
+        let visible = self.visible.as_ref().filter(|_| !measured.seen).map(|visible| visible.need(work, limits));
+        [scan, visible, Some(self.score.need(work, limits))].into_iter().flatten().collect()
+    }
+
     /// Measures, unless the scene was measured as it arrived, and scores.
     ///
     /// # Errors
     /// Those of the stages.
-    pub fn run(&self, scene: &Scene, arrived: Option<Measured>, journal: &mut Journal) -> Result<Scored> {
+    pub fn measure(&self, scene: &Scene, arrived: Option<Measured>, journal: &mut Journal) -> Result<Scored> {
         scene.set_absent(&[]);
         let ScoreStage { snap_noise, non_finite, score, select, user, .. } = &self.score;
         let key = scene.work.key(&(
             (&self.scan.recipe, self.visible.is_some(), snap_noise, non_finite, score, user),
             (select.keep_fraction, select.tau_static, select.tau_dynamic, select.low_priority),
         ));
-        let scored = journal.kept(&scene.work, score::NAME, key, |journal| self.measure(scene, arrived, journal))?;
+        let scored =
+            journal.kept(&scene.work, score::NAME, key, |journal| self.measure_anew(scene, arrived, journal))?;
         scene.set_absent(&scored.absent);
         scored.within(&scene.limits, &scene.scratch)
     }
@@ -122,7 +101,7 @@ impl Measure {
         self.scan.run(scene, journal)
     }
 
-    fn measure(&self, scene: &Scene, arrived: Option<Measured>, journal: &mut Journal) -> Result<Scored> {
+    fn measure_anew(&self, scene: &Scene, arrived: Option<Measured>, journal: &mut Journal) -> Result<Scored> {
         let Measured { scanned, seen } = match arrived {
             Some(measured) => measured,
             None => Measured { scanned: self.scan(scene, journal)?, seen: None },
@@ -135,14 +114,37 @@ impl Measure {
     }
 }
 
-impl Stages for Measure {
-    fn measure(&self) -> &Measure {
-        self
+impl Stage for Measure {
+    fn estimates(&self, EstimateInput { work, limits, measured, .. }: EstimateInput<'_>) -> Vec<ResourceEstimate> {
+        self.needs(work, limits, measured)
     }
 
-    fn needs(&self, work: &Workload, limits: &Limits) -> Vec<ResourceEstimate> {
-        let visible = self.visible.as_ref().map(|visible| visible.need(work, limits));
-        let scan = self.scan.need(work, limits);
-        [Some(scan), visible, Some(self.score.need(work, limits))].into_iter().flatten().collect()
+    fn parameters(&self) -> String {
+        match &self.visible {
+            Some(visible) if visible.recipe.look_pictures > 0 => {
+                format!("visible: {} views at most", visible.recipe.look_pictures)
+            }
+            Some(_) => "visible: every view".to_owned(),
+            None => String::new(),
+        }
+    }
+
+    fn shardable_units(&self, scene: &Scene, _: &CountPlan) -> Vec<String> {
+        let mut units = vec![format!("{}: {} blocks of Gaussians", scan::NAME, scan_units(scene.source().info()))];
+        if let Some(visible) = &self.visible {
+            let most = match visible.recipe.look_pictures {
+                0 => scene.schedule.pairs(),
+                most => most.min(scene.schedule.pairs()),
+            };
+            units.push(format!("{}: {most} pictures", visible::NAME));
+        }
+        units
+    }
+
+    fn run(&self, run: &mut RunState<'_>) -> Result<()> {
+        let scored = self.measure(run.scene, run.arrived.take(), &mut run.journal)?;
+        run.ranking = Some(Arc::new(scored.ranked()));
+        run.scored = Some(Arc::new(scored));
+        Ok(())
     }
 }

@@ -27,10 +27,12 @@ use crate::merging::{Merged, RequestedPairs, Survivors};
 use crate::model::{Column, Columns, Gaussians};
 use crate::models::trajectories::state_bytes;
 use crate::passes::{BLOCK, gather};
+use crate::pipeline::planning::Planning;
+use crate::pipeline::request::Only;
+use crate::pipeline::stage::{CountPlan, EstimateInput, Phase, RunState, Stage, StageList};
 use crate::pipeline::summary::MergeSummary;
 use crate::progress::Progress;
 use crate::pruning::Ranking;
-use crate::pruning::prune::Prune;
 use crate::pruning::score::{Scored, scored_memory};
 use crate::recipe;
 use crate::scene::Scene;
@@ -62,7 +64,7 @@ const FOLLOWED: f64 = 0.3;
 
 /// The merging of a run.
 #[derive(Debug, Clone)]
-pub struct MergeStage {
+pub(crate) struct MergeStage {
     /// Tests, passes and how members make up a proxy.
     pub recipe: recipe::MergeParams,
     /// What is life, and what is a step.
@@ -75,26 +77,65 @@ pub struct MergeStage {
 
 /// A reduction, and what merging did to get there.
 #[derive(Serialize, Deserialize)]
-pub struct Outcome {
+pub(crate) struct Outcome {
     /// What is left.
     pub reduction: CompressedModel,
     /// Counts of every pass.
     pub summary: Option<MergeSummary>,
 }
 
-impl MergeStage {
-    /// The merging that `recipe` has follow on `prune`.
-    pub fn after(prune: &Prune, recipe: &recipe::Recipe) -> MergeStage {
-        MergeStage {
-            recipe: recipe.merge.clone(),
-            scan: recipe.scan.clone(),
-            prunes: prune.prunes,
-            target: prune.target,
-        }
+/// Adds the stage where survivors merge.
+pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
+    let recipe = &planning.request.recipe;
+    let stage = MergeStage {
+        recipe: recipe.merge.clone(),
+        scan: recipe.scan.clone(),
+        prunes: planning.prunes,
+        target: planning.target,
+    };
+    if planning.merges {
+        stages.add(Phase::Reduce, stage);
+        return;
+    }
+    let what = "merging, and its pass over the frames";
+    let has_passes = !recipe.merge.passes.is_empty();
+    let why = match planning.request.only {
+        Only::Prune => "--prune-only",
+        _ if !has_passes => "the recipe has no merge pass",
+        _ if planning.request.goal.is_some() => "a quality or a size on disk is found by pruning",
+        _ => "refining what is left gains more at the same count (--no-refine merges)",
+    };
+    match has_passes {
+        true => stages.leave_out_stage(what, why, move |work, limits| stage.need(work, limits)),
+        false => stages.leave_out(what, why),
+    }
+}
+
+impl Stage for MergeStage {
+    fn estimates(&self, EstimateInput { work, limits, .. }: EstimateInput<'_>) -> Vec<ResourceEstimate> {
+        vec![self.need(work, limits)]
     }
 
+    fn parameters(&self) -> String {
+        format!("merge: {} passes", self.recipe.passes.len())
+    }
+
+    fn shardable_units(&self, _: &Scene, _: &CountPlan) -> Vec<String> {
+        self.recipe.passes.iter().map(|_| format!("{PAIRS}: pairs of neighbours")).collect()
+    }
+
+    fn run(&self, run: &mut RunState<'_>) -> Result<()> {
+        let (scored, ranking) = (run.scored()?, run.ranking()?);
+        let found = self.merge(run.scene, &scored, &ranking, run.result.len(), &mut run.journal)?;
+        run.result = CompressedModel { sh_degree: run.template.sh_degree, ..found.reduction };
+        run.merge = found.summary;
+        Ok(())
+    }
+}
+
+impl MergeStage {
     /// What is known of pairs that are measured together and of all that may survive, and the proxies.
-    pub fn need(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
+    pub(crate) fn need(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
         let pairs = (merging::BYTES_PER_PAIR + motion_pass::BYTES_PER_PAIR) as u64;
         // Of the colors the first band; of proxies at most one for every two, before a pass and after it, then with
         // all colors.
@@ -126,7 +167,7 @@ impl MergeStage {
     ///
     /// # Errors
     /// Frames that cannot be read; a target that merging alone cannot reach.
-    pub fn run(
+    pub(crate) fn merge(
         &self,
         scene: &Scene,
         scored: &Scored,

@@ -1,4 +1,5 @@
-//! Stages of the pipeline that call on several topics; those of one topic are in its folder (`pruning`, `refinement`).
+//! The stages of a run, a file each, in the order of [`STAGES`]. What they compute lies in the folders of its topic
+//! (`statistics`, `pruning`, `merging`, `refinement`, `archive`).
 
 pub mod archive;
 pub(crate) mod bands;
@@ -8,6 +9,33 @@ pub(crate) mod degree;
 pub(crate) mod field;
 pub mod measure;
 pub(crate) mod merge;
+pub(crate) mod prune;
 pub(crate) mod reference_views;
+pub(crate) mod refine;
+pub(crate) mod rounds;
 pub(crate) mod scan;
+pub(crate) mod size;
 pub mod write;
+
+use super::planning::Planning;
+use super::stage::StageList;
+
+/// Adds a stage to the list if the request needs it, or records why the run goes without it.
+pub(super) type PlanStage = fn(&Planning<'_>, &mut StageList);
+
+/// Every stage in the order in which stages run.
+pub(super) const STAGES: &[PlanStage] = &[
+    measure::plan,
+    size::plan_count,
+    rounds::plan,
+    degree::plan,
+    prune::plan,
+    merge::plan,
+    choose::plan,
+    refine::plan,
+    field::plan,
+    bands::plan,
+    size::plan_shrink,
+    archive::plan,
+    write::plan,
+];

@@ -4,14 +4,15 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use super::archive::Archived;
 use super::bounds;
 use super::choose::CLUSTERED;
+use crate::TOOL;
 use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result};
 use crate::files::atomic::{
     Kind, MARKER, Replace, ScratchFolder, StagedFiles, StagedFolder, check_target, check_targets,
 };
+use crate::files::names::name_of;
 use crate::journal::Journal;
 use crate::limits::Limits;
 use crate::memory_plan::{ResourceEstimate, Workload, of_left};
@@ -21,8 +22,9 @@ use crate::outputs::bounds::Bounds;
 use crate::outputs::container::{FRAME_BLOCK, write_container};
 use crate::outputs::index_map::write_index_map;
 use crate::outputs::kind::OutputKind;
-use crate::pipeline::request::Request;
-use crate::pipeline::summary::Summary;
+use crate::pipeline::planning::Planning;
+use crate::pipeline::stage::{Archived, EstimateInput, Phase, RunState, Stage, StageList};
+use crate::pipeline::summary::{self, CameraSummary, InputSummary, Summary};
 use crate::progress::Progress;
 use crate::pruning::score::scored_memory;
 use crate::scene::Scene;
@@ -73,18 +75,85 @@ pub struct Emit {
     overwrite: Replace,
 }
 
+/// Adds the stage.
+pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
+    stages.add(Phase::Write, Emit::from_planning(planning));
+}
+
+impl Stage for Emit {
+    fn estimates(&self, EstimateInput { work, limits, left, .. }: EstimateInput<'_>) -> Vec<ResourceEstimate> {
+        vec![self.need(work, limits, left)]
+    }
+
+    fn check(&self, scene: &Scene) -> Result<()> {
+        self.kind.check_frames(scene.source().info().times.len(), &self.output)?;
+        scene.input.check_output(self.kind, &self.output)
+    }
+
+    fn run(&self, run: &mut RunState<'_>) -> Result<()> {
+        run.scene.work.not_divided("writing")?;
+        let scored = run.scored()?;
+        let mut map = run.result.index_map(run.scene.source().info().count);
+        if let Some(Archived::Content(encoded)) = &run.archived {
+            reorder(&mut map, &encoded.order);
+        }
+        let journal = std::mem::take(&mut run.journal);
+        let input = InputSummary::from_scene(run.scene)?.without_folders();
+        let (merge, goal, archive) = (run.merge.take(), run.goal.take(), run.archive.take());
+        let summarize = |journal: Journal, output: Size| Summary {
+            schema: summary::SCHEMA,
+            files: Vec::new(),
+            tool: TOOL.to_owned(),
+            cameras: CameraSummary::from_scene(run.scene),
+            output: name_of(&self.output),
+            gaussians: run.result.len(),
+            output_bytes: output.whole(),
+            output_size: output,
+            selection: scored.selection.counts,
+            terms: scored.term_summaries(),
+            flags: scored.flags.clone(),
+            merge,
+            goal,
+            field: journal.field,
+            bands: journal.bands,
+            refined: journal.refined,
+            archive,
+            left_out: journal.left_out,
+            notes: journal.notes,
+            planned_reads: run.scene.planned_reads,
+            forecast: journal.forecast,
+            stages: journal.stages,
+            input,
+        };
+        let archived = run.archived.as_ref();
+        let mut summary = self.write(run.scene, &run.result, (&map, archived), &run.recipe, journal, summarize)?;
+        // The file has names alone, for it is published; whoever asked for the run sees the paths as they were given.
+        summary.input.path = run.scene.path.to_string_lossy().into_owned();
+        summary.output = self.output.to_string_lossy().into_owned();
+        run.written = Some((map, summary));
+        Ok(())
+    }
+}
+
+/// Has places follow those of an archive, whose Gaussian `i` was at `order[i]`.
+fn reorder(map: &mut [Option<u32>], order: &[u32]) {
+    let mut places = vec![0; order.len()];
+    order.iter().zip(0..).for_each(|(&before, now)| places[before as usize] = now);
+    map.iter_mut().flatten().for_each(|place| *place = places[*place as usize]);
+}
+
 impl Emit {
-    /// As `request` asks, of an input whose own kind of result is `own`.
-    pub fn new(request: &Request, own: OutputKind, merges: bool) -> Emit {
-        let kind = OutputKind::from_path(&request.output, request.kind, own);
-        Emit { kind, merges, output: request.output.clone(), overwrite: request.overwrite }
+    /// Returns the writing that a run needs.
+    pub(in crate::pipeline) fn from_planning(planning: &Planning<'_>) -> Emit {
+        let Planning { request, output, merges, .. } = *planning;
+        Emit { kind: output, merges, output: request.output.clone(), overwrite: request.overwrite }
     }
 
     /// Confirms, before any work, that the result and what goes beside it can be written by a run that reads `inputs`.
     ///
     /// # Errors
     /// Outputs that are there already, or cannot be; see [`check_target`].
-    pub fn check(&self, inputs: &[&Path]) -> Result<()> {
+    pub fn check_target(&self, inputs: &[&Path]) -> Result<()> {
         if self.kind.is_folder() {
             return check_target(&self.output, Kind::Folder, inputs, self.overwrite);
         }
@@ -169,7 +238,7 @@ impl Emit {
     ///
     /// # Errors
     /// Frames that cannot be read, a failed write; nothing is left behind then.
-    pub fn run(
+    fn write(
         &self,
         scene: &Scene,
         reduction: &CompressedModel,

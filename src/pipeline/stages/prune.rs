@@ -1,9 +1,12 @@
 //! Stage `prune`: how many of the ranking survive, as far as that is known before anything merges.
 
-use super::score::Scored;
 use crate::error::{Error, Result};
 use crate::journal::Journal;
+use crate::memory_plan::ResourceEstimate;
+use crate::pipeline::planning::Planning;
+use crate::pipeline::stage::{EstimateInput, Phase, RunState, Stage, StageList};
 use crate::pruning::Ranking;
+use crate::pruning::score::Scored;
 use crate::scene::Scene;
 
 /// What the stage is called.
@@ -11,27 +14,57 @@ const NAME: &str = "prune";
 
 /// The pruning of a run.
 #[derive(Debug, Clone)]
-pub struct Prune {
+pub(crate) struct Prune {
     /// Whether anybody is pruned who is not to be dropped.
     pub prunes: bool,
     /// Whether survivors merge afterwards.
     pub merges: bool,
-    /// Exact size of the output.
-    pub target: Option<usize>,
+}
+
+/// Adds the stage.
+pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
+    if !planning.prunes {
+        stages.leave_out("pruning", "--merge-only");
+    }
+    stages.add(Phase::Reduce, Prune { prunes: planning.prunes, merges: planning.merges });
+}
+
+impl Stage for Prune {
+    fn estimates(&self, _: EstimateInput<'_>) -> Vec<ResourceEstimate> {
+        Vec::new()
+    }
+
+    fn run(&self, run: &mut RunState<'_>) -> Result<()> {
+        let (scored, ranking) = (run.scored()?, run.ranking()?);
+        let most = ranking.order().len();
+        // More may fit into a size on disk than may stay.
+        let target = run.target.map(|target| if run.request.goal.is_some() { target.min(most) } else { target });
+        run.wanted = self.survivors(run.scene, &scored, &ranking, target, &mut run.journal)?;
+        let survivors = run.stages.counts.before_refinement(run.wanted, scored.count()).min(most);
+        run.result = run.template.with(ranking.take(survivors));
+        Ok(())
+    }
 }
 
 impl Prune {
-    /// Number of survivors: of a run that is to merge down to a target all that may survive, for only merging tells how
-    /// many are needed.
+    /// Returns the number of survivors, exactly `target` where it is given. Of a run that merges down to a target all that may
+    /// survive do, for only merging tells how many are needed.
     ///
     /// # Errors
     /// A target that protected or dropped Gaussians rule out.
-    pub fn run(&self, scene: &Scene, scored: &Scored, ranked: &Ranking, journal: &mut Journal) -> Result<usize> {
+    pub(crate) fn survivors(
+        &self,
+        scene: &Scene,
+        scored: &Scored,
+        ranked: &Ranking,
+        target: Option<usize>,
+        journal: &mut Journal,
+    ) -> Result<usize> {
         let all = ranked.order().len();
-        if let Some(target) = self.target {
+        if let Some(target) = target {
             check_reachable(target, scored, all)?;
         }
-        let survivors = match self.target {
+        let survivors = match target {
             _ if !self.prunes => all,
             None => scored.selection.counts.kept,
             Some(target) if !self.merges => target,
@@ -70,7 +103,7 @@ mod tests {
         let scored = score_scene(&scene, &Recipe::preset("default").unwrap(), &user);
         let own = scored.selection.counts.kept;
         let run = |prunes, merges, target| {
-            Prune { prunes, merges, target }.run(&scene, &scored, &scored.ranked(), &mut Journal::default())
+            Prune { prunes, merges }.survivors(&scene, &scored, &scored.ranked(), target, &mut Journal::default())
         };
         for (prunes, merges, target, expected) in [
             (true, true, None, own),

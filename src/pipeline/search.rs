@@ -1,31 +1,32 @@
-//! Stage `search`: the smallest model that is as good as asked for.
+//! The search for the smallest model that is as good as asked for: a loop around the stages that reduce the model.
 //!
 //! Sizes are tried one after the other, each refined as if it had been asked for; the next one follows from how much
 //! quality the last ones had to spare, and lies between the largest that did not do and the smallest that did. Cuts on the
 //! way down are kept, so that a smaller size goes on from there. A quarter of the pictures is never searched on and gives
 //! the figure that is reported (method.md, section 6.3).
 
-pub(crate) mod quality_meter;
-pub(crate) mod size;
-
-use super::request::Quality;
+use super::planning::Planning;
+use super::quality_meter::{QualityMeter, With};
+use super::request::{Goal, Quality};
+use super::stage::{EstimateInput, Phase, RunState};
+use super::stages::bands::ShDegreeStage;
+use super::stages::choose::CLUSTERED;
+use super::stages::field::FieldPrecisionStage;
+use super::stages::reference_views::LEFT_BY_SEARCH;
 use super::summary::GoalSummary;
 use crate::cache::CacheKey;
 use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result, ShowPath};
 use crate::journal::Journal;
 use crate::journal::as_toml::AsToml;
-use crate::limits::Limits;
-use crate::memory_plan::{MemoryPart, PICTURE_ON_ALL_THREADS, RENDER, ResourceEstimate, Workload};
+use crate::memory_plan::{PICTURE_ON_ALL_THREADS, RENDER, ResourceEstimate};
 use crate::model::{Columns, Picture};
-use crate::pipeline::search::quality_meter::{QualityMeter, With};
-use crate::pipeline::stages::bands::ShDegreeStage;
-use crate::pipeline::stages::choose::CLUSTERED;
-use crate::pipeline::stages::field::FieldPrecisionStage;
+use crate::outputs::kind::OutputKind;
 use crate::pruning::Ranking;
 use crate::pruning::score::{Scored, scored_memory};
-use crate::refinement::targets::Targets;
-use crate::refinement::{CUT, RefineRun, RefineStage};
+use crate::refinement::prune_steps::PruneSteps;
+use crate::refinement::targets::{Parted, Targets};
+use crate::refinement::{RefineRun, RefineStage};
 use crate::render;
 use crate::scene::Scene;
 use crate::scene::photographs::Photographs;
@@ -37,8 +38,8 @@ use crate::source::FrameSource;
 const NAME: &str = "search";
 /// Part of the Gaussians that is tried first.
 const FIRST: f64 = 0.2;
-/// Part that rounds leave where nothing is refined.
-const FEWEST: f64 = 0.02;
+/// Sizes that are usually tried, for estimates.
+const SIZES_USUALLY_TRIED: f64 = 4.0;
 /// Sizes that are tried at most.
 const MOST_TRIED: usize = 8;
 /// Neighboring sizes whose ratio is this or less are not told apart.
@@ -52,46 +53,62 @@ const LEAST_LOSS: f64 = 1e-3;
 /// Of the photographs every fourth is held back.
 const HELD_EVERY: usize = 4;
 
-/// The search of a run.
+/// The search of a run: repeats the stages that reduce the model, once for every size it tries.
 #[derive(Debug, Clone)]
 pub struct SearchStage {
     /// What is asked for.
-    pub quality: Quality,
+    quality: Quality,
+    /// What is searched for: an archive takes some of the quality that is found.
+    searched: Quality,
     /// Pictures of the original that sizes are compared and refined by.
-    pub pictures: usize,
+    pictures: usize,
     /// How a size is refined.
-    pub refine: Option<RefineStage>,
-    /// How its field is rounded.
-    pub field: Option<FieldPrecisionStage>,
-    /// How bands of its harmonics are dropped.
-    pub bands: Option<ShDegreeStage>,
+    refine: Option<RefineStage>,
+    /// Margins, dB, by which the field of a size is rounded and bands of its harmonics are dropped; none: they stay.
+    margins: [Option<f64>; 2],
 }
 
 /// A size that was tried.
 struct TriedSize {
-    reduction: CompressedModel,
+    result: CompressedModel,
     /// dB or dB lost, by the pictures that are searched on.
     value: f64,
     journal: Journal,
 }
 
 impl SearchStage {
-    /// How many of `all` Gaussians rounds are to rank down to.
-    pub fn fewest(&self, all: usize) -> usize {
-        self.refine.as_ref().map_or((FEWEST * all as f64).ceil() as usize, |refine| refine.first(0, all))
+    /// Returns the search of a run that asks for a quality.
+    pub fn from_planning(planning: &Planning<'_>) -> Option<SearchStage> {
+        let Planning { request, output, .. } = *planning;
+        let Some(Goal::Quality(quality)) = &request.goal else { return None };
+        let searched = match quality {
+            Quality::Psnr(least) if output == OutputKind::Archive => Quality::Psnr(least + LEFT_BY_SEARCH),
+            other => other.clone(),
+        };
+        let field = FieldPrecisionStage::from_request(request, output).map(|stage| stage.margin);
+        let bands = ShDegreeStage::from_request(request, output).map(|stage| stage.margin);
+        Some(SearchStage {
+            quality: quality.clone(),
+            searched,
+            pictures: request.recipe.refine.refine_pictures,
+            refine: planning.refine.clone(),
+            margins: [field, bands],
+        })
     }
 
-    /// What refining needs, what is kept of the way down, and of the best.
-    pub fn need(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
+    /// Returns what is searched for, for a person.
+    pub(super) fn parameters(&self) -> String {
+        format!("search: {} sizes at most, for {} {}", MOST_TRIED, self.name(), self.goal())
+    }
+
+    /// Returns what a search takes whose sizes go through stages that take `repeated`: the largest of them beside what is
+    /// kept of the way down and of the best.
+    pub fn estimate(&self, input: EstimateInput<'_>, repeated: &[ResourceEstimate]) -> ResourceEstimate {
+        let EstimateInput { work, limits, .. } = input;
         let whole = work.state(Columns::all());
         let (reader, held) = (work.input.reader, work.held(limits, Columns::all()));
-        // Cuts of a fifth from two fifths: twice the Gaussians.
-        let ways: Vec<MemoryPart> = vec![("ways", 3 * (whole + 8)), ("result", work.input.reduced)];
-        let refined = self.refine.as_ref().map(|refine| refine.need(work, limits));
         let frames = work.frames.min(128);
-        // A picture, what it is compared with as it is read, and as it is used.
-        let compared = work.threads * (render::STRIP_BYTES as u64 + 28 * work.pixels);
-        let looked = ResourceEstimate {
+        let measured = ResourceEstimate {
             stage: NAME,
             reads: work.scattered_reads(frames, limits),
             seconds: work.reading(work.count(), frames as f64)
@@ -103,51 +120,39 @@ impl SearchStage {
             .concat(),
             fixed: vec![work.arriving()],
         };
-        let mut need = refined.unwrap_or(looked);
-        need.fixed.push(("compared", compared));
-        need.fixed.extend(self.field.as_ref().map(|_| ("field", work.input.fixed)));
+        let (seconds, reads) = repeated.iter().fold((0.0, 0.0), |(s, r), stage| (s + stage.seconds, r + stage.reads));
+        let largest = repeated.iter().chain([&measured]).max_by_key(|stage| stage.bytes(work));
+        let mut need = largest.unwrap_or(&measured).clone();
         need.stage = NAME;
-        (need.seconds, need.reads) = (4.0 * need.seconds, 4.0 * need.reads);
-        need.per_gaussian.extend(ways);
-        need.per_gaussian.push(("kept", CLUSTERED));
+        need.seconds = SIZES_USUALLY_TRIED * seconds.max(measured.seconds);
+        need.reads = SIZES_USUALLY_TRIED * reads.max(measured.reads);
+        // A picture, what it is compared with as it is read, and as it is used.
+        need.fixed.push(("compared", work.threads * (render::STRIP_BYTES as u64 + 28 * work.pixels)));
+        need.fixed.push(("field", work.input.fixed));
+        // Prune steps of a fifth from two fifths: twice the Gaussians.
+        need.per_gaussian.extend([("ways", 3 * (whole + 8)), ("result", work.input.reduced), ("kept", CLUSTERED)]);
         need
     }
 
-    /// The smallest reduction in the manner of `like` found that is as good as asked for.
+    /// Finds the smallest result that is as good as asked for, and leaves it and what it was found by in `run`.
     ///
     /// # Errors
     /// Frames or photographs that cannot be read; too few pictures.
-    pub fn run(
-        &self,
-        scene: &Scene,
-        scored: &Scored,
-        ranked: &Ranking,
-        like: &CompressedModel,
-        journal: &mut Journal,
-    ) -> Result<(CompressedModel, GoalSummary)> {
-        let all = ranked.order().len();
-        let key = self.key(scene, scored, ranked, like)?;
-        let found = journal.kept_stage(NAME, all, scene, key, |journal| {
+    pub fn run(&self, run: &mut RunState<'_>) -> Result<()> {
+        let (scene, scored, ranking) = (run.scene, run.scored()?, run.ranking()?);
+        let key = self.key(scene, &scored, &ranking, &run.template)?;
+        let (request, stages, template) = (run.request, run.stages, &run.template);
+        let found = run.journal.kept_stage(NAME, ranking.order().len(), scene, key, |journal| {
             let photographs = self.photographs(scene)?;
             let targets = Targets::new(scene, self.pictures)?;
             let parts = targets.parted(photographs.is_none());
-            let gauge = match photographs {
-                Some((of, photographs)) => {
-                    journal.notes.push(format!("{} held-out pictures have photographs", of.len()));
-                    let of = of.into_iter().enumerate().map(|(k, of)| (of, k % HELD_EVERY == HELD_EVERY - 1));
-                    QualityMeter::new(scene, &scene.rig.cameras, of.collect(), With::Photographs(photographs))?
-                }
-                None => {
-                    let mut numbers = [&parts.apart[..], &parts.held[..]].concat();
-                    numbers.sort_unstable();
-                    let of = |&k: &usize| (targets.pictures[k], parts.held.contains(&k));
-                    let of = numbers.iter().map(of).collect();
-                    QualityMeter::new(scene, &targets.cameras, of, With::Original(&targets, numbers))?
-                }
-            };
-            let walk = self.refine.as_ref().map(|refine| RefineRun::new(NAME, refine, scene, scored, &targets, parts));
-            let mut way = SearchState { search: self, scene, scored, ranked, like, gauge: &gauge, walk, cuts: Vec::new() };
-            let (best, tried) = self.bracket(&mut way, scored.protected.len().max(1), all)?;
+            let meter = self.meter(scene, &targets, &parts, photographs, journal)?;
+            let mut trial = RunState::new(scene, request, stages, template.clone());
+            (trial.scored, trial.ranking) = (Some(scored.clone()), Some(ranking.clone()));
+            let steps =
+                |stage| PruneSteps::new(RefineRun::new(NAME, stage, scene, &scored, &targets, parts.clone()));
+            trial.prune_steps = self.refine.as_ref().map(steps);
+            let (best, tried) = self.bracket(&mut trial, &meter)?;
             if best.value.is_nan() {
                 return Err(Error::usage(format!(
                     "--{}: the PSNR of pictures cannot be measured: expected numbers in every pixel, found NaN in some\n  \
@@ -155,24 +160,53 @@ impl SearchStage {
                     self.name().replace('_', "-")
                 )));
             }
-            let result = scene.input.reduced(&best.reduction)?;
-            let summary = self.summary(&best, self.value(&gauge, &*result, scene, true)?, gauge.held(), tried);
+            let result = scene.input.reduced(&best.result)?;
+            let summary = self.summary(&best, self.value(&meter, &*result, scene, true)?, meter.held(), tried);
             drop(result);
-            let (count, does) = (best.reduction.len(), self.spare(summary.searched) >= 0.0);
+            let (count, does) = (best.result.len(), self.spare(summary.searched) >= 0.0);
             journal.left_out.extend(best.journal.left_out);
             journal.notes.extend(best.journal.notes);
             (journal.field, journal.bands) = (best.journal.field, best.journal.bands);
             journal.refined = best.journal.refined;
-            journal.notes.push(note(&summary, gauge.searched(), count, does));
-            Ok(((best.reduction, AsToml(summary)), count))
+            journal.notes.push(note(&summary, meter.searched(), count, does));
+            Ok(((best.result, AsToml(summary)), count))
         });
-        let (reduction, AsToml(summary)) = found?;
-        Ok((reduction, summary))
+        let (result, AsToml(mut goal)) = found?;
+        if let Quality::Psnr(least) = self.quality {
+            goal.asked = least;
+        }
+        (run.result, run.goal) = (result, Some(goal));
+        Ok(())
+    }
+
+    /// Returns what sizes are compared by: photographs, or pictures of the original.
+    fn meter<'a>(
+        &self,
+        scene: &'a Scene,
+        targets: &'a Targets,
+        parts: &Parted,
+        photographs: Option<(Vec<Picture>, Photographs)>,
+        journal: &mut Journal,
+    ) -> Result<QualityMeter<'a>> {
+        match photographs {
+            Some((of, photographs)) => {
+                journal.notes.push(format!("{} held-out pictures have photographs", of.len()));
+                let of = of.into_iter().enumerate().map(|(k, of)| (of, k % HELD_EVERY == HELD_EVERY - 1));
+                QualityMeter::new(scene, &scene.rig.cameras, of.collect(), With::Photographs(photographs))
+            }
+            None => {
+                let mut numbers = [&parts.apart[..], &parts.held[..]].concat();
+                numbers.sort_unstable();
+                let of = |&k: &usize| (targets.pictures[k], parts.held.contains(&k));
+                let of = numbers.iter().map(of).collect();
+                QualityMeter::new(scene, &targets.cameras, of, With::Original(targets, numbers))
+            }
+        }
     }
 
     /// What the search follows from.
     fn key(&self, scene: &Scene, scored: &Scored, ranked: &Ranking, like: &CompressedModel) -> Result<CacheKey> {
-        let (asked, folder) = match &self.quality {
+        let (asked, folder) = match &self.searched {
             Quality::Psnr(least) => (*least, None),
             Quality::Loss { most, photographs } => (*most, Some(photographs)),
         };
@@ -180,9 +214,13 @@ impl SearchStage {
         if let Some(folder) = folder.filter(|_| scene.work.keeps()) {
             stamps(folder, &mut files)?;
         }
-        let (field, bands) = (self.field.as_ref().map(|of| of.margin), self.bands.as_ref().map(|of| of.margin));
         let refine = self.refine.as_ref().map(RefineStage::key);
-        Ok(scene.work.key(&((asked, files, self.pictures, field, bands, refine), &scored.protected, ranked, like)))
+        Ok(scene.work.key(&(
+            (asked, files, self.pictures, self.margins[0], self.margins[1], refine),
+            &scored.protected,
+            ranked,
+            like,
+        )))
     }
 
     /// Confirms, before any work, that there are photographs, where a loss is asked for.
@@ -195,7 +233,7 @@ impl SearchStage {
 
     /// The held-out pictures that have a photograph, and these, where a loss is asked for.
     fn photographs(&self, scene: &Scene) -> Result<Option<(Vec<Picture>, Photographs)>> {
-        let Quality::Loss { photographs, .. } = &self.quality else { return Ok(None) };
+        let Quality::Loss { photographs, .. } = &self.searched else { return Ok(None) };
         let times = &scene.source().info().times;
         let of = pictures(&scene.rig, times, PictureSet::HeldOut)?;
         let found = Photographs::of_some(photographs, &scene.rig, times, of)?;
@@ -208,8 +246,10 @@ impl SearchStage {
         Ok(Some(found))
     }
 
-    /// Tries sizes from `least` to `all`; the smallest that does, or everything, and every size tried with what it has.
-    fn bracket(&self, way: &mut SearchState<'_>, least: usize, all: usize) -> Result<(TriedSize, Vec<(usize, f64)>)> {
+    /// Tries sizes from all protected Gaussians to all that may stay. Returns the smallest that does, or everything, and every
+    /// size tried with what it has.
+    fn bracket(&self, trial: &mut RunState<'_>, meter: &QualityMeter<'_>) -> Result<(TriedSize, Vec<(usize, f64)>)> {
+        let (least, all) = (trial.scored()?.protected.len().max(1), trial.ranking()?.order().len());
         let mut tried: Vec<(usize, f64)> = Vec::new();
         let mut best: Option<TriedSize> = None;
         // Sizes, and halvings that each has to spare: below what does not do, above what does.
@@ -217,7 +257,7 @@ impl SearchStage {
         let mut next = FIRST * all as f64;
         while tried.len() < MOST_TRIED && high.0 - low.0 > 1 && high.0 as f64 > SAME_SIZE * low.0 as f64 {
             let size = (next.round() as usize).clamp(low.0 + 1, high.0 - 1);
-            let now = way.at(size)?;
+            let now = self.try_size(trial, meter, size)?;
             let spare = self.spare(now.value);
             tried.push((size, now.value));
             if spare >= 0.0 {
@@ -240,7 +280,7 @@ impl SearchStage {
         let best = match best {
             Some(best) => best,
             None => {
-                let everything = way.at(all)?;
+                let everything = self.try_size(trial, meter, all)?;
                 tried.push((all, everything.value));
                 everything
             }
@@ -248,22 +288,41 @@ impl SearchStage {
         Ok((best, tried))
     }
 
+    /// Runs the stages that reduce the model to `size` Gaussians and measures what comes out.
+    fn try_size(&self, trial: &mut RunState<'_>, meter: &QualityMeter<'_>, size: usize) -> Result<TriedSize> {
+        (trial.journal, trial.target) = (Journal::default(), Some(size));
+        trial.stages.run(Phase::Reduce, trial)?;
+        let (result, journal) = (trial.take_result(), std::mem::take(&mut trial.journal));
+        let source = trial.scene.input.reduced(&result)?;
+        let value = self.value(meter, &*source, trial.scene, false)?;
+        drop(source);
+        Ok(TriedSize { result, value, journal })
+    }
+
     /// What the goal is about, dB or dB lost, of `result`, by the pictures that are searched on or by those held back.
-    fn value(&self, gauge: &QualityMeter<'_>, result: &dyn FrameSource, scene: &Scene, held: bool) -> Result<f64> {
-        let found = gauge.measure(result, held)?;
-        match self.quality {
-            Quality::Loss { .. } => Ok(gauge.measure(scene.source(), held)? - found),
+    fn value(&self, meter: &QualityMeter<'_>, result: &dyn FrameSource, scene: &Scene, held: bool) -> Result<f64> {
+        let found = meter.measure(result, held)?;
+        match self.searched {
+            Quality::Loss { .. } => Ok(meter.measure(scene.source(), held)? - found),
             Quality::Psnr(_) => Ok(found),
         }
     }
 
     /// Halvings of the number of Gaussians that `value` has to spare, about.
     fn spare(&self, value: f64) -> f64 {
-        match self.quality {
+        match self.searched {
             // Of pictures that are not finite.
             _ if value.is_nan() => f64::NEG_INFINITY,
             Quality::Loss { most, .. } => (most / value.max(LEAST_LOSS)).ln() / HALVING.1.ln(),
             Quality::Psnr(least) => (value - least) / HALVING.0,
+        }
+    }
+
+    /// Returns what is searched for, dB.
+    fn goal(&self) -> f64 {
+        match self.searched {
+            Quality::Psnr(least) => least,
+            Quality::Loss { most, .. } => most,
         }
     }
 
@@ -282,18 +341,9 @@ impl SearchStage {
         held_pictures: Vec<String>,
         tried: Vec<(usize, f64)>,
     ) -> GoalSummary {
-        let asked = match self.quality {
-            Quality::Psnr(least) => least,
-            Quality::Loss { most, .. } => most,
-        };
+        let asked = self.goal();
         GoalSummary { name: self.name().to_owned(), asked, searched: best.value, held, held_pictures, tried }
     }
-}
-
-/// Returns how many of `count` Gaussians the next prune step leaves on the way to `wanted`, of which there are fewer: a part
-/// [`CUT`], and always at least one Gaussian less than before.
-fn next_size(count: usize, wanted: usize) -> usize {
-    ((CUT * count as f64).ceil() as usize).min(count - 1).max(wanted)
 }
 
 /// What was found, for a person: of `gaussians`, by so many pictures searched on, and whether it `does`.
@@ -309,73 +359,4 @@ fn note(summary: &GoalSummary, searched: usize, gaussians: usize, does: bool) ->
         "at {at} {asked} {unit} asked for: {found}; {by_searched:.2} dB by the {searched} pictures searched on, \
          {held:.2} dB by {others} held back (goal.held_pictures in the summary)"
     )
-}
-
-/// The way down, as far as it was gone.
-struct SearchState<'a> {
-    search: &'a SearchStage,
-    scene: &'a Scene,
-    scored: &'a Scored,
-    ranked: &'a Ranking,
-    like: &'a CompressedModel,
-    gauge: &'a QualityMeter<'a>,
-    walk: Option<RefineRun<'a>>,
-    /// What cuts left, larger ones first.
-    cuts: Vec<CompressedModel>,
-}
-
-impl SearchState<'_> {
-    /// The best of `size` Gaussians.
-    fn at(&mut self, size: usize) -> Result<TriedSize> {
-        let mut journal = Journal::default();
-        let all = self.ranked.order().len();
-        let prefix = |size: usize| self.like.with(self.ranked.take(size));
-        let mut reduction = match (&self.search.refine, &mut self.walk) {
-            (Some(refine), Some(walk)) if size < all => {
-                let first = refine.first(size, self.scored.count()).min(all);
-                let cut = self.cuts.iter().rfind(|cut| first > size && cut.len() >= size);
-                let mut start = cut.cloned().unwrap_or_else(|| prefix(first));
-                while start.len() > size {
-                    let next = next_size(start.len(), size);
-                    start = walk.cut_down(&start, next, size)?;
-                    if next > size {
-                        self.cuts.push(start.clone());
-                    }
-                }
-                walk.best_of(start, &mut journal)?
-            }
-            _ => prefix(size),
-        };
-        if let Some(field) = &self.search.field {
-            reduction = field.round(self.scene, reduction, &mut journal)?;
-        }
-        if let Some(bands) = &self.search.bands {
-            reduction = bands.drop_some(self.scene, reduction, &mut journal)?;
-        }
-        let result = self.scene.input.reduced(&reduction)?;
-        let value = self.search.value(self.gauge, &*result, self.scene, false)?;
-        drop(result);
-        Ok(TriedSize { reduction, value, journal })
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn prune_steps_reach_every_size_from_every_count() {
-        for count in 0..=50 {
-            for wanted in 0..count {
-                let (mut left, mut steps) = (count, 0);
-                while left > wanted {
-                    let next = next_size(left, wanted);
-                    assert!((wanted..left).contains(&next), "{left} to {next} on the way to {wanted}");
-                    (left, steps) = (next, steps + 1);
-                }
-                assert!(steps <= count, "{steps} steps from {count} to {wanted}");
-            }
-        }
-        assert_eq!([next_size(1000, 3), next_size(1000, 900), next_size(5, 1)], [800, 900, 4]);
-    }
 }

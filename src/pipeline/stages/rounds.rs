@@ -1,4 +1,4 @@
-//! Ranking by what the pictures would lose, scored anew as the model shrinks.
+//! Stage `rounds`: ranking by what the pictures would lose, scored anew as the model shrinks.
 //!
 //! One look at the whole model cannot rank for strong reductions: when a Gaussian goes, those behind it show
 //! and those that it made superfluous are needed. So each round looks at what is left, ranks it by
@@ -7,10 +7,10 @@
 //! Memory: see [`removal_error`].
 
 use std::ops::Range;
+use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 
-use super::score::{Scored, scored_memory};
 use crate::cache::CacheKey;
 use crate::error::Result;
 use crate::journal::Journal;
@@ -18,9 +18,12 @@ use crate::limits::Limits;
 use crate::memory_plan::{REMOVE, ResourceEstimate, Workload};
 use crate::model::{Columns, Picture};
 use crate::passes::spread_over;
+use crate::pipeline::planning::Planning;
+use crate::pipeline::stage::{CountPlan, EstimateInput, Phase, RunState, Stage, StageList};
 use crate::progress::Progress;
 use crate::pruning::Ranking;
 use crate::pruning::removal::removal_error;
+use crate::pruning::score::{Scored, scored_memory};
 use crate::recipe;
 use crate::scene::Scene;
 
@@ -29,7 +32,7 @@ const NAME: &str = "rounds";
 
 /// The rounds of a run.
 #[derive(Debug, Clone)]
-pub struct Rounds {
+pub(crate) struct Rounds {
     /// Part of the Gaussians that a round leaves.
     pub fraction: f64,
     /// Pictures that a round looks at, the same for a longer sequence.
@@ -49,10 +52,45 @@ const FEWEST: f64 = 0.05;
 /// And usually this one.
 const USUAL: f64 = 0.5;
 
+/// Adds the stage where Gaussians are ranked by views.
+pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
+    let rounds = Rounds::from_recipe(&planning.request.recipe.select, planning.part());
+    if let Some(rounds) = rounds.filter(|_| planning.prunes_by_views()) {
+        stages.add(Phase::Rank, rounds);
+    }
+}
+
+impl Stage for Rounds {
+    fn estimates(&self, EstimateInput { work, limits, .. }: EstimateInput<'_>) -> Vec<ResourceEstimate> {
+        vec![self.need(work, limits)]
+    }
+
+    fn parameters(&self) -> String {
+        let (percent, Rounds { pictures, turns, .. }) = (100.0 * self.fraction, self);
+        format!("rounds: each leaves {percent:.0}% of the Gaussians, by a part of {turns} of {pictures} views")
+    }
+
+    fn shardable_units(&self, scene: &Scene, counts: &CountPlan) -> Vec<String> {
+        let count = scene.source().info().count;
+        let usual = (self.usual * count as f64).ceil() as usize;
+        self.divided(count, counts.after_ranking(usual, count))
+    }
+
+    fn run(&self, run: &mut RunState<'_>) -> Result<()> {
+        let (scored, ranking) = (run.scored()?, run.ranking()?);
+        let wanted = run.target.unwrap_or(scored.selection.counts.kept);
+        let fewest = run.stages.counts.after_ranking(wanted, scored.count());
+        run.ranking = None;
+        let ranking = Arc::unwrap_or_clone(ranking);
+        run.ranking = Some(Arc::new(self.rank(run.scene, &scored, ranking, fewest, &mut run.journal)?));
+        Ok(())
+    }
+}
+
 impl Rounds {
     /// The stage, unless `recipe` ranks once; `target`: the part of the Gaussians that is asked for. Takes visible
     /// contributions.
-    pub fn from_recipe(recipe: &recipe::Select, target: Option<f64>) -> Option<Rounds> {
+    pub(crate) fn from_recipe(recipe: &recipe::Select, target: Option<f64>) -> Option<Rounds> {
         let recipe::Select {
             round_fraction: fraction,
             round_pictures: pictures,
@@ -65,7 +103,7 @@ impl Rounds {
     }
 
     /// The ranking, and pictures of all that is left.
-    pub fn need(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
+    pub(crate) fn need(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
         let (looking, fixed) = work.looking(limits, Columns::all(), 8);
         let all = (self.pictures as u64).min(work.pictures);
         let turns = (self.turns as u64).min(all).max(1);
@@ -115,7 +153,7 @@ impl Rounds {
     ///
     /// # Errors
     /// Frames that cannot be read.
-    pub fn run(
+    pub(crate) fn rank(
         &self,
         scene: &Scene,
         scored: &Scored,
@@ -264,7 +302,7 @@ mod tests {
         let recipe = Recipe::preset("default").unwrap();
         let scored = score_scene(scene, &recipe, user);
         let rounds = Rounds::from_recipe(&recipe.select, None).unwrap();
-        let found = rounds.run(scene, &scored, scored.ranked(), fewest, &mut Journal::default()).unwrap();
+        let found = rounds.rank(scene, &scored, scored.ranked(), fewest, &mut Journal::default()).unwrap();
         (scored.ranked(), found)
     }
 

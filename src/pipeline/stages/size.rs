@@ -1,17 +1,22 @@
-//! As many Gaussians as so many bytes hold.
-
-use serde::{Deserialize, Serialize};
+//! Stages of a run that is asked for a size on disk: `size` finds how many Gaussians fit before anything is ranked, and
+//! shrinks the result at the end where its values take more bytes than those that the count was found by.
 
 use crate::cache::CacheKey;
 use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result};
 use crate::journal::Journal;
+use crate::memory_plan::ResourceEstimate;
 use crate::outputs::kind::OutputKind;
 use crate::passes::{VIEWS_AT_ONCE, spread};
+use crate::pipeline::planning::Planning;
+use crate::pipeline::request::Goal;
+use crate::pipeline::stage::{ByteLimitFit, EstimateInput, Phase, RunState, Stage, StageList};
 use crate::pipeline::stages::archive;
+use crate::pipeline::stages::field::FieldPrecisionStage;
 use crate::pipeline::stages::write::Emit;
 use crate::pruning::removal::removal_error;
 use crate::pruning::score::Scored;
+use crate::recipe::{Precision, WhichBands};
 use crate::scene::Scene;
 
 /// What the stage is called.
@@ -23,34 +28,91 @@ const MOST_TRIED: usize = 8;
 /// Pictures that say who goes, where the values of the best turn out larger than those of any.
 const PICTURES: usize = 48;
 
+/// Adds the stage that finds how many Gaussians fit.
+pub(super) fn plan_count(planning: &Planning<'_>, stages: &mut StageList) {
+    if let Some(limit) = ByteLimit::from_planning(planning) {
+        stages.add(Phase::Rank, CountByBytes { drops_bands: drops_bands(planning), limit });
+    }
+}
+
+/// Adds the stage that shrinks what does not fit. An archive of any number fits on some grids.
+pub(super) fn plan_shrink(planning: &Planning<'_>, stages: &mut StageList) {
+    if let Some(limit) = ByteLimit::from_planning(planning).filter(|_| planning.output != OutputKind::Archive) {
+        stages.add(Phase::Reduce, ShrinkToBytes { limit });
+    }
+}
+
+fn drops_bands(planning: &Planning<'_>) -> bool {
+    planning.refine.is_some() && planning.request.recipe.bands.bands == WhichBands::Needed
+}
+
+/// The stage that finds how many Gaussians fit.
+#[derive(Debug)]
+struct CountByBytes {
+    limit: ByteLimit,
+    /// Whether lower SH degrees are tried, too.
+    drops_bands: bool,
+}
+
+impl Stage for CountByBytes {
+    fn estimates(&self, _: EstimateInput<'_>) -> Vec<ResourceEstimate> {
+        Vec::new()
+    }
+
+    fn run(&self, run: &mut RunState<'_>) -> Result<()> {
+        let like = CompressedModel { field: self.limit.field, ..run.template.clone() };
+        let (present, recipe) = (run.scored()?.present(), run.recipe.len() as u64);
+        run.fits = self.limit.fits(run.scene, (&present, recipe), &like, self.drops_bands, &mut run.journal)?;
+        run.target = run.fits.first().map(|fit| fit.gaussians);
+        Ok(())
+    }
+}
+
+/// The stage that shrinks what does not fit.
+#[derive(Debug)]
+struct ShrinkToBytes {
+    limit: ByteLimit,
+}
+
+impl Stage for ShrinkToBytes {
+    fn estimates(&self, _: EstimateInput<'_>) -> Vec<ResourceEstimate> {
+        Vec::new()
+    }
+
+    fn run(&self, run: &mut RunState<'_>) -> Result<()> {
+        let (scored, result, recipe) = (run.scored()?, run.take_result(), run.recipe.len() as u64);
+        run.result = self.limit.shrink(run.scene, &scored, result, recipe, &mut run.journal)?;
+        Ok(())
+    }
+}
+
 /// So many bytes for everything that is written.
-pub(crate) struct ByteLimit<'a> {
+#[derive(Debug, Clone)]
+struct ByteLimit {
     /// What writes.
-    pub(crate) emit: &'a Emit,
+    emit: Emit,
     /// Bytes at most.
-    pub(crate) most: u64,
-    /// Bytes of the recipe beside the result.
-    pub(crate) recipe: u64,
+    most: u64,
+    /// Precision of the field that takes its room: one that may be rounded is taken in half precision.
+    field: Precision,
 }
 
-/// What fits into so many bytes.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-pub(crate) struct ByteLimitFit {
-    /// Highest SH degree.
-    pub(crate) sh_degree: usize,
-    /// How many Gaussians of that degree.
-    pub(crate) gaussians: usize,
-}
+impl ByteLimit {
+    fn from_planning(planning: &Planning<'_>) -> Option<ByteLimit> {
+        let Some(Goal::Bytes(most)) = planning.request.goal else { return None };
+        let is_rounded = FieldPrecisionStage::from_request(planning.request, planning.output).is_some();
+        let field = if is_rounded { Precision::Half } else { Precision::Exact };
+        Some(ByteLimit { emit: Emit::from_planning(planning), most, field })
+    }
 
-impl ByteLimit<'_> {
     /// [`ByteLimit::count`] of the Gaussians `ids` for the SH degree of `like` and, where bands may go, every lower one, until everything fits.
     ///
     /// # Errors
     /// Those of [`ByteLimit::count`].
-    pub(crate) fn fits(
+    fn fits(
         &self,
         scene: &Scene,
-        ids: &[u32],
+        (ids, recipe): (&[u32], u64),
         like: &CompressedModel,
         drops: bool,
         journal: &mut Journal,
@@ -64,30 +126,36 @@ impl ByteLimit<'_> {
                 break;
             }
             let like = CompressedModel { sh_degree, ..like.clone() };
-            fits.push(ByteLimitFit { sh_degree, gaussians: self.count(scene, ids, &like, journal)? });
+            fits.push(ByteLimitFit { sh_degree, gaussians: self.count(scene, (ids, recipe), &like, journal)? });
         }
         Ok(fits)
     }
 
-    /// What bytes follow from.
-    fn key(&self, scene: &Scene, reduction: &CompressedModel) -> CacheKey {
-        scene.work.key(&(self.emit.kind, self.emit.merges, self.most, self.recipe, reduction))
+    /// What bytes follow from, with a recipe of so many bytes beside the result.
+    fn key(&self, scene: &Scene, recipe: u64, reduction: &CompressedModel) -> CacheKey {
+        scene.work.key(&(self.emit.kind, self.emit.merges, self.most, recipe, reduction))
     }
 
     /// As many of the Gaussians `ids` as fit, of any of them, with the rule and the field of `like`.
     ///
     /// # Errors
     /// Not even one fits; frames that cannot be read, a failed write.
-    fn count(&self, scene: &Scene, ids: &[u32], like: &CompressedModel, journal: &mut Journal) -> Result<usize> {
+    fn count(
+        &self,
+        scene: &Scene,
+        (ids, recipe): (&[u32], u64),
+        like: &CompressedModel,
+        journal: &mut Journal,
+    ) -> Result<usize> {
         let (all, most) = (ids.len(), self.most);
-        journal.kept_stage(NAME, all, scene, self.key(scene, like), |_| {
+        journal.kept_stage(NAME, all, scene, self.key(scene, recipe, like), |_| {
             let bytes = |count: usize| {
                 let kept = (0..count).map(|k| ids[k * all / count]).collect();
                 let some = like.with(kept);
                 match self.emit.kind {
                     // What lies beside it is neither stored nor sent.
                     OutputKind::Archive => archive::bytes(scene, &some),
-                    _ => self.emit.bytes(scene, &some, self.recipe),
+                    _ => self.emit.bytes(scene, &some, recipe),
                 }
             };
             let one = 1.min(all);
@@ -126,16 +194,17 @@ impl ByteLimit<'_> {
     ///
     /// # Errors
     /// What is protected does not fit; frames that cannot be read, a failed write.
-    pub(crate) fn shrink(
+    fn shrink(
         &self,
         scene: &Scene,
         scored: &Scored,
         mut reduction: CompressedModel,
+        recipe: u64,
         journal: &mut Journal,
     ) -> Result<CompressedModel> {
-        let key = self.key(scene, &reduction).and(&scored.protected);
+        let key = self.key(scene, recipe, &reduction).and(&scored.protected);
         journal.kept_stage(NAME, reduction.len(), scene, key, |_| {
-            let bytes = |reduction: &CompressedModel| self.emit.bytes(scene, reduction, self.recipe);
+            let bytes = |reduction: &CompressedModel| self.emit.bytes(scene, reduction, recipe);
             let empty = bytes(&reduction.pick(&[]))?;
             let mut tried = 0;
             loop {

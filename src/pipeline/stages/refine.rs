@@ -1,0 +1,53 @@
+//! Stage `refine`: moves what is left toward the original's renders, and removes Gaussians between its steps.
+
+use crate::error::Result;
+use crate::memory_plan::ResourceEstimate;
+use crate::pipeline::planning::Planning;
+use crate::pipeline::stage::{CountPlan, EstimateInput, Phase, RunState, Stage, StageList};
+use crate::refinement::RefineStage;
+use crate::refinement::targets;
+use crate::scene::Scene;
+
+/// Adds the stage where anything may move and there is memory for it.
+pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
+    for (what, bytes) in planning.fallback.left_out() {
+        let why = format!("memory: expected at least {}MiB for it (--memory)", bytes.div_ceil(1 << 20));
+        stages.leave_out(what, why);
+    }
+    if let Some(refine) = &planning.refine {
+        stages.add(Phase::Reduce, refine.clone());
+    }
+}
+
+impl Stage for RefineStage {
+    fn estimates(&self, EstimateInput { work, limits, .. }: EstimateInput<'_>) -> Vec<ResourceEstimate> {
+        vec![self.need(work, limits)]
+    }
+
+    fn parameters(&self) -> String {
+        let RefineStage { steps, cut_steps, pictures, .. } = self;
+        format!("refine: {steps} steps at the end, {cut_steps} before a prune step, toward {pictures} views")
+    }
+
+    /// What is close enough already is not refined.
+    fn may_be_skipped(&self, input: EstimateInput<'_>, hardly_seen: f64) -> bool {
+        input.left >= 1.0 - hardly_seen
+    }
+
+    fn shardable_units(&self, _: &Scene, _: &CountPlan) -> Vec<String> {
+        vec![format!("{}: pictures", targets::NAME)]
+    }
+
+    fn run(&self, run: &mut RunState<'_>) -> Result<()> {
+        let (scored, ranking) = (run.scored()?, run.ranking()?);
+        let wanted = run.wanted.min(run.result.len());
+        let start = run.take_result();
+        run.result = match &mut run.prune_steps {
+            None => self.run(run.scene, &scored, start, wanted, &mut run.journal)?,
+            // Of everything nothing is missing.
+            Some(_) if wanted >= ranking.order().len() => start,
+            Some(steps) => steps.refined(start, wanted, &mut run.journal)?,
+        };
+        Ok(())
+    }
+}

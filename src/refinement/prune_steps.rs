@@ -1,0 +1,71 @@
+//! The way of a search for a size: models that prune steps left, from which smaller sizes go on.
+
+use super::{CUT, RefineRun};
+use crate::compressed_model::CompressedModel;
+use crate::error::Result;
+use crate::journal::Journal;
+
+/// The way of a search to smaller and smaller sizes: what its prune steps left.
+pub struct PruneSteps<'a> {
+    refinement: RefineRun<'a>,
+    /// Larger ones first.
+    models: Vec<CompressedModel>,
+}
+
+impl<'a> PruneSteps<'a> {
+    /// Returns the way before its first step.
+    pub(crate) fn new(refinement: RefineRun<'a>) -> PruneSteps<'a> {
+        PruneSteps { refinement, models: Vec::new() }
+    }
+
+    /// Returns the best model of `size` Gaussians. Goes on from the smallest model on the way that has as many, or from
+    /// `start`, what ranking alone leaves for that size.
+    ///
+    /// # Errors
+    /// Frames that cannot be read; a scratch file that cannot be written.
+    pub(crate) fn refined(
+        &mut self,
+        start: CompressedModel,
+        size: usize,
+        journal: &mut Journal,
+    ) -> Result<CompressedModel> {
+        let first = start.len();
+        let before = self.models.iter().rfind(|model| first > size && model.len() >= size);
+        let mut model = before.cloned().unwrap_or(start);
+        while model.len() > size {
+            let next = next_size(model.len(), size);
+            model = self.refinement.cut_down(&model, next, size)?;
+            if next > size {
+                self.models.push(model.clone());
+            }
+        }
+        self.refinement.best_of(model, journal)
+    }
+}
+
+/// Returns how many of `count` Gaussians the next prune step leaves on the way to `wanted`, of which there are fewer: a part
+/// [`CUT`], and always at least one Gaussian less than before.
+fn next_size(count: usize, wanted: usize) -> usize {
+    ((CUT * count as f64).ceil() as usize).min(count - 1).max(wanted)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn prune_steps_reach_every_size_from_every_count() {
+        for count in 0..=50 {
+            for wanted in 0..count {
+                let (mut left, mut steps) = (count, 0);
+                while left > wanted {
+                    let next = next_size(left, wanted);
+                    assert!((wanted..left).contains(&next), "{left} to {next} on the way to {wanted}");
+                    (left, steps) = (next, steps + 1);
+                }
+                assert!(steps <= count, "{steps} steps from {count} to {wanted}");
+            }
+        }
+        assert_eq!([next_size(1000, 3), next_size(1000, 900), next_size(5, 1)], [800, 900, 4]);
+    }
+}
