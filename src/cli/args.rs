@@ -145,6 +145,18 @@ pub(super) struct Trained {
     /// How its rotations of four dimensions are written: unflipped before 15 September 2024 [default: flipped]
     #[arg(long, value_name = "HOW", hide_short_help = true)]
     pub(super) rot4d: Option<Rot4d>,
+    /// What becomes of Gaussians of a .splatv whose quaternion is zero, which no player draws [default: drop]
+    #[arg(long, value_name = "HOW", hide_short_help = true)]
+    pub(super) zero_rotation: Option<ZeroRotationArg>,
+}
+
+/// What becomes of zero quaternions of a .splatv.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(super) enum ZeroRotationArg {
+    /// They are left out
+    Drop,
+    /// They are kept without a rotation
+    Identity,
 }
 
 /// How rotations of four dimensions are written.

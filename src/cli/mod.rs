@@ -15,7 +15,7 @@ use gseq::Compression;
 
 use args::{
     CacheArgs, CameraFile, Cameras, Cli, CompareArgs, Compress, ImageKind, Input, Memory, OutputSize, Render, Rot4d,
-    SplitArg, Sweep, Trained, Verb, ViewArgs,
+    SplitArg, Sweep, Trained, Verb, ViewArgs, ZeroRotationArg,
 };
 use output::{print, print_as};
 use splatsieve::cache::{self, Completion};
@@ -38,7 +38,7 @@ use splatsieve::files::image::write::ImageFormat;
 use splatsieve::memory_plan;
 use splatsieve::memory_plan::{Budget, Verbosity};
 use splatsieve::model::Split;
-use splatsieve::models::{Conventions, Link};
+use splatsieve::models::{Conventions, Link, ZeroRotation};
 use splatsieve::outputs::kind::OutputKind;
 use splatsieve::pipeline::summary::Detail;
 use splatsieve::pipeline::{Only, Request, RunOptions, Target, compress, divided_stages, foresee};
@@ -378,6 +378,7 @@ fn compress_options(args: Compress, quiet: bool) -> Result<Request> {
             let said = &mut input.conventions;
             said.time_duration = said.time_duration.or(run.time_duration);
             said.rot4d_unflipped |= run.rot4d_unflipped && !is_flipped;
+            said.zero_rotation = said.zero_rotation.or(run.zero_rotation);
             if let (Link::Auto, Some(link)) = (input.link, run.link) {
                 input.link = link;
             }
@@ -604,7 +605,12 @@ fn budget_of(memory: Memory) -> Budget {
 }
 
 fn conventions(trained: &Trained) -> Conventions {
-    Conventions { time_duration: trained.time_duration, rot4d_unflipped: trained.rot4d == Some(Rot4d::Unflipped) }
+    let zero_rotation = trained.zero_rotation.map(|how| match how {
+        ZeroRotationArg::Drop => ZeroRotation::Drop,
+        ZeroRotationArg::Identity => ZeroRotation::Identity,
+    });
+    let rot4d_unflipped = trained.rot4d == Some(Rot4d::Unflipped);
+    Conventions { time_duration: trained.time_duration, rot4d_unflipped, zero_rotation }
 }
 
 fn input_options(input: Input, cameras: Option<Cameras>, output: Option<&Path>) -> InputOptions {

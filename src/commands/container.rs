@@ -229,6 +229,9 @@ pub struct InputInfo {
     /// Columns of a container.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub columns: Vec<ColumnInfo>,
+    /// Things a person should know.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub notes: Vec<String>,
 }
 
 /// Looks at an input. Its bytes are read once for the digest, but no frame is evaluated.
@@ -243,7 +246,7 @@ pub fn info(options: &InputOptions) -> Result<InputInfo> {
     if input.timing() == Timing::Continuous {
         summary.frames = None;
     }
-    Ok(InputInfo { input: summary, times, columns: input.columns()? })
+    Ok(InputInfo { input: summary, times, columns: input.columns()?, notes: input.notes() })
 }
 
 /// Of an input that nobody looks at.
@@ -318,6 +321,7 @@ impl InputInfo {
                 }
             );
         }
+        self.notes.iter().for_each(|note| out += &format!("  note: {note}\n"));
         out
     }
 }

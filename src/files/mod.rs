@@ -7,6 +7,7 @@ pub mod cameras;
 pub(crate) mod checkpoint;
 pub mod container;
 pub(crate) mod csv;
+pub mod defects;
 pub(crate) mod digest;
 pub mod frame_stream;
 pub mod image;

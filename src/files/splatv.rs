@@ -4,6 +4,7 @@
 //! entry of type `splat` has `size` (bytes of the texture), `texwidth`, `texheight` and `cameras`. The texture holds
 //! [`ROW_BYTES`] per Gaussian ([`SplatvGaussian`]), then zeros. Source: antmatter15/splaTV.
 
+pub mod rows;
 pub mod write;
 
 use std::ops::Range;
@@ -94,14 +95,17 @@ pub struct Splatv {
     /// Where the texture begins.
     start: usize,
     count: usize,
+    /// Rows that the texture would hold, where the data ends before it does.
+    declared: Option<usize>,
     cameras: Value,
 }
 
 impl Splatv {
-    /// Opens the file at `path`. Rows of zeros at the end are padding.
+    /// Opens the file at `path`. Rows of zeros at the end are padding, which some converters leave out.
     ///
     /// # Errors
-    /// Another magic; a text that is no list with an entry of type `splat`; sizes that contradict each other or the file.
+    /// Another magic; a text that is no list with an entry of type `splat`; sizes that contradict each other; data that end
+    /// within a Gaussian.
     pub fn open(path: &Path) -> Result<Splatv> {
         let map = FileMap::open(path)?;
         let cut = |expected: String| {
@@ -142,14 +146,20 @@ impl Splatv {
             return Err(Error::input(path, "its text, size", expected, size.to_string()));
         }
         let there = (map.len() - start) as u64;
-        if there < size {
-            return Err(cut(format!("{} bytes, {size} of them of its texture", start as u64 + size)));
+        let whole_rows = there / ROW_BYTES as u64;
+        if there < size && (whole_rows == 0 || !there.is_multiple_of(ROW_BYTES as u64)) {
+            let least = start as u64 + whole_rows.max(1) * ROW_BYTES as u64;
+            return Err(cut(format!(
+                "{} bytes, {size} of them of its texture, or fewer whole Gaussians of {ROW_BYTES} bytes, such as {least}",
+                start as u64 + size
+            )));
         }
-        let used = used_bytes(&map, start..start + size as usize);
+        let declared = (there < size).then_some((size / ROW_BYTES as u64) as usize);
+        let used = used_bytes(&map, start..start + there.min(size) as usize);
         let (count, cameras) = (used.div_ceil(ROW_BYTES), entry["cameras"].clone());
         u32::try_from(count)
             .map_err(|_| Error::input(path, "its texture", "at most 4294967295 Gaussians", count.to_string()))?;
-        Ok(Splatv { path: path.to_owned(), start, count, cameras, map })
+        Ok(Splatv { path: path.to_owned(), start, count, declared, cameras, map })
     }
 
     /// The file.
@@ -160,6 +170,12 @@ impl Splatv {
     /// N, the number of Gaussians.
     pub fn count(&self) -> usize {
         self.count
+    }
+
+    /// Returns a note about data that end before the texture does.
+    pub fn note(&self) -> Option<String> {
+        let (declared, rows) = (self.declared?, (self.map.len() - self.start) / ROW_BYTES);
+        Some(format!("{rows} rows of {declared} declared: the file is not padded to whole rows of its texture"))
     }
 
     /// Its cameras, as they stand in it.

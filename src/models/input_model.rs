@@ -10,7 +10,9 @@ use crate::archive::Content;
 use crate::compressed_model::{Cluster, CompressedModel, Proxies, Reference};
 use crate::error::{Error, Result, ShowPath};
 use crate::files::cameras::Clock;
+use crate::files::defects::{Defects, FileRows};
 use crate::files::ply::PlyOptions;
+use crate::files::splatv::rows::ZeroRotation;
 use crate::limits::{Limits, ReadLimit};
 use crate::model::{Columns, Gaussians};
 use crate::outputs::container::GAUSSIAN_BLOCK;
@@ -94,6 +96,16 @@ pub trait InputModel: Send + Sync {
     /// Things a person should know of it.
     fn notes(&self) -> Vec<String> {
         Vec::new()
+    }
+
+    /// Rows of its file that are not as the format says, and what the reader did about them.
+    fn defects(&self) -> Option<&Defects> {
+        None
+    }
+
+    /// Rows of its file that its Gaussians are, where some rows were left out.
+    fn file_rows(&self) -> Option<&FileRows> {
+        None
     }
 
     /// Folder of the data it was trained on, as the input names it, where it does: there cameras may be.
@@ -364,13 +376,15 @@ pub struct OpenOptions {
     pub memory: ReadLimit,
 }
 
-/// What the files of some families do not say of how their models were trained.
+/// What the files of some families do not say of how their models were trained, or what to do where they are unclear.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct Conventions {
     /// Length of `time_duration`, after which colors repeat; none: the family's guess, with a note.
     pub time_duration: Option<f64>,
     /// Whether rotations of four dimensions are those of before 15 September 2024, without the reversal of axes.
     pub rot4d_unflipped: bool,
+    /// What becomes of zero quaternions of a `.splatv`; none: [`ZeroRotation::Drop`].
+    pub zero_rotation: Option<ZeroRotation>,
 }
 
 /// Whether frames are linked, so that they say which Gaussian is which.

@@ -29,6 +29,7 @@ use std::fs;
 use std::io::Read;
 use std::path::Path;
 
+pub use crate::files::splatv::rows::ZeroRotation;
 pub use crate::models::input_model::{ColumnInfo, Conventions, InputModel, Link, MemoryProfile, OpenOptions, Timing};
 use deform_folder::Arguments;
 pub use four_d_gaussians::ModelFolder;

@@ -12,7 +12,7 @@ use crate::TOOL;
 use crate::files::cameras::Times;
 use crate::files::names::from_folder;
 use crate::model::{Split, ranges};
-use crate::models::Link;
+use crate::models::{Link, ZeroRotation};
 use crate::outputs::kind::OutputKind;
 use crate::pruning::score::UserOverrides;
 
@@ -61,6 +61,9 @@ pub struct RunOptions {
     /// Whether `--rot4d unflipped` was said of it.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub rot4d_unflipped: bool,
+    /// `--zero-rotation` of a `.splatv`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub zero_rotation: Option<ZeroRotation>,
     /// File or folder of the cameras; in a file, seen from the folder of the recipe.
     pub cameras: Option<PathBuf>,
     /// Part of their pictures that was scored; none: all.
@@ -160,6 +163,7 @@ impl RecipeRecord {
             iteration: input.iteration,
             time_duration: input.conventions.time_duration,
             rot4d_unflipped: input.conventions.rot4d_unflipped,
+            zero_rotation: input.conventions.zero_rotation,
             cameras: input.cameras.clone(),
             split: input.split,
             frames: input.frames,

@@ -14,4 +14,5 @@ mod scene;
 mod scripts;
 mod selfcheck;
 mod slurm;
+mod splatv;
 mod stream_input;

@@ -23,7 +23,8 @@ const SEEN_WIDTHS: f64 = 2.36;
 /// Texels of a Gaussian.
 const TEXELS_EACH: usize = 4;
 
-/// The words that a viewer reads of `row`. What no half holds becomes the largest that it does; NaN becomes 0.
+/// The words that a viewer reads of `row`. What no half holds becomes the largest that it does; NaN becomes 0. A quaternion
+/// that halves would hold as 0 at every time is scaled to length 1, or is the identity: players divide by its length.
 pub fn words(row: &SplatvGaussian) -> [u32; WORDS] {
     let half = |value: f32| {
         let most = f16::MAX.to_f32();
@@ -33,8 +34,15 @@ pub fn words(row: &SplatvGaussian) -> [u32; WORDS] {
     let pair = |low: f32, high: f32| half(low) | half(high) << 16;
     // `as` truncates, saturates and turns NaN into 0.
     let byte = |value: f64| u32::from((255.0 * value) as u8);
-    let SplatvGaussian { position, motion: m, rotation: q, omega: o, scale: s, rgb: [r, g, b], opacity, center, width } =
-        *row;
+    let SplatvGaussian { position, motion: m, scale: s, rgb: [r, g, b], opacity, center, width, .. } = *row;
+    let (mut q, mut o) = (row.rotation, row.omega);
+    if q.iter().chain(&o).all(|&x| half(x) & 0x7fff == 0) {
+        let length = q.iter().map(|x| x * x).sum::<f32>().sqrt();
+        (q, o) = match length.is_normal() {
+            true => (q.map(|x| x / length), o.map(|x| x / length)),
+            false => ([1.0, 0.0, 0.0, 0.0], o),
+        };
+    }
     let [x, y, z] = position.map(f32::to_bits);
     let color = byte(r) | byte(g) << 8 | byte(b) << 16 | byte(opacity) << 24;
     [
@@ -174,6 +182,16 @@ mod tests {
     }
 
     #[test]
+    fn no_row_is_written_with_a_quaternion_of_zero() {
+        let rotation = |rotation| {
+            SplatvGaussian::of_words(&words(&SplatvGaussian { rotation, omega: [0.0; 4], ..row(1) })).rotation
+        };
+        assert_eq!(rotation([0.0; 4]), [1.0, 0.0, 0.0, 0.0]);
+        assert_eq!(rotation([0.0, 3e-9, 0.0, -4e-9]).map(|x| (100.0 * x).round()), [0.0, 60.0, 0.0, -80.0]);
+        assert_eq!(rotation([0.0, 0.5, 0.0, 0.0]), [0.0, 0.5, 0.0, 0.0]);
+    }
+
+    #[test]
     fn what_no_half_holds_is_the_largest_that_it_does() {
         let wild = SplatvGaussian { motion: [1e9, -1e9, f32::NAN, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], width: 1e6, ..row(1) };
         let found = SplatvGaussian::of_words(&words(&wild));
@@ -199,8 +217,18 @@ mod tests {
         let path = folder.path().join("some.splatv");
         write(&path, 3, (0..3).map(|k| words(&row(k))), &json!([])).unwrap();
         let whole = std::fs::read(&path).unwrap();
+        let header = 8 + u32::from_le_bytes(whole[4..8].try_into().unwrap()) as usize;
         for length in (0..200).chain((200..whole.len()).step_by(997)) {
             std::fs::write(&path, &whole[..length]).unwrap();
+            // What ends behind a whole row is not padded; what ends within one is cut.
+            let rows = length.checked_sub(header).filter(|bytes| *bytes > 0 && bytes % ROW_BYTES == 0);
+            if let Some(bytes) = rows {
+                let file = Splatv::open(&path).unwrap();
+                assert_eq!(file.count(), 3.min(bytes / ROW_BYTES), "{length}");
+                let note = file.note().unwrap();
+                assert!(note.starts_with(&format!("{} rows of 1024 declared", bytes / ROW_BYTES)), "{note}");
+                continue;
+            }
             let message = Splatv::open(&path).expect_err("cut").to_string();
             assert!(message.contains("some.splatv") && message.contains("bytes"), "{length}: {message}");
         }

@@ -102,7 +102,7 @@ impl Place {
 }
 
 fn open_as(path: &Path, rot4d_unflipped: bool) -> Result<Box<dyn InputModel>> {
-    let conventions = Conventions { time_duration: Some(2.0), rot4d_unflipped };
+    let conventions = Conventions { time_duration: Some(2.0), rot4d_unflipped, ..Conventions::default() };
     models::open(path, &OpenOptions { conventions, ..OpenOptions::default() })?.with_times(TIMES.to_vec())
 }
 

@@ -1,6 +1,7 @@
 //! `.splatv` as an input, and as a result of the lite model.
 //!
-//! The result of one keeps the words of what stays.
+//! The result of one keeps the words of what stays. Rows that no player draws are left out; an infinite width is a window
+//! that is 1 at every time ([`rows`](crate::files::splatv::rows)).
 
 use std::fs;
 use std::path::Path;
@@ -15,13 +16,15 @@ use crate::compressed_model::{Cluster, CompressedModel, Proxies, Reference};
 use crate::error::{Error, Result};
 use crate::files::accuracy::Accuracy;
 use crate::files::cameras::Clock;
+use crate::files::defects::{Defects, FileRows};
 use crate::files::digest::hash_file;
 use crate::files::json::read_json;
+use crate::files::splatv::rows::{inspect, repair};
 use crate::files::splatv::write::{measure, seen_whole, words, write as write_file};
 use crate::files::splatv::{MAGIC, Splatv, SplatvGaussian};
-use crate::limits::{Limits, ReadLimit};
+use crate::limits::Limits;
 use crate::model::{Column, Columns, Gaussians, Raw, color, harmonic, logit, opacity};
-use crate::models::input_model::{InputModel, MemoryProfile, ModelFormat, Timing};
+use crate::models::input_model::{InputModel, MemoryProfile, ModelFormat, OpenOptions, Timing};
 use crate::models::motion_model::window::MOST;
 use crate::models::motion_model::{MotionModelFrames, left, solve};
 use crate::models::size::{Size, bytes_below, bytes_of};
@@ -34,6 +37,9 @@ use crate::source::FrameSource;
 const MAX_LISTED: u64 = 4 << 20;
 /// Scales and widths are no less: their logs are finite.
 const LEAST_LENGTH: f64 = 1e-7;
+/// Natural log of the width of a window without an end: finite, so that no inf·0 arises, and so wide that the window
+/// exp(−(dt/width)²) is exactly 1 in f64 for |dt| below 10⁹.
+const UNBOUNDED_LOG_WIDTH: f32 = 40.0;
 
 /// A `.splatv`.
 pub(in super::super) const SPLATV: ModelFormat = ModelFormat {
@@ -41,7 +47,7 @@ pub(in super::super) const SPLATV: ModelFormat = ModelFormat {
     recognizes: |found| found.is_file_of(&MAGIC.to_le_bytes(), "splatv"),
     open: |path, options| {
         options.refuse_for(path)?;
-        Ok(Box::new(SplatvModel::open(path, options.memory)?))
+        Ok(Box::new(SplatvModel::open(path, options)?))
     },
 };
 
@@ -49,40 +55,48 @@ pub(in super::super) const SPLATV: ModelFormat = ModelFormat {
 #[derive(Debug)]
 struct SplatvModel {
     file: Splatv,
+    /// Rows that the Gaussians are, where some were left out.
+    rows: Option<FileRows>,
+    defects: Defects,
     model: MotionModelFrames<Spacetime>,
 }
 
 impl SplatvModel {
-    fn open(path: &Path, memory: ReadLimit) -> Result<SplatvModel> {
+    fn open(path: &Path, options: &OpenOptions) -> Result<SplatvModel> {
         let file = Splatv::open(path)?;
-        let count = file.count();
-        let values = (Columns::all().width(0) + WIDTH) as u64;
-        memory.check(path, "its texture", "the Gaussians of the file", 4 * values * count as u64)?;
+        // Parameters and the number of the row.
+        let values = (Columns::all().width(0) + WIDTH + 1) as u64;
+        options.memory.check(path, "its texture", "the Gaussians of the file", 4 * values * file.count() as u64)?;
+        let zero_rotation = options.conventions.zero_rotation.unwrap_or_default();
+        let (defects, rows) = inspect(&file, zero_rotation)?;
+        let count = file.count() - defects.dropped;
         let mut raw = Raw { gaussians: Gaussians::zeros(count, 0), own: Column::zeros(WIDTH, count) };
         for i in 0..count {
-            let row = SplatvGaussian::of_words(&file.words(i));
-            let numbers =
-                [&row.position[..], &row.motion, &row.rotation, &row.omega, &row.scale, &[row.center, row.width]];
-            if let Some(x) = numbers.concat().iter().find(|x| !x.is_finite()) {
-                return Err(Error::input(path, format!("Gaussian {i}"), "finite numbers", x.to_string()));
-            }
-            set(&mut raw, i, &row);
+            set(&mut raw, i, &SplatvGaussian::of_words(&file.words(file_row(rows.as_ref(), i))));
         }
-        Ok(SplatvModel { file, model: MotionModelFrames::new(Spacetime { is_full: false, decoder: None }, raw, 0) })
+        let model = MotionModelFrames::new(Spacetime { is_full: false, decoder: None }, raw, 0);
+        Ok(SplatvModel { file, rows, defects, model })
     }
+}
+
+/// Row of the file that Gaussian `i` is.
+fn file_row(rows: Option<&FileRows>, i: usize) -> usize {
+    rows.map_or(i, |rows| rows.rows[i] as usize)
 }
 
 /// Makes Gaussian `i` what `row` is.
 fn set(raw: &mut Raw, i: usize, row: &SplatvGaussian) {
     let log = |length: f32| f64::from(length).max(LEAST_LENGTH).ln() as f32;
     raw.gaussians.position.set_row(i, row.position);
-    raw.gaussians.rotation.set_row(i, row.rotation);
-    raw.gaussians.log_scale.set_row(i, row.scale.map(log));
+    let is_unturned = row.rotation == [0.0; 4] && row.omega == [0.0; 4];
+    raw.gaussians.rotation.set_row(i, if is_unturned { [1.0, 0.0, 0.0, 0.0] } else { row.rotation });
+    // Players square scales: the sign is nothing.
+    raw.gaussians.log_scale.set_row(i, row.scale.map(|scale| log(scale.abs())));
     raw.gaussians.opacity_logit.set_row(i, [logit(row.opacity).clamp(-MOST, MOST) as f32]);
     raw.gaussians.sh.set_row(i, row.rgb.map(harmonic));
     let mut own = |plane: usize, value: f32| raw.own.plane_mut(plane)[i] = value;
     own(CENTRE, row.center);
-    own(LOG_WIDTH, log(row.width));
+    own(LOG_WIDTH, if row.width.is_finite() { log(row.width) } else { UNBOUNDED_LOG_WIDTH });
     row.motion.into_iter().enumerate().for_each(|(k, x)| own(MOTION + k, x));
     row.omega.into_iter().enumerate().for_each(|(k, x)| own(OMEGA + k, x));
 }
@@ -157,7 +171,21 @@ impl InputModel for SplatvModel {
     }
 
     fn residence(&self) -> MemoryProfile {
-        residence(WIDTH)
+        let all = residence(WIDTH);
+        let of_rows = if self.rows.is_some() { size_of::<u32>() as u64 } else { 0 };
+        MemoryProfile { per_gaussian: all.per_gaussian + of_rows, ..all }
+    }
+
+    fn notes(&self) -> Vec<String> {
+        self.defects.notes().into_iter().chain(self.file.note()).collect()
+    }
+
+    fn defects(&self) -> Option<&Defects> {
+        Some(&self.defects).filter(|defects| !defects.is_empty())
+    }
+
+    fn file_rows(&self) -> Option<&FileRows> {
+        self.rows.as_ref()
     }
 
     fn timing(&self) -> Timing {
@@ -215,7 +243,12 @@ impl InputModel for SplatvModel {
         let unchanged = self.model.raw().pick(&reduction.kept);
         let words_of = |i: usize| {
             let (now, before) = (row(&raw, i), row(&unchanged, i));
-            if now == before { self.file.words(reduction.kept[i] as usize) } else { words(&now) }
+            if now != before {
+                return words(&now);
+            }
+            let mut stored = self.file.words(file_row(self.rows.as_ref(), reduction.kept[i] as usize));
+            repair(&mut stored);
+            stored
         };
         let mut accuracy = Accuracy::new(&raw.gaussians.position);
         let changed = |&i: &usize| row(&raw, i) != row(&unchanged, i);
