@@ -35,6 +35,7 @@ use splatsieve::model::hash_id;
 use splatsieve::model::{Column, Columns, Gaussians};
 use splatsieve::outputs::container::write_container;
 use splatsieve::passes::gather;
+use splatsieve::progress::Events;
 use splatsieve::recipe::{MotionParams, Recipe};
 use splatsieve::source::FrameSource;
 
@@ -248,6 +249,7 @@ fn motion(criterion: &mut Criterion) {
                 gate: MotionGate::new(&recipe.merge, 4.0),
                 frames_held: usize::MAX,
                 scratch: folder.path().to_owned(),
+                events: Events::IGNORED,
                 gathered: None,
             };
             let parts = pairs.chunks(pairs.len().div_ceil(partitions));

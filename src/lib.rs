@@ -9,8 +9,9 @@
 //! | crates `splat-platform`, [`gseq`], `splat-core`, `splat-render`, `splat-fields` | what differs between systems; the container; Gaussians, cameras and errors ([`model`], [`error`]); the rasterizer and image metrics ([`render`], [`metrics`]); deformation fields ([`deform`]) |
 //! | [`limits`], [`machine`], [`recipe`], [`compressed_model`], [`source`] | memory limits, parameters of a run, what is left of a model, and how frames are read |
 //! | [`archive`], [`fit`] | the codec of `.gsz` archives; curves fitted to the states of a Gaussian |
+//! | [`progress`] | the events by which the library tells what it is doing |
 //! | [`files`], [`cache`] | file formats, reader beside writer; atomic outputs; results that stages keep |
-//! | [`progress`], [`passes`] | progress on standard error; driving a pass over frames on all threads |
+//! | [`passes`] | driving a pass over frames on all threads |
 //! | [`outputs`] | sequences as containers, curves, streams, films and tables |
 //! | [`tracking`], [`merging`] | which Gaussian of one frame is which of the next; which Gaussians become one |
 //! | [`models`] | one folder per model format: recognize, open, evaluate, write back |

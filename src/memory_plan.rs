@@ -19,7 +19,7 @@ use crate::models::MemoryProfile;
 use crate::models::trajectories::state_bytes;
 use crate::outputs::container::{FRAME_BLOCK, GAUSSIAN_BLOCK};
 use crate::passes::{BLOCK, PICTURES_PER_THREAD};
-use crate::progress::duration;
+use crate::progress::{Events, Message, duration};
 use crate::render;
 
 /// What a run says of itself before it begins.
@@ -382,20 +382,21 @@ pub struct Plan {
 }
 
 impl Plan {
-    /// The fastest limits by which every stage that `needs` names fits into `budget`; says so if that is asked for.
+    /// The fastest limits by which every stage that `needs` names fits into `budget`. Sends the plan to `events` if the
+    /// budget asks for it, whether it fits or not.
     ///
     /// # Errors
     /// A budget that no limits fit; the error names the least that works.
     pub fn fit(
         work: Workload,
         budget: Budget,
+        events: &Events,
         needs: impl Fn(&Workload, &Limits) -> Vec<ResourceEstimate>,
     ) -> Result<Plan> {
         let plan = Self::closest(work, budget.limit(), needs);
         let fits = plan.excess() == 0;
-        match budget.tell {
-            Verbosity::Plan => crate::progress::tell(format!("budget: {}\n{}", budget.named(), plan.text()).trim_end()),
-            Verbosity::Time | Verbosity::Nothing => (),
+        if budget.tell == Verbosity::Plan {
+            events.send(Message::Plan(format!("budget: {}\n{}", budget.named(), plan.text()).trim_end()));
         }
         if fits { Ok(plan) } else { Err(plan.refusal(budget)) }
     }
@@ -551,17 +552,14 @@ impl Plan {
         out
     }
 
-    /// How long it will take, by what was measured elsewhere; said where the plan is.
-    pub fn tell_time(&self, tell: Verbosity) {
+    /// Sends to `events` how long it will take, by what was measured elsewhere, if `tell` asks for the plan.
+    pub fn tell_time(&self, tell: Verbosity, events: &Events) {
         if tell == Verbosity::Plan {
             let stages = seconds(&self.work, &self.needs);
             let whole: f64 = stages.iter().map(|(_, seconds)| seconds).sum();
             let named = stages.iter().map(|(stage, seconds)| format!("{} {stage}", duration(*seconds)));
-            crate::progress::tell(&format!(
-                "time: about {} ({})",
-                duration(whole),
-                named.collect::<Vec<_>>().join(" + ")
-            ));
+            let text = format!("time: about {} ({})", duration(whole), named.collect::<Vec<_>>().join(" + "));
+            events.send(Message::Plan(&text));
         }
     }
 }

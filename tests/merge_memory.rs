@@ -17,6 +17,7 @@ use splatsieve::merging::tree::TreePoint;
 use splatsieve::model::Columns;
 use splatsieve::outputs::container::write_container;
 use splatsieve::passes::gather;
+use splatsieve::progress::Events;
 use splatsieve::recipe::Recipe;
 
 #[global_allocator]
@@ -51,6 +52,7 @@ fn peak(folder: &Path, frames: usize, partitions: usize) -> (usize, usize) {
         gate: MotionGate::new(&recipe.merge, 4.0),
         frames_held: FRAMES_HELD,
         scratch: folder.to_owned(),
+        events: Events::IGNORED,
         gathered: None,
     };
     let count = pairs.len();

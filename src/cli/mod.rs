@@ -2,7 +2,9 @@
 
 mod args;
 mod help;
+mod message;
 mod output;
+mod progress;
 mod recipe_flags;
 mod signals;
 
@@ -17,7 +19,9 @@ use args::{
     CacheArgs, CameraFile, Cameras, Cli, CompareArgs, Compress, ImageKind, Input, Memory, OutputSize, Render, Rot4d,
     SplitArg, Sweep, Trained, Verb, ViewArgs, ZeroRotationArg,
 };
+use message::tell;
 use output::{print, print_as};
+use progress::Display;
 use splatsieve::cache::{self, Completion};
 use splatsieve::commands::container::Storing;
 use splatsieve::commands::render::{RenderOptions, RenderSelection};
@@ -44,7 +48,7 @@ use splatsieve::pipeline::summary::Detail;
 use splatsieve::pipeline::{Only, Request, RunOptions, Target, compress, divided_stages, foresee};
 use splatsieve::player::view;
 use splatsieve::player::view::ViewOptions;
-use splatsieve::progress::{Mode, Progress, tell};
+use splatsieve::progress::Events;
 use splatsieve::recipe::preset_text;
 use splatsieve::report::{self, ReportOptions, trade_off};
 use splatsieve::scene::pictures::PictureSet;
@@ -65,7 +69,6 @@ pub(crate) fn main() -> ExitCode {
     };
     // Before anything is begun.
     signals::install();
-    Progress::set_mode(if cli.quiet { Mode::Quiet } else { Mode::Auto });
     let explains = cli.verb.explains();
     let result = run(cli);
     // Results that these warnings name are in place, so the exit code stays.
@@ -112,12 +115,13 @@ fn run(cli: Cli) -> Result<()> {
             .build_global()
             .map_err(|error| Error::usage(format!("--threads {threads}: {error}")))?;
     }
+    let events = Events::new(Display::new(cli.quiet));
     match cli.verb {
         Verb::Compress(args) => {
             let (json, list_stages, dry_run) = (args.json, args.list_stages, args.dry_run);
             let detail = if args.verbose { Detail::All } else { Detail::Most };
             let view_output = args.view.clone();
-            let request = compress_options(*args, cli.quiet)?;
+            let request = compress_options(*args, cli.quiet, &events)?;
             if list_stages {
                 return print(&divided_stages(&request)?.iter().map(|stage| format!("{stage}\n")).collect::<String>());
             }
@@ -139,7 +143,7 @@ fn run(cli: Cli) -> Result<()> {
             printed
         }
         Verb::Score(args) => {
-            let input = input_options(args.input, Some(args.cameras), Some(&args.output));
+            let input = input_options(args.input, Some(args.cameras), Some(&args.output), &events);
             let report = score::score(&input, &args.output, &args.recipe.recipe()?, args.earlier.replace())?;
             notes(&report.notes);
             print(&format!(
@@ -151,9 +155,9 @@ fn run(cli: Cli) -> Result<()> {
         }
         Verb::Render(mut args) => {
             if let Some(output) = args.video.take() {
-                return film(args, output);
+                return film(args, output, &events);
             }
-            let options = render_options(args)?;
+            let options = render_options(args, &events)?;
             let Some(rendered) = whole(render::render(&options)?)? else { return Ok(()) };
             notes(&rendered.notes);
             let plural = if rendered.pictures == 1 { "" } else { "s" };
@@ -161,8 +165,11 @@ fn run(cli: Cli) -> Result<()> {
         }
         Verb::Evaluate(args) => {
             let as_json = args.json;
-            let mut options =
-                EvaluateOptions { csv: args.csv, overwrite: args.earlier.replace(), ..evaluate_options(args.models) };
+            let mut options = EvaluateOptions {
+                csv: args.csv,
+                overwrite: args.earlier.replace(),
+                ..evaluate_options(args.models, &events)
+            };
             options.original.work = work_of(args.kept);
             let Some(found) = whole(evaluation::evaluate(&options)?)? else { return Ok(()) };
             notes(&found.work_notes);
@@ -170,17 +177,17 @@ fn run(cli: Cli) -> Result<()> {
         }
         Verb::Sweep(args) => {
             let (as_json, page) = (args.json, args.output.join(trade_off::PAGE));
-            let found = sweep::sweep(&sweep_options(args))?;
+            let found = sweep::sweep(&sweep_options(args, &events))?;
             print_as(as_json, &if as_json { found.json() } else { format!("{}{}\n", found.text(), page.shown()) })
         }
         Verb::Precision(args) => {
             let (as_json, page) = (args.json, args.output.join(report::precision::PAGE));
-            let found = precision::precision(&precision_options(args)?)?;
+            let found = precision::precision(&precision_options(args, &events)?)?;
             print_as(as_json, &if as_json { found.json() } else { format!("{}{}\n", found.text(), page.shown()) })
         }
         Verb::Report(args) => {
             let page = args.output.join(report::PAGE);
-            let mut evaluate = evaluate_options(args.models);
+            let mut evaluate = evaluate_options(args.models, &events);
             evaluate.original.work = work_of(args.kept);
             let options = ReportOptions {
                 evaluate,
@@ -194,9 +201,9 @@ fn run(cli: Cli) -> Result<()> {
             notes(&found.notes);
             print(&format!("{}\n{}\n", found.verdict, page.shown()))
         }
-        Verb::View(args) => print(&(viewed(&view_options(args))? + "\n")),
+        Verb::View(args) => print(&(viewed(&view_options(args, &events))? + "\n")),
         Verb::Convert(args) => {
-            let input = input_options(args.input, Some(args.cameras), Some(&args.output));
+            let input = input_options(args.input, Some(args.cameras), Some(&args.output), &events);
             let done = convert::convert(&input, &args.output, args.kind.map(kind_of), args.earlier.replace())?;
             if args.json {
                 return print_as(true, &json(&done));
@@ -216,7 +223,7 @@ fn run(cli: Cli) -> Result<()> {
                 (_, asked) if asked.is_empty() => Storing::Exact(Compression::Zstd(args.level.unwrap_or(1))),
                 (_, asked) => Storing::Within(asked, args.level.unwrap_or(15)),
             };
-            let mut input = input_options(args.input, Some(args.cameras), Some(&args.output));
+            let mut input = input_options(args.input, Some(args.cameras), Some(&args.output), &events);
             input.work = work_of(args.kept);
             let packed = container::pack(&input, &args.output, &storing, args.earlier.replace())?;
             let Some(packed) = whole(packed)? else { return Ok(()) };
@@ -231,7 +238,7 @@ fn run(cli: Cli) -> Result<()> {
             ))
         }
         Verb::Info(args) => {
-            let info = container::info(&input_options(args.input, None, None))?;
+            let info = container::info(&input_options(args.input, None, None, &events))?;
             print_as(args.json, &if args.json { json(&info) } else { info.text() })
         }
         Verb::Verify(args) => {
@@ -250,7 +257,7 @@ fn run(cli: Cli) -> Result<()> {
             print_as(args.json, &text)
         }
         Verb::Unpack(args) => {
-            let input = input_options(args.input, Some(args.cameras), args.output.as_deref());
+            let input = input_options(args.input, Some(args.cameras), args.output.as_deref(), &events);
             let Some(output) = args.output else {
                 if output::is_terminal() {
                     return Err(Error::usage("a frame stream is not for a terminal; pipe it into a program or a file"));
@@ -301,6 +308,7 @@ fn run(cli: Cli) -> Result<()> {
                 output: args.output,
                 overwrite: args.earlier.replace(),
                 memory: budget_of(args.memory),
+                events,
             };
             print(&demo::run(&options)?.text())?;
             if let Some(folder) = options.output {
@@ -309,8 +317,6 @@ fn run(cli: Cli) -> Result<()> {
             Ok(())
         }
         Verb::Selfcheck(args) => {
-            // What it makes up is nobody's progress.
-            Progress::set_mode(Mode::Quiet);
             let found = selfcheck::run();
             let printed = print_as(args.json, &if args.json { json(&found) } else { found.text() });
             found.verdict()?;
@@ -342,13 +348,13 @@ fn kind_of(asked: args::OutputKindArg) -> OutputKind {
     }
 }
 
-fn compress_options(args: Compress, quiet: bool) -> Result<Request> {
+fn compress_options(args: Compress, quiet: bool, events: &Events) -> Result<Request> {
     let recipe = args.recipe.recipe()?;
     let kind = args.kind.map(kind_of);
     let record = args.recipe.record()?;
     let (has_split, has_cameras) = (args.cameras.split.is_some(), args.cameras.file.cameras.is_some());
     let is_flipped = args.input.trained.rot4d == Some(Rot4d::Flipped);
-    let mut input = input_options(args.input, Some(args.cameras), Some(&args.output));
+    let mut input = input_options(args.input, Some(args.cameras), Some(&args.output), events);
     input.work = work_of(args.kept);
     if input.memory.tell == Verbosity::Nothing && !quiet {
         input.memory.tell = Verbosity::Time;
@@ -423,7 +429,7 @@ fn compress_options(args: Compress, quiet: bool) -> Result<Request> {
     })
 }
 
-fn render_options(args: Render) -> Result<RenderOptions> {
+fn render_options(args: Render, events: &Events) -> Result<RenderOptions> {
     // The parser lets them pass beside what --video does not go with.
     let of_films =
         [("--path", args.path.is_some()), ("--fps", args.fps.is_some()), ("--beside", args.beside.is_some())];
@@ -439,7 +445,7 @@ fn render_options(args: Render) -> Result<RenderOptions> {
         None => (RenderSelection::All(format), PictureSet::HeldOut),
     };
     let output = args.output.unwrap_or_default();
-    let mut input = input_options(args.input, None, Some(&output));
+    let mut input = input_options(args.input, None, Some(&output), events);
     args.cameras.apply_to(&mut input);
     input.work = work_of(args.kept);
     Ok(RenderOptions {
@@ -453,12 +459,12 @@ fn render_options(args: Render) -> Result<RenderOptions> {
 }
 
 /// `render --video`.
-fn film(args: Render, output: PathBuf) -> Result<()> {
+fn film(args: Render, output: PathBuf, events: &Events) -> Result<()> {
     let (way, part) = match args.path {
         Some(views) => (FilmPath::Path(views), PictureSet::HeldOut),
         None => (FilmPath::View(args.view), PictureSet::All),
     };
-    let mut input = input_options(args.input, None, Some(&output));
+    let mut input = input_options(args.input, None, Some(&output), events);
     args.cameras.apply_to(&mut input);
     input.work = work_of(args.kept);
     let options = VideoOptions {
@@ -479,13 +485,14 @@ fn film(args: Render, output: PathBuf) -> Result<()> {
     print(&format!("{path}: {} frames of {width}x{height}, {fps} a second\n{places}", filmed.frames))
 }
 
-fn evaluate_options(args: CompareArgs) -> EvaluateOptions {
+fn evaluate_options(args: CompareArgs, events: &Events) -> EvaluateOptions {
     let mut original = InputOptions { path: args.original, iteration: args.iteration, ..InputOptions::default() };
     original.allow_gaps = args.allow_gaps;
     original.link = args.link.map_or(Link::Auto, Link::from);
     original.conventions = conventions(&args.trained);
     args.cameras.apply_to(&mut original);
     original.memory = budget_of(args.memory);
+    original.events = events.clone();
     EvaluateOptions {
         original,
         compressed: args.compressed,
@@ -499,8 +506,8 @@ fn evaluate_options(args: CompareArgs) -> EvaluateOptions {
     }
 }
 
-fn view_options(args: ViewArgs) -> ViewOptions {
-    let mut original = input_options(args.input, None, Some(&args.output));
+fn view_options(args: ViewArgs, events: &Events) -> ViewOptions {
+    let mut original = input_options(args.input, None, Some(&args.output), events);
     args.cameras.apply_to(&mut original);
     ViewOptions {
         original,
@@ -552,8 +559,8 @@ fn viewed(options: &ViewOptions) -> Result<String> {
     Ok(format!("{}: {} frames, {} bytes{files}", found.page.shown(), found.frames, found.bytes))
 }
 
-fn sweep_options(args: Sweep) -> SweepOptions {
-    let mut input = input_options(args.input, None, Some(&args.output));
+fn sweep_options(args: Sweep, events: &Events) -> SweepOptions {
+    let mut input = input_options(args.input, None, Some(&args.output), events);
     args.cameras.apply_to(&mut input);
     let named = |name: &String| Method::ALL.into_iter().find(|method| method.name() == name);
     SweepOptions {
@@ -570,8 +577,8 @@ fn sweep_options(args: Sweep) -> SweepOptions {
     }
 }
 
-fn precision_options(args: args::PrecisionArgs) -> Result<PrecisionOptions> {
-    let mut input = input_options(args.input, None, Some(&args.output));
+fn precision_options(args: args::PrecisionArgs, events: &Events) -> Result<PrecisionOptions> {
+    let mut input = input_options(args.input, None, Some(&args.output), events);
     args.cameras.apply_to(&mut input);
     let named = |name: &String| Turned::ALL.into_iter().find(|knob| knob.name() == name);
     let knobs: Vec<Turned> = args.knobs.iter().filter_map(named).collect();
@@ -613,8 +620,9 @@ fn conventions(trained: &Trained) -> Conventions {
     Conventions { time_duration: trained.time_duration, rot4d_unflipped, zero_rotation }
 }
 
-fn input_options(input: Input, cameras: Option<Cameras>, output: Option<&Path>) -> InputOptions {
-    let mut options = InputOptions { path: input.input, iteration: input.iteration, ..InputOptions::default() };
+fn input_options(input: Input, cameras: Option<Cameras>, output: Option<&Path>, events: &Events) -> InputOptions {
+    let events = events.clone();
+    let mut options = InputOptions { path: input.input, iteration: input.iteration, events, ..InputOptions::default() };
     options.allow_gaps = input.allow_gaps;
     options.conventions = conventions(&input.trained);
     options.link = input.link.map_or(Link::Auto, Link::from);

@@ -3,9 +3,9 @@
 use std::io::{self, IsTerminal, Write};
 use std::path::Path;
 
+use super::message::tell;
 use splatsieve::error::{Error, Result, printable};
 use splatsieve::files::atomic::is_standard_output_used;
-use splatsieve::progress::tell;
 
 /// What messages call standard output.
 const NAME: &str = "standard output";

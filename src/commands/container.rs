@@ -31,7 +31,6 @@ use crate::outputs::kind::{OutputKind, check_container_name, check_folder_name};
 use crate::passes::FrameReaders;
 use crate::pipeline::stages::write::ENCODING;
 use crate::pipeline::summary::InputSummary;
-use crate::progress::Progress;
 use crate::scene::{
     InputOptions, Opened, first_box, is_linked, kept_work, link_stream, open_input, open_stream, room_to_pack,
 };
@@ -92,12 +91,13 @@ fn pack_whole(input: &InputOptions, output: &Path, storing: &Storing, overwrite:
         None => open_input(input)?,
     };
     let source = opened.input.source();
-    Plan::fit(workload(&*opened.input), input.memory, |work, _| packing(work, storing))?.tell_time(input.memory.tell);
+    Plan::fit(workload(&*opened.input), input.memory, &input.events, |work, _| packing(work, storing))?
+        .tell_time(input.memory.tell, &input.events);
     let (work, digest) = kept_work(input, &*opened.input)?;
     let extent = || Ok(first_box(source)?.map_or(1.0, |bounds| bounds.extent()));
     let packing = storing.packing(|| work.known("extent", work.key(&()), extent))?;
     let attributes = BTreeMap::from([("source_digest".to_owned(), digest.map_or_else(|| opened.input.digest(), Ok)?)]);
-    let progress = |frames: usize| Progress::new(PACK, "states", (source.info().count * frames) as u64);
+    let progress = |frames: usize| input.events.task(PACK, "states", (source.info().count * frames) as u64);
     let staged = if work.keeps() {
         let encode = |blocks: Range<usize>, to: &mut SpillWriter| {
             let progress = progress(blocks.clone().map(|block| packing.frames(source, block).len()).sum());
@@ -137,7 +137,7 @@ fn pack_arriving(
     })?;
     let staged = StagedFile::new(output, overwrite)?;
     let mut room = room_to_pack(input, stream.header())?;
-    let received = pack_stream(stream, staged.path(), packing, |held| room.admit(held.len()))?;
+    let received = pack_stream(stream, staged.path(), packing, &input.events, |held| room.admit(held.len()))?;
     let container = Container::open(staged.path())?;
     let (gaussians, frames) = (container.info().count, container.info().times.len());
     let bytes = fs::metadata(staged.path()).map_err(Error::io("read", staged.path()))?.len();
@@ -155,8 +155,8 @@ pub fn unpack_stream(input: &InputOptions, to: impl Write) -> Result<Opened> {
     let info = source.info();
     let header =
         StreamHeader { count: info.count, sh_degree: info.sh_degree, varying: info.varying, is_unlinked: false };
-    let plan = Plan::fit(workload(&*opened.input), input.memory, unpacking)?;
-    plan.tell_time(input.memory.tell);
+    let plan = Plan::fit(workload(&*opened.input), input.memory, &input.events, unpacking)?;
+    plan.tell_time(input.memory.tell, &input.events);
     let held = plan.limits.frames_held;
     let wanted = ReadPlan::every().holding(held);
     let mut frames = FrameReaders::open(source, Ids::Range(0..source.info().count), Columns::all(), &wanted)?;
@@ -164,7 +164,7 @@ pub fn unpack_stream(input: &InputOptions, to: impl Write) -> Result<Opened> {
     if !info.times.is_empty() {
         frames.read(0, Columns::all(), &mut state)?;
     }
-    let progress = Progress::new("unpack", "frames", info.times.len() as u64);
+    let progress = input.events.task("unpack", "frames", info.times.len() as u64);
     let mut stream = StreamWriter::new(to, Path::new("standard output"), header, &state)?;
     for (frame, &time) in info.times.iter().enumerate() {
         frames.read(frame, info.varying, &mut state)?;
@@ -182,11 +182,11 @@ pub fn unpack(input: &InputOptions, output: &Path, overwrite: Replace) -> Result
     check_target(output, Kind::Folder, &[&input.path], overwrite)?;
     let opened = open_input(input)?;
     let source = opened.input.source();
-    let plan = Plan::fit(workload(&*opened.input), input.memory, unpacking)?;
-    plan.tell_time(input.memory.tell);
+    let plan = Plan::fit(workload(&*opened.input), input.memory, &input.events, unpacking)?;
+    plan.tell_time(input.memory.tell, &input.events);
     let held = plan.limits.frames_held;
     let staged = StagedFolder::new(output, overwrite)?;
-    write_sequence(source, OutputKind::PlySequence, staged.path(), held)?;
+    write_sequence(source, OutputKind::PlySequence, staged.path(), held, &input.events)?;
     let marker = serde_json::json!({
         "tool": TOOL,
         "input": InputSummary::new(&*opened.input, &input.path, opened.input.digest()?)?.without_folders(),

@@ -67,12 +67,12 @@ pub fn convert(
     kind.check_frames(frames, output)?;
     family.check_output(kind, output)?;
     let work = Workload::new(source.info(), family.residence());
-    let plan = Plan::fit(work, input.memory, |work, limits| vec![need(kind, work, limits)])?;
-    plan.tell_time(input.memory.tell);
+    let plan = Plan::fit(work, input.memory, &input.events, |work, limits| vec![need(kind, work, limits)])?;
+    plan.tell_time(input.memory.tell, &input.events);
     let all = CompressedModel::pruned((0..gaussians as u32).collect(), &Recipe::preset("default")?.merge);
     let mut notes = opened.notes;
     let mut write = |path: &Path| -> Result<u64> {
-        notes.extend(family.write(&all, kind, path, &plan.limits)?);
+        notes.extend(family.write(&all, kind, path, &plan.limits, &input.events)?);
         Ok(family.size_written(kind, path)?.whole())
     };
     let bytes = if kind.is_folder() {

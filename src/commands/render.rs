@@ -17,7 +17,7 @@ use crate::model::{Camera, Picture};
 use crate::outputs::kind::check_folder_name;
 use crate::passes::{Batch, Subject, ViewStates, show};
 use crate::pipeline::summary::{CameraSummary, InputSummary};
-use crate::progress::Progress;
+use crate::progress::Events;
 use crate::render::Image;
 use crate::scene::pictures::{self, PictureSet, background, picture, pictures};
 use crate::scene::{InputOptions, open_scene};
@@ -100,7 +100,14 @@ fn render_whole(options: &RenderOptions) -> Result<Rendered> {
         RenderSelection::One { frame, view } => vec![picture(&scene.rig, times, options.part, frame, view)?],
         RenderSelection::All(_) => pictures(&scene.rig, times, options.part)?,
     };
-    let job = RenderJob { source, cameras: &scene.rig.cameras, limits: scene.limits, background, format };
+    let job = RenderJob {
+        source,
+        cameras: &scene.rig.cameras,
+        limits: scene.limits,
+        background,
+        format,
+        events: &scene.events,
+    };
     if kind == Kind::File {
         let staged = StagedFile::new(output, options.overwrite)?;
         job.write(&chosen, |_| staged.path().to_owned())?;
@@ -161,6 +168,7 @@ struct RenderJob<'a> {
     limits: Limits,
     background: [f32; 3],
     format: ImageFormat,
+    events: &'a Events,
 }
 
 impl RenderJob<'_> {
@@ -184,7 +192,7 @@ impl RenderJob<'_> {
         of_each: impl Fn(Picture, &Image) -> Result<T> + Sync,
         mut then: impl FnMut(T) -> Result<()>,
     ) -> Result<()> {
-        let progress = Progress::new(NAME, "pictures", pictures.len() as u64);
+        let progress = self.events.task(NAME, "pictures", pictures.len() as u64);
         show([Subject::all(self.source)], self.cameras, pictures, Batch::of_frame(&self.limits), |views| {
             // Tasks within a picture too: a frame may have fewer pictures than there are threads.
             let made = views.par_iter().map(|view: &ViewStates<'_, 1>| {

@@ -14,7 +14,7 @@ use crate::memory_plan::ResourceEstimate;
 use crate::model::{Camera, Picture, Rig, Shot};
 use crate::outputs::film::{FilmFormat, FilmOutput};
 use crate::passes::{Batch, Subject, ViewStates, show};
-use crate::progress::Progress;
+use crate::progress::Events;
 use crate::render::Image;
 use crate::scene::path::along;
 use crate::scene::pictures::{self, PictureSet, background};
@@ -101,7 +101,8 @@ pub fn video(options: &VideoOptions) -> Result<Filmed> {
 
     let staged = StagedFile::new(output, options.overwrite)?;
     let mut film = FilmOutput::create((staged.path(), output), &format, size, pictures.len() as u32, options.fps)?;
-    let shown = FilmSource { cameras: &cameras, pictures: &pictures, limits: &scene.limits, background };
+    let shown =
+        FilmSource { cameras: &cameras, pictures: &pictures, limits: &scene.limits, background, events: &scene.events };
     match &beside {
         None => shown.film([Subject::all(scene.source())], &mut film)?,
         Some(other) => shown.film([scene.source(), other.source()].map(Subject::all), &mut film)?,
@@ -194,11 +195,12 @@ struct FilmSource<'a> {
     pictures: &'a [Picture],
     limits: &'a Limits,
     background: [f32; 3],
+    events: &'a Events,
 }
 
 impl FilmSource<'_> {
     fn film<const S: usize>(&self, subjects: [Subject<'_>; S], film: &mut FilmOutput) -> Result<()> {
-        let progress = Progress::new(NAME, "frames", self.pictures.len() as u64);
+        let progress = self.events.task(NAME, "frames", self.pictures.len() as u64);
         show(subjects, self.cameras, self.pictures, Batch::of_frame(self.limits), |views| {
             let made: Vec<Image> = views
                 .par_iter()

@@ -17,6 +17,7 @@ use crate::outputs::kind::check_folder_name;
 use crate::pipeline::summary::Detail;
 use crate::pipeline::summary::Summary;
 use crate::pipeline::{Request, Target, compress_scene, keep_to_budget};
+use crate::progress::Events;
 use crate::recipe::Recipe;
 use crate::scene::{InputOptions, Scene};
 
@@ -37,6 +38,8 @@ pub struct DemoOptions {
     pub overwrite: Replace,
     /// Memory to keep to.
     pub memory: Budget,
+    /// Where the events of the run go.
+    pub events: Events,
 }
 
 /// What the demo did.
@@ -68,14 +71,15 @@ pub fn run(options: &DemoOptions) -> Result<DemoReport> {
 fn run_in(folder: &Path, options: &DemoOptions) -> Result<DemoReport> {
     let made = demo_scene::Scene::new(options.gaussians, options.frames);
     let packed = folder.join("scene.gseq");
-    write_sequence(&made, OutputKind::Gseq, &packed, 1)?;
+    write_sequence(&made, OutputKind::Gseq, &packed, 1, &options.events)?;
     let rig = made.rig();
     let cameras = folder.join("cameras.json");
     fs::write(&cameras, cameras_json(&rig)).map_err(Error::io("write", &cameras))?;
 
     let input = Box::new(Container::open(&packed)?);
     let mut scene = Scene::new(PathBuf::from("scene.gseq"), input, rig, Some(Split::Train))?;
-    let plain = InputOptions { memory: options.memory, ..InputOptions::default() };
+    scene.events = options.events.clone();
+    let plain = InputOptions { memory: options.memory, events: options.events.clone(), ..InputOptions::default() };
     let request = Request {
         target: Some(options.kept),
         ..Request::new(plain, folder.join("compressed.gseq"), options.recipe.clone())

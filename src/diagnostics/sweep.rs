@@ -18,7 +18,6 @@ use crate::files::atomic::{Kind, MARKER, Replace, StagedFolder, check_target};
 use crate::files::names::name_of;
 use crate::outputs::kind::check_folder_name;
 use crate::pipeline::Target;
-use crate::progress::Progress;
 use crate::report::trade_off::{PAGE, page};
 use crate::scene::{InputOptions, open_scene};
 
@@ -90,7 +89,7 @@ pub fn sweep(options: &SweepOptions) -> Result<TradeOff> {
             own.into_iter().chain(fractions.iter().copied().map(Some)).map(move |asked| (method, asked))
         })
         .collect();
-    let progress = Progress::new("sweep", "points", (points.len() + steps.len()) as u64);
+    let progress = options.input.events.task("sweep", "points", (points.len() + steps.len()) as u64);
     for (method, asked) in points {
         if !beyond_merging(method, asked, &found) {
             let point = measure(&run, method, asked, &method.means()?, &mut found)?;

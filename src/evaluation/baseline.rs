@@ -46,7 +46,7 @@ pub fn prune_by(baseline: Baseline, options: &InputOptions, target: Option<Targe
     let kind = OutputKind::from_path(output, None, scene.input.own_output());
     scene.input.check_output(kind, output)?;
     let reduction = CompressedModel::pruned(kept, &Recipe::preset("default")?.merge);
-    write_alone(&*scene.input, &reduction, kind, output, &Limits::NONE)
+    write_alone(&*scene.input, &reduction, kind, output, &Limits::NONE, &scene.events)
 }
 
 /// The `wanted` best of `ids`, increasing.

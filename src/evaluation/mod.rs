@@ -33,7 +33,6 @@ use crate::models;
 use crate::models::{InputModel, OpenOptions, Timing};
 use crate::passes::{Batch, Subject, ViewStates, show};
 use crate::pipeline::summary::CameraSummary;
-use crate::progress::Progress;
 use crate::render::Image;
 use crate::scene::photographs::Photographs;
 use crate::scene::pictures::{self, PictureSet, background, pictures, thin};
@@ -173,8 +172,8 @@ impl ModelPair {
         let of_scene = self.scene.workload();
         let gaussians = of_scene.gaussians.max(self.compressed_count() as u64);
         let pictures = of_scene.pictures.max(self.pictures.len() as u64);
-        let plan = Plan::fit(Workload { gaussians, pictures, ..of_scene }, budget, needs)?;
-        plan.tell_time(budget.tell);
+        let plan = Plan::fit(Workload { gaussians, pictures, ..of_scene }, budget, &self.scene.events, needs)?;
+        plan.tell_time(budget.tell, &self.scene.events);
         self.scene.limits = plan.limits;
         Ok(())
     }
@@ -222,7 +221,7 @@ impl ModelPair {
         observe: impl Fn(&Gaussians, &Camera, &RenderedViews) -> O + Sync,
     ) -> Result<Vec<O>> {
         self.divided(name, |some| {
-            let progress = Progress::new(name, "pictures", some.len() as u64);
+            let progress = self.scene.events.task(name, "pictures", some.len() as u64);
             let mut all = Vec::with_capacity(some.len());
             self.show(&self.pictures[some], |views| {
                 let see = |view: &ViewStates<'_, 2>| {
@@ -385,7 +384,7 @@ impl ModelPair {
         let mut all = Vec::with_capacity(chosen.len() - again);
         let mut observed = Vec::with_capacity(chosen.len() - again);
         let mut shown = 0;
-        let progress = Progress::new(NAME, "pictures", (chosen.len() - again) as u64);
+        let progress = self.scene.events.task(NAME, "pictures", (chosen.len() - again) as u64);
         self.show(&chosen, |views| {
             let first = shown;
             shown += views.len();

@@ -18,7 +18,7 @@ use crate::merging::voxels::voxel_order;
 use crate::model::{Column, opacity};
 use crate::outputs::container::FRAME_BLOCK;
 use crate::passes::FrameReaders;
-use crate::progress::Progress;
+use crate::progress::Events;
 use crate::recipe;
 use crate::source::{BlockReader, FrameSource, Ids, ReadPlan};
 
@@ -43,6 +43,8 @@ pub struct PairMeter<'a> {
     pub frames_held: usize,
     /// Folder for trajectories that have to wait.
     pub scratch: PathBuf,
+    /// Where progress goes.
+    pub events: Events,
     /// None at first.
     pub gathered: Option<Gathered>,
 }
@@ -59,7 +61,7 @@ pub struct Gathered {
 impl PairMeter<'_> {
     /// The same, with nothing gathered.
     pub fn fresh(&self) -> Self {
-        PairMeter { scratch: self.scratch.clone(), gathered: None, ..*self }
+        PairMeter { scratch: self.scratch.clone(), events: self.events.clone(), gathered: None, ..*self }
     }
 
     /// How alike each of `pairs` (rows of `ids`, which increase) moves, in some order. `reference` `[3, M]` holds the
@@ -119,7 +121,7 @@ impl PairMeter<'_> {
         let rows: Vec<u32> = (0..ids.len() as u32).collect();
         let order = voxel_order(&rows, |row| reference.row(row as usize), reach);
         let of_order: Vec<u32> = order.iter().map(|&row| ids[row as usize]).collect();
-        let trajectories = Trajectories::gather(self.source, &of_order, self.frames_held, &self.scratch)?;
+        let trajectories = Trajectories::gather(self.source, &of_order, self.frames_held, &self.scratch, &self.events)?;
         let mut place = rows;
         for (&row, k) in order.iter().zip(0u32..) {
             place[row as usize] = k;
@@ -132,7 +134,7 @@ impl PairMeter<'_> {
         let info = self.source.info();
         let varying = info.varying & NEEDED;
         let frames = if varying.is_empty() { info.times.len().min(1) } else { info.times.len() };
-        let progress = Progress::new("merge", "states", (ids.len() * frames) as u64);
+        let progress = self.events.task("merge", "states", (ids.len() * frames) as u64);
         let wanted = ReadPlan::new(0..frames).holding(self.frames_held);
         let mut readers = FrameReaders::open(self.source, Ids::List(ids), NEEDED, &wanted)?;
         let mut state = readers.state();
@@ -205,6 +207,7 @@ mod tests {
                 gate: MotionGate::new(&self.recipe.merge, 4.0),
                 frames_held: 4,
                 scratch: folder.path().to_owned(),
+                events: Events::IGNORED,
                 gathered: None,
             };
             let is_part = self.pairs.len() > pairs_together;

@@ -23,7 +23,7 @@ use crate::error::Result;
 use crate::model::{Columns, Gaussians};
 use crate::outputs::container::FRAME_BLOCK;
 use crate::passes::BLOCK;
-use crate::progress::Progress;
+use crate::progress::Events;
 use crate::source::{FrameSource, Ids, ReadPlan};
 
 /// What test 3 reads of a Gaussian at one frame: x, y, z, opacity logit.
@@ -59,13 +59,14 @@ impl Trajectories {
         ids: &[u32],
         frames_together: usize,
         folder: &Path,
+        events: &Events,
     ) -> Result<Trajectories> {
         let (frames, columns) = (source.info().times.len(), source.info().varying & NEEDED);
         let mut places: Vec<(u32, u32)> = ids.iter().copied().zip(0..).collect();
         places.par_sort_unstable();
         let mut file = SpillWriter::new(folder)?;
         let block = frames_together.clamp(1, FRAME_BLOCK);
-        let progress = Progress::new("merge", "frames", frames as u64);
+        let progress = events.task("merge", "frames", frames as u64);
         let mut values = Vec::new();
         if frames > 0 {
             take(source, &places, 0..1, NEEDED, &mut values)?;
@@ -237,7 +238,8 @@ mod tests {
         for varying in [NEEDED, Columns::POSITION, Columns::OPACITY, Columns::empty()] {
             let source = Still::new(varying);
             for frames_together in [1, 3, usize::MAX] {
-                let gathered = Trajectories::gather(&source, &ids, frames_together, folder.path()).unwrap();
+                let gathered =
+                    Trajectories::gather(&source, &ids, frames_together, folder.path(), &Events::IGNORED).unwrap();
                 let mut shown = Vec::new();
                 gathered.play(&places, |moments| shown.push(moments.to_vec())).unwrap();
                 let frames = if varying.is_empty() { 1 } else { 7 };

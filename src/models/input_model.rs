@@ -17,6 +17,7 @@ use crate::limits::{Limits, ReadLimit};
 use crate::model::{Columns, Gaussians};
 use crate::outputs::container::GAUSSIAN_BLOCK;
 use crate::outputs::kind::OutputKind;
+use crate::progress::Events;
 use crate::recipe::MergeParams;
 use crate::source::FrameSource;
 
@@ -223,7 +224,7 @@ pub trait InputModel: Send + Sync {
     }
 
     /// Writes what `reduction` leaves to `path`, a new file or an empty folder; gives things a person should know.
-    /// What waits in memory to be written keeps to `limits`.
+    /// What waits in memory to be written keeps to `limits`. Progress goes to `events`.
     ///
     /// # Errors
     /// Frames that cannot be read, a failed write.
@@ -233,8 +234,9 @@ pub trait InputModel: Send + Sync {
         kind: OutputKind,
         path: &Path,
         limits: &Limits,
+        events: &Events,
     ) -> Result<Vec<String>> {
-        write_trajectories(self.source(), reduction, kind, path, limits)
+        write_trajectories(self.source(), reduction, kind, path, limits, events)
     }
 }
 
@@ -374,6 +376,8 @@ pub struct OpenOptions {
     pub conventions: Conventions,
     /// Memory that opening it may take.
     pub memory: ReadLimit,
+    /// Where the progress of opening goes.
+    pub events: Events,
 }
 
 /// What the files of some families do not say of how their models were trained, or what to do where they are unclear.
@@ -422,7 +426,7 @@ impl OpenOptions {
 
     /// How PLY files of the input are read.
     pub(crate) fn ply(&self) -> PlyOptions {
-        PlyOptions { scratch: self.scratch(), memory: self.memory }
+        PlyOptions { scratch: self.scratch(), memory: self.memory, events: self.events.clone() }
     }
 
     /// Refuses what only model folders take.

@@ -24,7 +24,7 @@ use crate::models::input_model::{InputModel, Link, MemoryProfile, ModelFormat, O
 use crate::outputs::container::GAUSSIAN_BLOCK;
 use crate::outputs::kind::OutputKind;
 use crate::passes::{HeldFrames, gather_all};
-use crate::progress::Progress;
+use crate::progress::Events;
 use crate::source::{FrameSource, Ids};
 use crate::tracking::{OrderDifference, identity};
 
@@ -195,20 +195,28 @@ impl InputModel for PlySequence {
         kind: OutputKind,
         path: &Path,
         limits: &Limits,
+        events: &Events,
     ) -> Result<Vec<String>> {
         match kind {
-            OutputKind::Ply | OutputKind::PlySequence => write_files(self, reduction, kind, path).map(|()| Vec::new()),
-            _ => write_trajectories(self, reduction, kind, path, limits),
+            OutputKind::Ply | OutputKind::PlySequence => {
+                write_files(self, reduction, (kind, path), events).map(|()| Vec::new())
+            }
+            _ => write_trajectories(self, reduction, kind, path, limits, events),
         }
     }
 }
 
 /// Writes every frame's file again with the properties, comments and names it had.
-fn write_files(sequence: &PlySequence, reduction: &CompressedModel, kind: OutputKind, path: &Path) -> Result<()> {
+fn write_files(
+    sequence: &PlySequence,
+    reduction: &CompressedModel,
+    (kind, path): (OutputKind, &Path),
+    events: &Events,
+) -> Result<()> {
     let result = merged(sequence, reduction);
     let places: Vec<u32> = reduction.clusters.iter().map(|cluster| cluster.output).collect();
     let rows = out_rows(reduction);
-    let progress = Progress::new("emit", "frames", sequence.paths().len() as u64);
+    let progress = events.task("emit", "frames", sequence.paths().len() as u64);
     let write = |&frame: &usize| {
         let mut proxies = Gaussians::zeros(0, sequence.info().sh_degree);
         result.open(Ids::List(&places))?.read(frame, Columns::all(), &mut proxies)?;

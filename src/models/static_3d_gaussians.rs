@@ -17,6 +17,7 @@ use crate::files::ply_sequence::PlySequence;
 use crate::limits::Limits;
 use crate::models::input_model::{InputModel, MemoryProfile, ModelFormat, OpenOptions, Timing};
 use crate::outputs::kind::OutputKind;
+use crate::progress::Events;
 use crate::source::FrameSource;
 
 const CLOUDS: &str = "point_cloud";
@@ -146,9 +147,10 @@ impl InputModel for Static {
         kind: OutputKind,
         path: &Path,
         limits: &Limits,
+        events: &Events,
     ) -> Result<Vec<String>> {
         if kind != OutputKind::Model {
-            return self.cloud.write(reduction, kind, path, limits);
+            return self.cloud.write(reduction, kind, path, limits, events);
         }
         let to = self.cloud_in(path);
         let folder = to.parent().unwrap_or(path);
@@ -156,7 +158,7 @@ impl InputModel for Static {
         for file in self.beside() {
             copy(&file, &path.join(file.file_name().unwrap_or_default()))?;
         }
-        self.cloud.write(reduction, OutputKind::Ply, &to, limits)
+        self.cloud.write(reduction, OutputKind::Ply, &to, limits, events)
     }
 }
 
@@ -187,7 +189,7 @@ mod tests {
         let result = folder.path().join("result");
         fs::create_dir(&result).unwrap();
         let reduction = CompressedModel::pruned(vec![1, 3], &Recipe::preset("default").unwrap().merge);
-        model.write(&reduction, OutputKind::Model, &result, &Limits::NONE).unwrap();
+        model.write(&reduction, OutputKind::Model, &result, &Limits::NONE, &Events::IGNORED).unwrap();
         let [all, left] =
             [&root, &result].map(|path| gather_all(open(path, None).unwrap().source(), 0, Columns::all()).unwrap());
         assert_eq!(left, all.pick(&[1, 3]));

@@ -19,7 +19,7 @@ use crate::model::Gaussians;
 use crate::models::input_model::{InputModel, MemoryProfile, Timing};
 use crate::outputs::container::{ContainerWriter, FRAME_BLOCK, Packing};
 use crate::passes::HeldFrames;
-use crate::progress::Progress;
+use crate::progress::Events;
 use crate::source::FrameSource;
 
 /// Most bytes of frames that are held together, if that is one frame at least.
@@ -47,10 +47,11 @@ impl Streamed {
     pub fn receive(
         stream: FrameStream<impl Read + Send + 'static>,
         folder: &Path,
+        events: &Events,
         take: impl FnMut(&HeldFrames) -> Result<()>,
     ) -> Result<Streamed> {
         let scratch = ScratchFile::new(folder)?;
-        let received = pack_stream(stream, scratch.path(), COMPRESSION, take)?;
+        let received = pack_stream(stream, scratch.path(), COMPRESSION, events, take)?;
         let container = Container::open(scratch.path())?;
         Ok(Streamed { container, received, _scratch: scratch })
     }
@@ -108,13 +109,14 @@ pub fn pack_stream(
     mut stream: FrameStream<impl Read + Send + 'static>,
     path: &Path,
     packing: impl Into<Packing>,
+    events: &Events,
     mut take: impl FnMut(&HeldFrames) -> Result<()>,
 ) -> Result<u64> {
     let StreamHeader { count, sh_degree, varying, .. } = *stream.header();
     let block = frame_block(stream.header());
     let mut writer = ContainerWriter::create(path, count, sh_degree, block, packing, BTreeMap::new())?;
     let mut held = HeldFrames::new(count, sh_degree, varying, stream.take_constant());
-    let progress = Progress::counting("receive", "frames");
+    let progress = events.counting_task("receive", "frames");
     let mut put = |held: &mut HeldFrames| -> Result<Vec<Gaussians>> {
         writer.append(held, 0..held.len(), |_| ())?;
         take(held)?;

@@ -19,7 +19,7 @@ use crate::outputs::curves::write_curves;
 use crate::outputs::four_dgs::write_four_dgs;
 use crate::outputs::kind::OutputKind;
 use crate::passes::{Changed, HeldFrames, States, gather_all};
-use crate::progress::Progress;
+use crate::progress::Events;
 use crate::source::{FrameSource, ReadPlan};
 
 /// zstd level of containers that are a result: higher ones gain about 1% on trained models.
@@ -74,22 +74,29 @@ pub(super) fn write_trajectories(
     kind: OutputKind,
     path: &Path,
     limits: &Limits,
+    events: &Events,
 ) -> Result<Vec<String>> {
     if kind == OutputKind::Gseq && !reduction.clusters.is_empty() {
-        write_merged(source, reduction, path, limits.gaussians_together)?;
+        write_merged(source, reduction, path, limits.gaussians_together, events)?;
         return Ok(Vec::new());
     }
-    write_sequence(&*reduced_trajectories(source, reduction), kind, path, limits.frames_held)
+    write_sequence(&*reduced_trajectories(source, reduction), kind, path, limits.frames_held, events)
 }
 
 /// A container with proxies, whose members lie anywhere: a frame block at a time, of as many Gaussians together as
 /// `most` allows.
-fn write_merged(source: &dyn FrameSource, reduction: &CompressedModel, path: &Path, most: usize) -> Result<()> {
+fn write_merged(
+    source: &dyn FrameSource,
+    reduction: &CompressedModel,
+    path: &Path,
+    most: usize,
+    events: &Events,
+) -> Result<()> {
     let merged = merged(source, reduction);
     let SequenceInfo { count, times, sh_degree, varying } = merged.info();
     let (compression, left) = (Compression::Zstd(LEVEL), reduction.sh_degree.min(*sh_degree));
     let mut writer = ContainerWriter::create(path, *count, left, FRAME_BLOCK, compression, BTreeMap::new())?;
-    let progress = Progress::new("emit", "states", (count * times.len()) as u64);
+    let progress = events.task("emit", "states", (count * times.len()) as u64);
     let parts = parts(&merged, most);
     for start in (0..times.len()).step_by(FRAME_BLOCK) {
         let of_block = start..times.len().min(start + FRAME_BLOCK);
@@ -140,24 +147,30 @@ fn parts(merged: &MergedSequence<'_>, most: usize) -> Vec<Range<usize>> {
 ///
 /// # Errors
 /// Frames that cannot be read, a failed write.
-pub fn write_sequence(source: &dyn FrameSource, kind: OutputKind, path: &Path, held: usize) -> Result<Vec<String>> {
+pub fn write_sequence(
+    source: &dyn FrameSource,
+    kind: OutputKind,
+    path: &Path,
+    held: usize,
+    events: &Events,
+) -> Result<Vec<String>> {
     let info = source.info();
     match kind {
-        OutputKind::Splatv => return Ok(vec![write_curves(source, path)?]),
-        OutputKind::FourDgs => return Ok(vec![write_four_dgs(source, path)?]),
+        OutputKind::Splatv => return Ok(vec![write_curves(source, path, events)?]),
+        OutputKind::FourDgs => return Ok(vec![write_four_dgs(source, path, events)?]),
         OutputKind::Spz => {
             let off = write_spz(&gather_all(source, 0, Columns::all())?, path)?;
             return Ok(vec![format!("positions are {off:.2e} scene units off at most")]);
         }
         OutputKind::Gseq => {
-            let progress = Progress::new("emit", "states", info.count as u64 * info.times.len() as u64);
+            let progress = events.task("emit", "states", info.count as u64 * info.times.len() as u64);
             let compression = Compression::Zstd(LEVEL);
             write_container(source, path, compression, BTreeMap::new(), |done| progress.advance(done))?;
             return Ok(Vec::new());
         }
         _ => (),
     }
-    let progress = Progress::new("emit", "frames", info.times.len() as u64);
+    let progress = events.task("emit", "frames", info.times.len() as u64);
     let mut states = States::open(source, &ReadPlan::every().holding(held))?;
     for frame in 0..info.times.len() {
         let file = match kind {

@@ -12,16 +12,16 @@ use crate::files::splatv::write::{measure, seen_whole, words, write};
 use crate::fit::{CubicTrack, Misfit, Tolerance, curved};
 use crate::model::{Columns, color};
 use crate::passes::{gather_all, tracks};
-use crate::progress::Progress;
+use crate::progress::Events;
 use crate::source::FrameSource;
 
 /// Writes all frames of `source`; says how close that is.
 ///
 /// # Errors
 /// Frames that cannot be read; a failed write.
-pub fn write_curves(source: &dyn FrameSource, path: &Path) -> Result<String> {
+pub fn write_curves(source: &dyn FrameSource, path: &Path, events: &Events) -> Result<String> {
     let info = source.info();
-    let progress = Progress::new("emit", "states", (info.count * info.times.len()) as u64);
+    let progress = events.task("emit", "states", (info.count * info.times.len()) as u64);
     let times = within_one(&info.times);
     let tolerance = Tolerance::default();
     let found = tracks(source, &times, &progress, |track| {
@@ -96,7 +96,7 @@ mod tests {
         let scene = Scene::new(300, 30);
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("scene.splatv");
-        let said = write_curves(&scene, &path).unwrap();
+        let said = write_curves(&scene, &path, &Events::IGNORED).unwrap();
         assert!(said.starts_with("300 Gaussians became"), "{said}");
         let file = Splatv::open(&path).unwrap();
         let rows: Vec<SplatvGaussian> = (0..file.count()).map(|k| SplatvGaussian::of_words(&file.words(k))).collect();
@@ -139,7 +139,7 @@ mod tests {
         let seen = f64::from(seen);
         assert!(seen > 3000.0 && apart / seen < 0.01 && depth / seen < 0.05, "{} {} of {seen}", apart, depth);
         let again = folder.path().join("again.splatv");
-        write_curves(&scene, &again).unwrap();
+        write_curves(&scene, &again, &Events::IGNORED).unwrap();
         assert_eq!(std::fs::read(&path).unwrap(), std::fs::read(&again).unwrap());
     }
 }

@@ -15,7 +15,7 @@ use crate::files::accuracy::{Accuracy, Drawn};
 use crate::fit::{LinearPiece, Misfit, Tolerance, straight};
 use crate::model::{Column, color};
 use crate::passes::tracks;
-use crate::progress::Progress;
+use crate::progress::Events;
 use crate::source::FrameSource;
 
 /// Frames a second of a sequence that says nothing of it.
@@ -25,9 +25,9 @@ const FRAME_RATE: f64 = 30.0;
 ///
 /// # Errors
 /// Frames that cannot be read; values that the format cannot hold; a failed write.
-pub fn write_four_dgs(source: &dyn FrameSource, path: &Path) -> Result<String> {
+pub fn write_four_dgs(source: &dyn FrameSource, path: &Path, events: &Events) -> Result<String> {
     let info = source.info();
-    let progress = Progress::new("emit", "states", (info.count * info.times.len()) as u64);
+    let progress = events.task("emit", "states", (info.count * info.times.len()) as u64);
     let tolerance = Tolerance::default();
     let starts: Vec<f64> = (0..=info.times.len()).map(|frame| frame as f64 / FRAME_RATE).collect();
     let found = tracks(source, &starts[..info.times.len()], &progress, |track| {
@@ -138,7 +138,7 @@ mod tests {
         let scene = Scene::new(400, 24);
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("scene.4dgs");
-        let said = write_four_dgs(&scene, &path).unwrap();
+        let said = write_four_dgs(&scene, &path, &Events::IGNORED).unwrap();
         assert!(said.contains("400 Gaussians became"), "{said}");
         let read = fourdgs::read_path(&path).unwrap();
         let mut scales: Vec<f64> = read.gaussians.scales.iter().map(|&scale| f64::from(scale)).collect();
@@ -176,7 +176,7 @@ mod tests {
             "{missing} missing of {seen}, {apart} of what they may be apart"
         );
         let again = folder.path().join("again.4dgs");
-        write_four_dgs(&scene, &again).unwrap();
+        write_four_dgs(&scene, &again, &Events::IGNORED).unwrap();
         assert_eq!(std::fs::read(&path).unwrap(), std::fs::read(&again).unwrap());
     }
 }

@@ -57,7 +57,7 @@ mod tests {
     #[test]
     fn tracks_are_what_frames_say_whatever_the_number_of_threads() {
         let scene = Scene::new(3 * TRACKED + 5, 7);
-        let progress = Progress::new("track", "states", 0);
+        let progress = Progress::IGNORED;
         let all = |threads: usize| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
             pool.install(|| tracks(&scene, &scene.info().times, &progress, Clone::clone)).unwrap()

@@ -80,7 +80,7 @@ pub fn foresee(request: &Request) -> Result<Foreseen> {
     run.check_target(&request.input.path)?;
     run.check(&scene)?;
     let needs = |work: &Workload, limits: &_| run.estimates(work, limits);
-    let plan = Plan::fit(scene.workload(), Budget { tell: Verbosity::Nothing, ..input.memory }, needs)?;
+    let plan = Plan::fit(scene.workload(), Budget { tell: Verbosity::Nothing, ..input.memory }, &input.events, needs)?;
     scene.follow(&plan);
     let forecast = forecast(&mut scene, &plan, &run, MeasuredOnArrival::default())?;
     let mut journal = Journal::default();

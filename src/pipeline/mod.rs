@@ -30,7 +30,6 @@ use crate::error::{Error, Result};
 use crate::journal::Journal;
 use crate::memory_plan::{Budget, Verbosity, Workload, seconds};
 use crate::model::ALL_HARMONICS;
-use crate::progress::begin_run;
 use crate::pruning::score::{Scored, UserOverrides};
 use crate::recipe::{Recipe, WhichBands};
 use crate::scene::{InputOptions, Scene};
@@ -112,7 +111,7 @@ fn run_stages(
     journal.notes.extend(scene.notes.iter().cloned());
     journal.whole = scene.whole()?;
     let (work, measured) = (scene.workload(), arrived.as_ref().map(Measured::kinds).unwrap_or_default());
-    let _numbered = begin_run(seconds(&work, &plan.remaining_estimates(&work, &scene.limits, measured)));
+    let _numbered = scene.events.begin_run(&seconds(&work, &plan.remaining_estimates(&work, &scene.limits, measured)));
     let recipe = recipe_text(scene, plan, request, &mut journal)?;
     let sh_degree = match request.recipe.bands.bands {
         WhichBands::UpTo(degree) => stages::bands::highest(scene, degree, &mut journal),

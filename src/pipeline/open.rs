@@ -27,6 +27,7 @@ use crate::pipeline::planning::InputMeta;
 use crate::pipeline::stage::{Measured, MeasuredOnArrival};
 use crate::pipeline::stages::measure::Measure;
 use crate::pipeline::throughput::forecast;
+use crate::progress::Message;
 use crate::pruning::contribution::RunningContribution;
 use crate::recipe;
 use crate::scene::{
@@ -62,7 +63,8 @@ pub fn open_to_measure(
         open_scene(options)?
     };
     let stages = plan(InputMeta::from_scene(&scene), &scene.workload())?;
-    let plan = Plan::fit(scene.workload(), options.memory, |work, limits| stages.estimates(work, limits))?;
+    let plan =
+        Plan::fit(scene.workload(), options.memory, &options.events, |work, limits| stages.estimates(work, limits))?;
     scene.follow(&plan);
     // What measuring beforehand reads is no part of the plan.
     let reads = scene.source().reads();
@@ -84,11 +86,11 @@ fn foretell(
     // Of a part nobody knows how much of the run it is.
     let is_part = options.work.as_ref().is_some_and(|work| work.part.is_some());
     if tell == Verbosity::Plan && stages.output.is_some() {
-        crate::progress::tell(&stages.text());
+        options.events.send(Message::Plan(&stages.text()));
     }
     if tell != Verbosity::Nothing && !is_part {
         let forecast = forecast(scene, plan, stages, measured)?;
-        crate::progress::tell(forecast.text(tell).trim_end());
+        options.events.send(Message::Plan(forecast.text(tell).trim_end()));
         journal.forecast = Some(forecast);
     }
     Ok(())
@@ -115,7 +117,7 @@ fn receive_measured(
     let visible = visible.as_ref().filter(|visible| visible.can_look_on_arrival());
     let held = (block + AHEAD) as u64;
     let fit = |tell: Verbosity, measuring: Option<bool>| {
-        Plan::fit(work, Budget { tell, ..options.memory }, |work, limits| {
+        Plan::fit(work, Budget { tell, ..options.memory }, &options.events, |work, limits| {
             let mut all = vec![receiving(work, limits, held, measuring, 0)];
             all.extend(stages.estimates(work, limits));
             all
@@ -124,10 +126,8 @@ fn receive_measured(
     let measures = fit(Verbosity::Nothing, Some(visible.is_some())).is_ok();
     let memory = fit(options.memory.tell, measures.then_some(visible.is_some()))?;
     if options.memory.tell == Verbosity::Time {
-        crate::progress::tell(&format!(
-            "memory: at most {}; nobody knows how many frames will arrive",
-            size(memory.peak())
-        ));
+        let text = format!("memory: at most {}; nobody knows how many frames will arrive", size(memory.peak()));
+        options.events.send(Message::Plan(&text));
     }
     let receive = |budget: u64, measuring: Option<bool>, frames: u64| {
         let limits = memory.limits;
@@ -140,10 +140,9 @@ fn receive_measured(
     let to_measure =
         FrameQuota::new(options.memory, |budget, frames| receive(budget, Some(visible.is_some()), frames)).most;
     if options.memory.tell == Verbosity::Plan {
-        crate::progress::tell(&format!(
-            "frames: there is memory for {}, for {to_measure} to be measured as they arrive",
-            room.most
-        ));
+        let most = room.most;
+        let text = format!("frames: there is memory for {most}, for {to_measure} to be measured as they arrive");
+        options.events.send(Message::Plan(&text));
     }
     // Without cameras the rig stands around the first frame, and everything else around the rig.
     let (rig, plan_of_scan) = (OnceCell::new(), OnceCell::new());
@@ -151,7 +150,7 @@ fn receive_measured(
         let _ = rig.set(loaded);
     }
     let mut measuring: Option<Measuring<'_>> = None;
-    let streamed = Streamed::receive(stream, &options.scratch_folder(), |held| {
+    let streamed = Streamed::receive(stream, &options.scratch_folder(), &options.events, |held| {
         room.admit(held.len())?;
         if room.arrived() > to_measure {
             measuring = None;
@@ -174,7 +173,7 @@ fn receive_measured(
     let mut scene = scene_of(opened, options)?;
     // Now that the frames are counted.
     let counted = Budget { tell: Verbosity::Nothing, ..options.memory };
-    let later = Plan::fit(scene.workload(), counted, |work, limits| stages.estimates(work, limits))?;
+    let later = Plan::fit(scene.workload(), counted, &options.events, |work, limits| stages.estimates(work, limits))?;
     scene.follow(&later);
     if measures && measuring.is_none() && room.arrived() > 0 {
         let note = format!(

@@ -273,6 +273,7 @@ mod tests {
     use crate::model::ALL_HARMONICS;
     use crate::pipeline::request::Target;
     use crate::pipeline::tests::work;
+    use crate::progress::Events;
     use crate::recipe::Recipe;
     use crate::scene::InputOptions;
 
@@ -299,11 +300,13 @@ mod tests {
             let least = Plan::closest(work(200_000), 1, everything(preset)).peak();
             let mut before = 0;
             for bytes in [least, least + (8 << 20), 2 * least, 4 * least, 64 * least] {
-                let plan = Plan::fit(work(200_000), budget(bytes), everything(preset)).unwrap();
+                let plan = Plan::fit(work(200_000), budget(bytes), &Events::IGNORED, everything(preset)).unwrap();
                 assert!((before..=bytes).contains(&plan.peak()), "{bytes}: {}", plan.text());
                 before = plan.peak();
             }
-            let message = Plan::fit(work(200_000), budget(least - 1), everything(preset)).unwrap_err().to_string();
+            let message = Plan::fit(work(200_000), budget(least - 1), &Events::IGNORED, everything(preset))
+                .unwrap_err()
+                .to_string();
             assert!(message.contains(&format!("at least {}MiB", least.div_ceil(1 << 20))), "{message}");
         }
     }

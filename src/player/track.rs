@@ -22,7 +22,7 @@ use super::lattice::{Steps, check_positions, components, width, write_points};
 use crate::error::{Error, Result};
 use crate::model::{Columns, Gaussians};
 use crate::passes::States;
-use crate::progress::Progress;
+use crate::progress::Events;
 use crate::source::{FrameSource, ReadPlan};
 
 /// Lattice points of a group's frames that lie ready together.
@@ -98,10 +98,11 @@ pub fn encode(
     frames: &[usize],
     track: &mut PageSequence,
     held: usize,
+    events: &Events,
     mut sink: impl FnMut(usize, Vec<u8>) -> Result<()>,
 ) -> Result<()> {
     let Some(&first) = frames.first() else { return Ok(()) };
-    let progress = Progress::new("view", "frames", frames.len() as u64);
+    let progress = events.task("view", "frames", frames.len() as u64);
     let mut states = States::open(source, &ReadPlan::new(frames.iter().copied()).holding(held))?;
     let mut shown = Gaussians::default();
     let (count, degree) = (track.count, track.sh_degree);
@@ -251,7 +252,7 @@ mod tests {
             chunks.push(bytes);
             Ok(())
         };
-        encode(source, frames, &mut track, 2, sink).unwrap();
+        encode(source, frames, &mut track, 2, &Events::IGNORED, sink).unwrap();
         assert_eq!(chunks.len(), track.chunks());
         (track, chunks)
     }

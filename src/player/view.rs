@@ -14,6 +14,7 @@ use crate::models::InputModel;
 use crate::player::lattice::{Steps, width};
 use crate::player::page::{Chunks, INDEX, PageModel, PageScene, looks, upwards};
 use crate::player::track::{GROUP_VALUES, PageSequence, encode};
+use crate::progress::Events;
 use crate::scene::pictures::background;
 use crate::scene::{InputOptions, first_box, open_scene, scratch_beside};
 
@@ -93,7 +94,8 @@ pub fn view(options: &ViewOptions) -> Result<Viewed> {
         let most = compressed.as_ref().map_or(0, |model| model.source().info().count as u64);
         let work = scene.workload();
         let work = Workload { gaussians: work.gaussians.max(most), ..work };
-        Plan::fit(work, options.original.memory, |work, limits| vec![need(work, limits)])?.limits
+        Plan::fit(work, options.original.memory, &options.original.events, |work, limits| vec![need(work, limits)])?
+            .limits
     };
     scene.limits = limits;
     let bounds = first_box(scene.source())?;
@@ -108,10 +110,10 @@ pub fn view(options: &ViewOptions) -> Result<Viewed> {
     let scratch = scratch_beside(&options.output).unwrap_or_else(|| scene.scratch.clone());
     let (mut chunks, mut notes) = (Chunks::new(&scratch)?, std::mem::take(&mut scene.notes));
     let asked = ModelView { role: "original", path: &scene.path, frames, degree };
-    let mut models = vec![show(&*scene.input, 0, &asked, steps, &limits, &mut chunks)?];
+    let mut models = vec![show(&*scene.input, 0, &asked, steps, &limits, &mut chunks, &scene.events)?];
     if let Some((path, model)) = options.compressed.as_deref().zip(compressed.as_deref()) {
         let asked = ModelView { role: "compressed", path, frames: all, degree: ALL_HARMONICS };
-        models.push(show(model, 1, &asked, steps, &limits, &mut chunks)?);
+        models.push(show(model, 1, &asked, steps, &limits, &mut chunks, &scene.events)?);
     }
     for model in models.iter().filter(|model| model.track.unseen > 0) {
         let (name, unseen) = (&model.name, model.track.unseen);
@@ -167,13 +169,14 @@ fn show(
     steps: Steps,
     limits: &Limits,
     chunks: &mut Chunks,
+    events: &Events,
 ) -> Result<PageModel> {
     let source = model.source();
     let SequenceInfo { times, sh_degree, .. } = source.info();
     let frames = evenly(times.len(), asked.frames);
     let mut track = PageSequence::plan(source, &frames, asked.degree, steps);
     let groups = track.groups.clone();
-    encode(source, &frames, &mut track, limits.frames_held, |chunk, bytes| {
+    encode(source, &frames, &mut track, limits.frames_held, events, |chunk, bytes| {
         let since = chunk.checked_sub(1).map_or(0.0, |group| groups[group] as f64 / frames.len() as f64);
         chunks.add(place, chunk, since, &bytes)
     })?;

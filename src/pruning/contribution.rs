@@ -11,7 +11,7 @@ use crate::error::Result;
 use crate::limits::Limits;
 use crate::model::{Camera, Columns, Picture};
 use crate::passes::pictures::{Subject, Workers};
-use crate::progress::Progress;
+use crate::progress::Events;
 use crate::render::{Contribution, Renderer};
 use crate::source::{FrameSource, Ids};
 
@@ -47,8 +47,9 @@ pub fn visible_contribution(
     (cameras, pictures): (&[Camera], &[Picture]),
     pixel_stride: NonZeroU32,
     limits: Limits,
+    events: &Events,
 ) -> Result<Contribution> {
-    let progress = Progress::new("visible", "pictures", pictures.len() as u64);
+    let progress = events.task("visible", "pictures", pictures.len() as u64);
     let mut running = RunningContribution::new(source.info().count, pixel_stride, limits);
     running.add(source, cameras, pictures, || progress.advance(1))?;
     Ok(running.sum())
@@ -156,8 +157,16 @@ mod tests {
             assert_eq!((sample.len(), frames), (pictures, 7usize.div_ceil(frame as usize)));
             let one = Limits { frames_held: 1, frames_together: 1, pictures_together: 1, ..Limits::NONE };
             for (threads, limits) in [(1, Limits::NONE), (2, Limits::NONE), (5, Limits::NONE), (3, one)] {
-                let look =
-                    || visible_contribution(&scene, (&schedule.cameras, &sample), scan.pixel_stride, limits).unwrap();
+                let look = || {
+                    visible_contribution(
+                        &scene,
+                        (&schedule.cameras, &sample),
+                        scan.pixel_stride,
+                        limits,
+                        &Events::IGNORED,
+                    )
+                    .unwrap()
+                };
                 let seen = VisibleContribution::new(&on_threads(threads, look), sample.len(), scan.pixel_stride);
                 for i in 0..2500 {
                     let expected = plain.pixels(i) * f64::from(pixel * pixel) / pictures as f64;
@@ -175,7 +184,8 @@ mod tests {
         let total = |pixel| {
             let scan = strides(pixel, 1, 1);
             let sample = (&schedule.cameras[..], &looked_at(&schedule, &scan, 1)[..]);
-            let found = visible_contribution(&scene, sample, scan.pixel_stride, Limits::NONE).unwrap();
+            let found =
+                visible_contribution(&scene, sample, scan.pixel_stride, Limits::NONE, &Events::IGNORED).unwrap();
             VisibleContribution::new(&found, sample.1.len(), scan.pixel_stride).coverage.iter().sum::<f64>()
         };
         let (all, third) = (total(1), total(3));
@@ -255,6 +265,7 @@ mod tests {
             (&schedule.cameras, &sample),
             recipe.scan.pixel_stride,
             Limits::NONE,
+            &Events::IGNORED,
         )
         .unwrap();
         let seen = VisibleContribution::new(&seen, sample.len(), recipe.scan.pixel_stride);
@@ -287,7 +298,7 @@ mod tests {
         let look = |source: &dyn FrameSource, schedule: &Schedule| {
             let sample = looked_at(schedule, &strides(1, 1, 1), 1);
             let sample = (&schedule.cameras[..], &sample[..]);
-            let found = visible_contribution(source, sample, NonZeroU32::MIN, Limits::NONE).unwrap();
+            let found = visible_contribution(source, sample, NonZeroU32::MIN, Limits::NONE, &Events::IGNORED).unwrap();
             VisibleContribution::new(&found, sample.1.len(), NonZeroU32::MIN)
         };
         let seen = look(&scene, &schedule);

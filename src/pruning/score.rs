@@ -15,7 +15,6 @@ use crate::model::RobustBox;
 use crate::model::{Columns, Flags, Gaussians, Rows};
 use crate::models::trajectories::state_bytes;
 use crate::passes::{frames_to_see, gather};
-use crate::progress::Progress;
 use crate::pruning;
 use crate::pruning::contribution::VisibleContribution;
 use crate::pruning::{Overrides, Ranking, Selection, select};
@@ -137,7 +136,7 @@ impl ScoreStage {
         }
         let reference_frame = first_of_largest(&scanned.alive_per_frame);
         journal.stage(NAME, info.count, source, |journal| {
-            let progress = Progress::new(NAME, "Gaussians", info.count as u64);
+            let progress = scene.events.task(NAME, "Gaussians", info.count as u64);
             if self.snap_noise {
                 snap(&mut rows, scanned.largest_coordinate);
             }

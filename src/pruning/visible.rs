@@ -72,7 +72,9 @@ impl Visible {
         let pictures = looked_at(&scene.schedule, &self.recipe, frames);
         let stride = self.recipe.pixel_stride;
         let cameras = &scene.schedule.cameras[..];
-        let look = |some: Range<usize>| visible_contribution(source, (cameras, &pictures[some]), stride, scene.limits);
+        let look = |some: Range<usize>| {
+            visible_contribution(source, (cameras, &pictures[some]), stride, scene.limits, &scene.events)
+        };
         let seen: Result<VisibleContribution> = journal.stage(NAME, count, source, |_| {
             let key = scene.work.key(&(&pictures, stride));
             let found = scene.work.divided(NAME, key, pictures.len(), look, |parts| {

@@ -11,6 +11,7 @@ use crate::memory_plan::Budget;
 use crate::model::{Rig, Split};
 use crate::models;
 use crate::models::{Conventions, InputModel, Link, OpenOptions};
+use crate::progress::Events;
 
 /// What to read and from where to look.
 #[derive(Debug, Clone, Default)]
@@ -44,6 +45,8 @@ pub struct InputOptions {
     pub memory: Budget,
     /// Where what stages find is kept; none: nowhere.
     pub work: Option<cache::CacheRequest>,
+    /// Where the events of the run go.
+    pub events: Events,
 }
 
 impl InputOptions {
@@ -61,6 +64,7 @@ impl InputOptions {
             scratch: self.scratch.clone(),
             conventions: self.conventions,
             memory: self.memory.read_limit(),
+            events: self.events.clone(),
         }
     }
 

@@ -19,6 +19,7 @@ use crate::limits::Limits;
 use crate::memory_plan::{Budget, Plan, ResourceEstimate, Throughput, Workload};
 use crate::model::{Rig, Schedule, Split};
 use crate::models::InputModel;
+use crate::progress::Events;
 use crate::source::Reads;
 
 use absent::Absent;
@@ -58,6 +59,8 @@ pub struct Scene {
     digest: Option<String>,
     /// Things a person should know.
     pub notes: Vec<String>,
+    /// Where the events of the run go.
+    pub events: Events,
     /// Gaussians that its frames are read without.
     absent: Absent,
 }
@@ -84,6 +87,7 @@ impl Scene {
             work: Cache::none(),
             digest: None,
             notes: Vec::new(),
+            events: Events::IGNORED,
             absent: Absent::default(),
         })
     }
@@ -103,8 +107,8 @@ impl Scene {
         budget: Budget,
         needs: impl Fn(&Workload, &Limits) -> Vec<ResourceEstimate>,
     ) -> Result<()> {
-        let plan = Plan::fit(self.workload(), budget, needs)?;
-        plan.tell_time(budget.tell);
+        let plan = Plan::fit(self.workload(), budget, &self.events, needs)?;
+        plan.tell_time(budget.tell, &self.events);
         self.follow(&plan);
         Ok(())
     }

@@ -134,7 +134,8 @@ pub fn scene_of(opened: Opened, options: &InputOptions) -> Result<Scene> {
     if scene.schedule.pairs() == 0 && !scene.source().info().times.is_empty() {
         return Err(no_picture(&scene.rig));
     }
-    let mut scene = Scene { has_cameras, scratch: options.scratch_folder(), notes, ..scene };
+    let mut scene =
+        Scene { has_cameras, scratch: options.scratch_folder(), notes, events: options.events.clone(), ..scene };
     scene.keep_work(options)?;
     Ok(scene)
 }

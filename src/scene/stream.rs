@@ -55,7 +55,7 @@ pub(super) fn open_arriving(options: &InputOptions) -> Result<Opened> {
 
 fn pack_arriving(stream: FrameStream<Stdin>, options: &InputOptions) -> Result<Streamed> {
     let mut room = room_to_pack(options, stream.header())?;
-    Streamed::receive(stream, &options.scratch_folder(), |held| room.admit(held.len()))
+    Streamed::receive(stream, &options.scratch_folder(), &options.events, |held| room.admit(held.len()))
 }
 
 /// Whether a stream is linked: one of frames that do not know one another, or any where that is asked for.
@@ -92,7 +92,7 @@ pub fn room_to_pack(options: &InputOptions, header: &StreamHeader) -> Result<Fra
     let nobody = Rig { cameras: Vec::new(), shots: Vec::new(), background: None, origin: String::new() };
     let work = |frames| Workload::of_stream(header, block, &nobody, frames);
     let receive = |frames| move |work: &Workload, limits: &Limits| vec![receiving(work, limits, held, None, frames)];
-    Plan::fit(work(0), options.memory, receive(0))?;
+    Plan::fit(work(0), options.memory, &options.events, receive(0))?;
     Ok(FrameQuota::new(options.memory, |budget, frames| {
         let packed = Plan::closest(work(frames), budget, |_, _| Vec::new()).peak();
         packed.max(Plan::closest(work(0), budget, receive(frames)).peak())

@@ -12,7 +12,7 @@ use serde::{Deserialize, Serialize};
 use crate::error::Result;
 use crate::model::{Camera, Gaussians, Rows, Schedule, SequenceInfo};
 use crate::passes::BLOCK;
-use crate::progress::Progress;
+use crate::progress::Events;
 use crate::source::{FrameSource, Ids};
 use crate::statistics::pass::blocks::BlockScans;
 use crate::statistics::{BlockScan, NEEDED, ScanPlan, wanted};
@@ -35,7 +35,7 @@ pub struct Scanned {
 /// with its accumulators ([`crate::statistics::BYTES_PER_GAUSSIAN`] each), its state at one frame, and its reader; in stages
 /// two readers.
 pub fn scan(source: &dyn FrameSource, schedule: &Schedule, plan: &ScanPlan) -> Result<Scanned> {
-    scan_blocks(source, schedule, plan, 0..scan_units(source.info()))
+    scan_blocks(source, schedule, plan, 0..scan_units(source.info()), &Events::IGNORED)
 }
 
 /// How many blocks of Gaussians [`scan`] goes through.
@@ -52,11 +52,12 @@ pub fn scan_blocks(
     schedule: &Schedule,
     plan: &ScanPlan,
     blocks: Range<usize>,
+    events: &Events,
 ) -> Result<Scanned> {
     let info = source.info();
     let frames = info.times.len();
     let gaussians = info.count.min(blocks.end * BLOCK) - info.count.min(blocks.start * BLOCK);
-    let progress = Progress::new("scan", "states", gaussians as u64 * frames as u64);
+    let progress = events.task("scan", "states", gaussians as u64 * frames as u64);
     let scan = BlockScans { source, schedule, plan, blocks, progress, alive: Mutex::new(vec![0; frames]) };
     let blocks = match source.ahead() {
         Some(ahead) if frames > 0 => staged::scan_in_stages(&scan, ahead)?,

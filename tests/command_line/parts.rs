@@ -8,6 +8,7 @@ use serde_json::{Value, json};
 use splatsieve::diagnostics::demo_scene::Scene;
 use splatsieve::models::trajectories::write_sequence;
 use splatsieve::outputs::kind::OutputKind;
+use splatsieve::progress::Events;
 
 /// More than two frame blocks, one of them not full.
 const FRAMES: usize = 70;
@@ -17,9 +18,9 @@ const FRAMES: usize = 70;
 fn workplace(gaussians: usize) -> Workplace {
     let workplace = Workplace::new();
     let made = Scene::new(gaussians, FRAMES);
-    write_sequence(&made, OutputKind::Gseq, &workplace.path("scene.gseq"), 1).unwrap();
+    write_sequence(&made, OutputKind::Gseq, &workplace.path("scene.gseq"), 1, &Events::IGNORED).unwrap();
     let fewer = Scene::new(gaussians * 3 / 4, FRAMES);
-    write_sequence(&fewer, OutputKind::Gseq, &workplace.path("smaller.gseq"), 1).unwrap();
+    write_sequence(&fewer, OutputKind::Gseq, &workplace.path("smaller.gseq"), 1, &Events::IGNORED).unwrap();
     let rig = made.rig();
     let shots: Vec<Value> = (0..3u32)
         .flat_map(|view| (0..if view == 1 { 40 } else { FRAMES }).map(move |frame| (view, frame)))

@@ -10,6 +10,7 @@ use splatsieve::model::{ALL_HARMONICS, Columns, Gaussians};
 use splatsieve::models;
 use splatsieve::models::{InputModel, OpenOptions};
 use splatsieve::outputs::kind::OutputKind;
+use splatsieve::progress::Events;
 use splatsieve::recipe::{Precision, Recipe};
 
 /// Opens `path`, at three times where it leaves them open.
@@ -56,7 +57,7 @@ fn both(
     if kind.is_folder() {
         std::fs::create_dir(&path).unwrap();
     }
-    input.write(reduction, kind, &path, &Limits::NONE).unwrap();
+    input.write(reduction, kind, &path, &Limits::NONE, &Events::IGNORED).unwrap();
     let frames = input.source().info().times.len();
     let reduced = input.reduced(reduction).unwrap();
     let written = open(&path);

@@ -14,6 +14,7 @@ use serde_json::{Value, json};
 use splatsieve::diagnostics::demo_scene::Scene;
 use splatsieve::models::trajectories::write_sequence;
 use splatsieve::outputs::kind::OutputKind;
+use splatsieve::progress::Events;
 use tempfile::TempDir;
 
 const FRAMES: usize = 4;
@@ -24,8 +25,15 @@ const SIZE: (usize, usize) = (48, 36);
 fn scene() -> TempDir {
     let folder = tempfile::tempdir().unwrap();
     let made = Scene::new(400, FRAMES);
-    write_sequence(&made, OutputKind::Gseq, &folder.path().join("scene.gseq"), 1).unwrap();
-    write_sequence(&Scene::new(300, FRAMES), OutputKind::Gseq, &folder.path().join("smaller.gseq"), 1).unwrap();
+    write_sequence(&made, OutputKind::Gseq, &folder.path().join("scene.gseq"), 1, &Events::IGNORED).unwrap();
+    write_sequence(
+        &Scene::new(300, FRAMES),
+        OutputKind::Gseq,
+        &folder.path().join("smaller.gseq"),
+        1,
+        &Events::IGNORED,
+    )
+    .unwrap();
     write_cameras(folder.path(), json!([0.0, 0.5, 1.0]));
     folder
 }
@@ -328,7 +336,14 @@ fn misuse_exits_with_2_and_leaves_nothing() {
 #[test]
 fn wrong_inputs_exit_with_1_and_leave_nothing() {
     let folder = scene();
-    write_sequence(&Scene::new(300, FRAMES + 1), OutputKind::Gseq, &folder.path().join("longer.gseq"), 1).unwrap();
+    write_sequence(
+        &Scene::new(300, FRAMES + 1),
+        OutputKind::Gseq,
+        &folder.path().join("longer.gseq"),
+        1,
+        &Events::IGNORED,
+    )
+    .unwrap();
     let longer = "evaluate scene.gseq longer.gseq --cameras cameras.json --csv x.csv";
     refused(folder.path(), longer, 1, &["longer.gseq", "4 frames", "5 frames"]);
     done(folder.path(), "render scene.gseq --cameras cameras.json --all -o photos");

@@ -1,5 +1,7 @@
 //! The vocabulary: Gaussians at an instant, sequences of them, cameras, rows of statistics.
 
+#![cfg_attr(not(test), deny(clippy::print_stderr, clippy::print_stdout))]
+
 mod camera;
 mod covariance;
 pub mod error;

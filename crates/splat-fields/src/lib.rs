@@ -5,6 +5,8 @@
 //!
 //! [`oracle`] evaluates a [`Field`] in f64, and [`synthetic`] makes fields of random weights to test with.
 
+#![cfg_attr(not(test), deny(clippy::print_stderr, clippy::print_stdout))]
+
 mod deltas;
 mod field;
 mod jacobian;

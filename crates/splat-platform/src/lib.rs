@@ -28,6 +28,8 @@
 //! limits of the process's own group and of the groups around it, `memory.high`, and groups that are mounted elsewhere
 //! would be missed, so this crate reads them itself ([`memory_limits`]).
 
+#![cfg_attr(not(test), deny(clippy::print_stderr, clippy::print_stdout))]
+
 use std::fs::FileType;
 use std::path::PathBuf;
 

@@ -12,6 +12,8 @@
 //! changes no pixel. Pixels are the same bits for any number of threads and any instruction set.
 //! Gaussians with a NaN or infinite value among position, rotation, scale or opacity are not drawn.
 
+#![cfg_attr(not(test), deny(clippy::print_stderr, clippy::print_stdout))]
+
 mod backward;
 mod bin;
 mod blend;

@@ -30,7 +30,7 @@ use crate::outputs::kind::check_folder_name;
 use crate::pipeline::planning::InputMeta;
 use crate::pipeline::stages::measure::Measure;
 use crate::pipeline::{Request, RunPlan, Target};
-use crate::progress::Progress;
+use crate::progress::{Events, Progress};
 use crate::pruning::score::UserOverrides;
 use crate::recipe::Recipe;
 use crate::report::precision::{PAGE, page};
@@ -202,7 +202,8 @@ pub fn precision(options: &PrecisionOptions) -> Result<PrecisionDiagram> {
     let work = scene.workload();
     let beside = work.count() as u64 * (HELD + work.input.per_gaussian) + work.input.fixed + Judge::bytes(work.pixels);
     let left = input.memory.bytes.map(|bytes| bytes.saturating_sub(beside));
-    let input = InputOptions { memory: Budget { bytes: left, tell: Verbosity::Nothing }, ..input };
+    let memory = Budget { bytes: left, tell: Verbosity::Nothing };
+    let input = InputOptions { memory, events: Events::IGNORED, ..input };
     let mut notes = scene.notes.clone();
     scene.schedule = thin(std::mem::take(&mut scene.schedule), options.max_frames);
     let looked_at = scene.schedule.iter().filter(|views| !views.is_empty()).count();
@@ -221,9 +222,13 @@ pub fn precision(options: &PrecisionOptions) -> Result<PrecisionDiagram> {
     }
 
     let measure = Measure::new(&options.recipe, true, UserOverrides::default());
+    let scanned = measure.scan(&scene, &mut Journal::default())?;
+    let judge = Judge::new(&scene)?;
+    // Hundreds of stages would hide which setting it is at.
+    scene.events = Events::IGNORED;
     let bench = Bench {
-        scanned: measure.scan(&scene, &mut Journal::default())?,
-        judge: Judge::new(&scene)?,
+        scanned,
+        judge,
         scene: &scene,
         input: &input,
         work,
@@ -232,7 +237,7 @@ pub fn precision(options: &PrecisionOptions) -> Result<PrecisionDiagram> {
         repeats: Repeats { most: options.runs, enough: ENOUGH },
         scratch: &staged.path().join("run"),
         name,
-        progress: Progress::counting("precision", "settings"),
+        progress: options.input.events.counting_task("precision", "settings"),
     };
     let mut found = PrecisionDiagram {
         tool: TOOL.to_owned(),
@@ -251,8 +256,6 @@ pub fn precision(options: &PrecisionOptions) -> Result<PrecisionDiagram> {
         knobs: Vec::new(),
         notes,
     };
-    // Hundreds of stages would hide which setting it is at.
-    let _quiet = Progress::hush();
     for knob in turned {
         match bench.turn(knob)? {
             Some(knob) => found.knobs.push(knob),

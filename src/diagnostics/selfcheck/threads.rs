@@ -11,6 +11,7 @@ use crate::files::atomic::{Replace, ScratchFolder};
 use crate::memory_plan::Budget;
 use crate::model::{Columns, Gradients};
 use crate::pipeline::Target;
+use crate::progress::Events;
 use crate::recipe::Recipe;
 use crate::render::{Image, Renderer};
 
@@ -42,6 +43,7 @@ fn made_on(threads: usize) -> Result<(Vec<u8>, Gradients)> {
             output: Some(output.clone()),
             overwrite: Replace::Never,
             memory: Budget::default(),
+            events: Events::IGNORED,
         })?;
         let path = output.join("compressed.gseq");
         let bytes = fs::read(&path).map_err(Error::io("read", &path))?;

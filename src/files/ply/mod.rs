@@ -31,6 +31,7 @@ use super::open::open_file;
 use crate::error::{Error, Result, ShowPath};
 use crate::limits::ReadLimit;
 use crate::model::{Column, Columns, Gaussians};
+use crate::progress::Events;
 use crate::source::Ids;
 
 /// Rows handled together, so that all planes of them are taken from cache: 32 KiB at degree 3.
@@ -45,11 +46,13 @@ pub struct PlyOptions {
     pub scratch: PathBuf,
     /// Memory that reading a whole file may take.
     pub memory: ReadLimit,
+    /// Where the progress of linking frames goes.
+    pub events: Events,
 }
 
 impl Default for PlyOptions {
     fn default() -> Self {
-        PlyOptions { scratch: std::env::temp_dir(), memory: ReadLimit::NONE }
+        PlyOptions { scratch: std::env::temp_dir(), memory: ReadLimit::NONE, events: Events::IGNORED }
     }
 }
 

@@ -23,6 +23,7 @@ use crate::limits::{Limits, ReadLimit};
 use crate::model::Gaussians;
 use crate::models::input_model::{ColumnInfo, InputModel, MemoryProfile, ModelFormat, OpenOptions, Timing};
 use crate::outputs::kind::OutputKind;
+use crate::progress::Events;
 use crate::recipe::MergeParams;
 use crate::source::FrameSource;
 
@@ -191,8 +192,9 @@ impl InputModel for OpenArchive {
         kind: OutputKind,
         path: &Path,
         limits: &Limits,
+        events: &Events,
     ) -> Result<Vec<String>> {
-        self.inner.write(reduction, kind, path, limits)
+        self.inner.write(reduction, kind, path, limits, events)
     }
 
     fn can_round_field(&self) -> Result<bool> {

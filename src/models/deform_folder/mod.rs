@@ -34,6 +34,7 @@ use crate::models::input_model::{InputModel, MemoryProfile, OpenOptions, Timing}
 use crate::models::motion_model::{MotionModel, MotionModelFrames, solve};
 use crate::outputs::container::GAUSSIAN_BLOCK;
 use crate::outputs::kind::OutputKind;
+use crate::progress::Events;
 use crate::recipe::MergeParams;
 use crate::source::FrameSource;
 
@@ -285,10 +286,11 @@ impl<L: Deforming + 'static> InputModel for Folder<L> {
         kind: OutputKind,
         path: &Path,
         limits: &Limits,
+        events: &Events,
     ) -> Result<Vec<String>> {
         let mut notes = match kind {
             OutputKind::Model => self.write_folder(reduction, path).map(|()| Vec::new())?,
-            _ => write_sequence(&*self.reduced(reduction)?, kind, path, limits.frames_held)?,
+            _ => write_sequence(&*self.reduced(reduction)?, kind, path, limits.frames_held, events)?,
         };
         let left = Columns::all().difference(self.model.law().movable());
         if !reduction.change.is_empty() && !left.is_empty() {

@@ -18,6 +18,7 @@ use crate::models;
 use crate::models::{InputModel, OpenOptions};
 use crate::outputs::kind::OutputKind;
 use crate::passes::gather_all;
+use crate::progress::Events;
 use crate::recipe::Recipe;
 use crate::source::FrameSource;
 
@@ -361,7 +362,15 @@ fn what_stays_keeps_its_bytes_and_the_network_all_of_them() {
         let path = made.folder.path().join("result");
         fs::create_dir(&path).unwrap();
         let kept = vec![0u32, 2, 39];
-        model.write(&CompressedModel::pruned(kept.clone(), &rule), OutputKind::Model, &path, &Limits::NONE).unwrap();
+        model
+            .write(
+                &CompressedModel::pruned(kept.clone(), &rule),
+                OutputKind::Model,
+                &path,
+                &Limits::NONE,
+                &Events::IGNORED,
+            )
+            .unwrap();
         for name in ["cfg_args", "cameras.json", "deform/iteration_7/deform.pth"] {
             assert_eq!(fs::read(made.path().join(name)).unwrap(), fs::read(path.join(name)).unwrap(), "{name}");
         }
@@ -390,7 +399,7 @@ fn merged_and_changed_ones_read_back_as_they_were_shown() {
             reduction.sh_degree = sh_degree;
             let path = made.folder.path().join(format!("result_{sh_degree}"));
             fs::create_dir(&path).unwrap();
-            model.write(&reduction, OutputKind::Model, &path, &Limits::NONE).unwrap();
+            model.write(&reduction, OutputKind::Model, &path, &Limits::NONE, &Events::IGNORED).unwrap();
             let again = open(&path).unwrap();
             assert_eq!(states(again.source()), states(&*model.reduced(&reduction).unwrap()), "{}", model.kind());
             let text = fs::read_to_string(path.join("cfg_args")).unwrap();

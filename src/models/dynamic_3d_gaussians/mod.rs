@@ -21,6 +21,7 @@ use crate::model::{Columns, Gaussians, SH_C0, color};
 use crate::models::input_model::{InputModel, MemoryProfile, ModelFormat, Timing};
 use crate::outputs::container::GAUSSIAN_BLOCK;
 use crate::outputs::kind::OutputKind;
+use crate::progress::Events;
 use crate::recipe::MergeParams;
 use crate::source::{FrameSource, Ids};
 use params::{COLOURS, LOG_SCALES, MEANS, OPACITIES, Params, ROTATIONS};
@@ -126,10 +127,11 @@ impl InputModel for Params {
         kind: OutputKind,
         path: &Path,
         limits: &Limits,
+        events: &Events,
     ) -> Result<Vec<String>> {
         match kind {
             OutputKind::Model => self.write_params(reduction, path.join(FILE)).map(|()| Vec::new()),
-            _ => write_sequence(&*self.reduced(reduction)?, kind, path, limits.frames_held),
+            _ => write_sequence(&*self.reduced(reduction)?, kind, path, limits.frames_held, events),
         }
     }
 }

@@ -11,6 +11,7 @@ use crate::compressed_model::ParamDelta;
 use crate::models;
 use crate::models::OpenOptions;
 use crate::passes::gather_all;
+use crate::progress::Events;
 use crate::recipe::Recipe;
 
 /// Arrays of a model, by name: shape and values.
@@ -95,7 +96,7 @@ fn what_stays_keeps_its_bytes_and_everything_else_its_place() {
         let written = |reduction: &CompressedModel| {
             _ = fs::remove_dir_all(&result);
             fs::create_dir(&result).unwrap();
-            model.write(reduction, OutputKind::Model, &result, &limits).unwrap();
+            model.write(reduction, OutputKind::Model, &result, &limits, &Events::IGNORED).unwrap();
             fs::read(result.join(FILE)).unwrap()
         };
         let of = |name: &str| {
@@ -143,7 +144,7 @@ fn merged_and_changed_ones_read_back_as_they_were_shown() {
     let shown = model.reduced(&reduction).unwrap();
     let result = folder.path().join("result");
     fs::create_dir(&result).unwrap();
-    model.write(&reduction, OutputKind::Model, &result, &Limits::NONE).unwrap();
+    model.write(&reduction, OutputKind::Model, &result, &Limits::NONE, &Events::IGNORED).unwrap();
     let read = open(&result).unwrap();
     for (frame, state) in states(&*read).iter().enumerate() {
         let expected = gather_all(&*shown, frame, Columns::all()).unwrap();

@@ -29,6 +29,7 @@ use crate::models::input_model::{InputModel, MemoryProfile, ModelFormat, Timing}
 use crate::models::motion_model::left;
 use crate::outputs::container::GAUSSIAN_BLOCK;
 use crate::outputs::kind::OutputKind;
+use crate::progress::Events;
 use crate::recipe::{MergeParams, Precision};
 use crate::source::{Deformation, FrameSource};
 pub use model_folder::ModelFolder;
@@ -199,6 +200,7 @@ impl InputModel for ModelFolder {
         kind: OutputKind,
         path: &Path,
         limits: &Limits,
+        events: &Events,
     ) -> Result<Vec<String>> {
         let mut notes = Vec::new();
         let paths = self.paths();
@@ -221,7 +223,7 @@ impl InputModel for ModelFolder {
             }
             OutputKind::Ply => self.write_cloud(reduction, path)?,
             OutputKind::Archive => return Err(Error::internal("an archive is made of a content")),
-            _ => notes.extend(write_sequence(&*self.reduced(reduction)?, kind, path, limits.frames_held)?),
+            _ => notes.extend(write_sequence(&*self.reduced(reduction)?, kind, path, limits.frames_held, events)?),
         }
         Ok(notes)
     }

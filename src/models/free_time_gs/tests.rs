@@ -9,6 +9,7 @@ use crate::model::{Gaussians, opacity};
 use crate::models;
 use crate::outputs::kind::OutputKind;
 use crate::passes::gather_all;
+use crate::progress::Events;
 use crate::recipe::{MergeParams, Recipe};
 
 const COUNT: usize = 5;
@@ -76,7 +77,7 @@ impl Place {
     fn written(&self, model: &dyn InputModel, reduction: &CompressedModel) -> PathBuf {
         let result = self.path("written");
         fs::create_dir(&result).unwrap();
-        model.write(reduction, OutputKind::Model, &result, &Limits::NONE).unwrap();
+        model.write(reduction, OutputKind::Model, &result, &Limits::NONE, &Events::IGNORED).unwrap();
         result
     }
 }

@@ -25,6 +25,7 @@ use crate::models::motion_model;
 use crate::models::motion_model::{MotionModel, MotionModelFrames};
 use crate::outputs::container::GAUSSIAN_BLOCK;
 use crate::outputs::kind::OutputKind;
+use crate::progress::Events;
 use crate::recipe::MergeParams;
 use crate::source::FrameSource;
 pub(super) use rows::{Reading, RowElement, RowTensors, count_of};
@@ -250,10 +251,11 @@ impl<L: ProxyRule + 'static> InputModel for InCheckpoint<L> {
         kind: OutputKind,
         path: &Path,
         limits: &Limits,
+        events: &Events,
     ) -> Result<Vec<String>> {
         match kind {
             OutputKind::Model => self.write_model(reduction, path).map(|()| Vec::new()),
-            _ => write_sequence(&*self.reduced(reduction)?, kind, path, limits.frames_held),
+            _ => write_sequence(&*self.reduced(reduction)?, kind, path, limits.frames_held, events),
         }
     }
 }

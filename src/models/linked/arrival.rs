@@ -23,7 +23,6 @@ use crate::model::{Columns, Gaussians, opacity};
 use crate::models::InputModel;
 use crate::models::trajectories::state_bytes;
 use crate::outputs::container::{GAUSSIAN_BLOCK, of_block};
-use crate::progress::Progress;
 use crate::source::{FrameSource, Ids, ReadPlan};
 
 /// Files of frames that are arriving, and their times.
@@ -77,7 +76,7 @@ impl LinkedFrames {
     ) -> Result<LinkedFrames> {
         let mut arriving = Arriving::new(&options.scratch, 0)?;
         let mut state = Gaussians::zeros(0, stream.header().sh_degree);
-        let progress = Progress::counting("receive", "frames");
+        let progress = options.events.counting_task("receive", "frames");
         while let Some(time) = stream.next_frame(&mut state)? {
             arriving.push(time, &state)?;
             progress.advance(1);
@@ -109,7 +108,7 @@ impl LinkedFrames {
         let decoding = tile * (state + 3 * state_bytes(info.sh_degree, Columns::SH));
         let unpacked = TOGETHER_BYTES.min(state * seen.iter().sum::<u64>());
         let mut arriving = Arriving::new(&options.scratch, unpacked + rayon::current_num_threads() as u64 * decoding)?;
-        let progress = Progress::new("unpack", "frames", info.times.len() as u64);
+        let progress = options.events.task("unpack", "frames", info.times.len() as u64);
         let mut start = 0;
         while start < seen.len() {
             let mut bytes = 0;

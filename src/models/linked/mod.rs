@@ -34,6 +34,7 @@ use crate::limits::Limits;
 use crate::model::SequenceInfo;
 use crate::models::input_model::{InputModel, MemoryProfile, Timing};
 use crate::outputs::kind::OutputKind;
+use crate::progress::Events;
 use crate::source::{BlockReader, FrameSource, Ids, Prefetch, ReadPlan, Reads};
 use crate::tracking::Joiner;
 
@@ -83,7 +84,7 @@ impl LinkedFrames {
         drop(linker);
         let held = if joins { lives::hold(&mut tracks, scratch)? } else { None };
         let packed = ScratchFile::new(scratch)?;
-        tracks.pack(packed.path())?;
+        tracks.pack(packed.path(), &options.events)?;
         let container = Container::open(packed.path())?;
         let info = container.info().clone();
         let mut notes = vec![format!("frames were linked: {why}")];
@@ -182,10 +183,11 @@ impl InputModel for LinkedFrames {
         kind: OutputKind,
         path: &Path,
         limits: &Limits,
+        events: &Events,
     ) -> Result<Vec<String>> {
         match kind {
-            OutputKind::PlySequence => self.write_files(reduction, path).map(|()| Vec::new()),
-            _ => write_trajectories(self, reduction, kind, path, limits),
+            OutputKind::PlySequence => self.write_files(reduction, path, events).map(|()| Vec::new()),
+            _ => write_trajectories(self, reduction, kind, path, limits, events),
         }
     }
 }

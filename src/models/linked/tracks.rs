@@ -14,7 +14,7 @@ use crate::files::ply::{Ply, PlyOptions};
 use crate::files::ply_frames::PlyFrames;
 use crate::model::{Columns, Gaussians, SequenceInfo};
 use crate::outputs::container::{BlockPresence, ContainerWriter, GAUSSIAN_BLOCK};
-use crate::progress::Progress;
+use crate::progress::Events;
 use crate::source::{BlockReader, FrameSource, Ids};
 use crate::tracking::{Joiner, Linker, blend};
 
@@ -124,7 +124,7 @@ impl LinkedTracks {
         let (mut births, mut cuts, mut doubtful) = (Vec::new(), Vec::new(), 0);
         let (mut spilling, mut starts, mut end) = (SpillWriter::new(scratch)?, vec![0], 0);
         let mut state = Gaussians::zeros(0, frames.sh_degree());
-        let progress = Progress::new("link", "frames", frames.paths().len() as u64);
+        let progress = options.events.task("link", "frames", frames.paths().len() as u64);
         for frame in 0..frames.paths().len() {
             // Before a frame is read at least its own Gaussians are counted as tracks.
             let linked = births.len().max(of_frame as usize) as u64;
@@ -301,13 +301,13 @@ impl LinkedTracks {
 
     /// Writes all tracks at all frames to the container `path`. Tracks that begin together are neighbors, so that where a
     /// block of them is not there yet, or no longer, nothing is written.
-    pub(super) fn pack(&self, path: &Path) -> Result<()> {
+    pub(super) fn pack(&self, path: &Path, events: &Events) -> Result<()> {
         let mut held = self.first();
         let (times, degree) = (self.frames.times(), self.frames.sh_degree());
         let compression = Compression::Zstd(1);
         let together = self.sizes().frame_block();
         let mut writer = ContainerWriter::create(path, self.count, degree, together, compression, BTreeMap::new())?;
-        let progress = Progress::new("pack", "frames", times.len() as u64);
+        let progress = events.task("pack", "frames", times.len() as u64);
         let mut was_still = vec![false; self.count.div_ceil(GAUSSIAN_BLOCK)];
         for start in (0..times.len()).step_by(together) {
             let of_block = start..times.len().min(start + together);

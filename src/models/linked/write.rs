@@ -12,7 +12,7 @@ use crate::error::Result;
 use crate::files::ply::write::{OutRow, out_rows, write_like};
 use crate::model::{Columns, Gaussians};
 use crate::models::trajectories::merged;
-use crate::progress::Progress;
+use crate::progress::Events;
 use crate::source::{FrameSource, Ids};
 
 /// What no row of a frame is of.
@@ -25,10 +25,10 @@ impl LinkedFrames {
     ///
     /// # Errors
     /// Frames that cannot be read, a failed write.
-    pub(super) fn write_files(&self, reduction: &CompressedModel, folder: &Path) -> Result<()> {
+    pub(super) fn write_files(&self, reduction: &CompressedModel, folder: &Path, events: &Events) -> Result<()> {
         let (frames, result) = (self.tracks.frames(), merged(self, reduction));
         let all = out_rows(reduction);
-        let progress = Progress::new("emit", "frames", frames.paths().len() as u64);
+        let progress = events.task("emit", "frames", frames.paths().len() as u64);
         let write = |&frame: &usize| {
             let mut of_frame = self.tracks.rows(frame, 0..self.tracks.count())?;
             let mut row_of = vec![NONE; self.tracks.count()];

@@ -15,6 +15,7 @@ use crate::models::OpenOptions;
 use crate::models::in_checkpoint::linear::covariance;
 use crate::outputs::kind::OutputKind;
 use crate::passes::gather_all;
+use crate::progress::Events;
 use crate::recipe::Recipe;
 
 const COUNT: usize = 6;
@@ -96,7 +97,7 @@ impl Place {
         let result = self.path("result");
         _ = fs::remove_dir_all(&result);
         fs::create_dir(&result).unwrap();
-        model.write(reduction, OutputKind::Model, &result, &Limits::NONE).unwrap();
+        model.write(reduction, OutputKind::Model, &result, &Limits::NONE, &Events::IGNORED).unwrap();
         result
     }
 }

@@ -35,6 +35,7 @@ use crate::model::{Raw, color};
 use crate::models::input_model::{InputModel, MemoryProfile, ModelFormat, OpenOptions, Timing};
 use crate::models::motion_model::{MotionModelFrames, left, solve};
 use crate::outputs::kind::OutputKind;
+use crate::progress::Events;
 use crate::recipe::MergeParams;
 use crate::source::FrameSource;
 use cloud::{Cloud, MARK};
@@ -312,6 +313,7 @@ impl InputModel for SpacetimeGaussians {
         kind: OutputKind,
         path: &Path,
         limits: &Limits,
+        events: &Events,
     ) -> Result<Vec<String>> {
         match kind {
             OutputKind::Model => self.write_folder(reduction, path)?,
@@ -328,7 +330,7 @@ impl InputModel for SpacetimeGaussians {
                 splatv::write(&raw, known, self.files.of_root(CAMERAS).as_deref(), path)?;
             }
             OutputKind::Archive => return Err(Error::usage(NO_ARCHIVE)),
-            _ => return write_sequence(&*self.reduced(reduction)?, kind, path, limits.frames_held),
+            _ => return write_sequence(&*self.reduced(reduction)?, kind, path, limits.frames_held, events),
         }
         Ok(Vec::new())
     }

@@ -30,6 +30,7 @@ use crate::models::motion_model::{MotionModelFrames, left, solve};
 use crate::models::size::{Size, bytes_below, bytes_of};
 use crate::models::trajectories::write_sequence;
 use crate::outputs::kind::OutputKind;
+use crate::progress::Events;
 use crate::recipe::MergeParams;
 use crate::source::FrameSource;
 
@@ -234,9 +235,10 @@ impl InputModel for SplatvModel {
         kind: OutputKind,
         path: &Path,
         limits: &Limits,
+        events: &Events,
     ) -> Result<Vec<String>> {
         if kind != OutputKind::Splatv {
-            return write_sequence(&*self.reduced(reduction)?, kind, path, limits.frames_held);
+            return write_sequence(&*self.reduced(reduction)?, kind, path, limits.frames_held, events);
         }
         self.file.check()?;
         let raw = left(self.model.raw(), reduction);

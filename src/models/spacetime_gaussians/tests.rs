@@ -7,6 +7,7 @@ use crate::model::{Column, Columns, Gaussians};
 use crate::models;
 use crate::models::OpenOptions;
 use crate::passes::gather_all;
+use crate::progress::Events;
 use crate::recipe::Recipe;
 
 const COUNT: usize = 7;
@@ -203,7 +204,7 @@ fn what_stays_of_a_folder_keeps_its_bytes() {
         let rule = Recipe::preset("default").unwrap().merge;
         let result = tempfile::tempdir().unwrap();
         let reduction = CompressedModel::pruned(vec![1, 4, 5], &rule);
-        model.write(&reduction, OutputKind::Model, result.path(), &Limits::NONE).unwrap();
+        model.write(&reduction, OutputKind::Model, result.path(), &Limits::NONE, &Events::IGNORED).unwrap();
         let kept = |name: &str, i: usize| value(name, [1, 4, 5][i]);
         let iteration = result.path().join("point_cloud/iteration_300");
         assert_eq!(fs::read(iteration.join(CLOUD)).unwrap(), ply(&properties(is_full), 3, kept));
@@ -220,7 +221,7 @@ fn what_stays_of_a_folder_keeps_its_bytes() {
         assert!(size.whole() < model.bytes().unwrap() && size.rest > 0);
         // The PLY alone, which a viewer takes.
         let alone = result.path().join("alone.ply");
-        model.write(&reduction, OutputKind::Ply, &alone, &Limits::NONE).unwrap();
+        model.write(&reduction, OutputKind::Ply, &alone, &Limits::NONE, &Events::IGNORED).unwrap();
         assert_eq!(fs::read(&alone).unwrap(), fs::read(iteration.join(CLOUD)).unwrap());
         let alone = opened(&alone);
         assert_eq!((alone.own_output(), alone.kind()), (OutputKind::Ply, model.kind()));
@@ -261,7 +262,7 @@ fn merged_and_changed_ones_read_back_as_they_were_shown() {
         let reduction = reduction(&*model);
         let shown = states(&*model.reduced(&reduction).unwrap());
         let result = tempfile::tempdir().unwrap();
-        model.write(&reduction, OutputKind::Model, result.path(), &Limits::NONE).unwrap();
+        model.write(&reduction, OutputKind::Model, result.path(), &Limits::NONE, &Events::IGNORED).unwrap();
         let read = opened(result.path());
         assert_near(&states(read.source()), &shown, 2e-6);
         let file = fs::read(result.path().join("point_cloud/iteration_300").join(CLOUD)).unwrap();
@@ -323,7 +324,7 @@ fn a_lite_model_as_a_splatv_moves_as_it_did_and_what_stays_of_that_keeps_its_wor
     let rule = Recipe::preset("default").unwrap().merge;
     let all = CompressedModel::pruned((0..COUNT as u32).collect(), &rule);
     let path = root.path().join("all.splatv");
-    model.write(&all, OutputKind::Splatv, &path, &Limits::NONE).unwrap();
+    model.write(&all, OutputKind::Splatv, &path, &Limits::NONE, &Events::IGNORED).unwrap();
     let read = opened(&path);
     assert_eq!(
         (read.kind(), read.source().info().count, read.own_output()),
@@ -341,21 +342,22 @@ fn a_lite_model_as_a_splatv_moves_as_it_did_and_what_stays_of_that_keeps_its_wor
     let file = Splatv::open(&path).unwrap();
     assert_eq!(file.cameras()[0]["id"], 4);
     let kept = root.path().join("kept.splatv");
-    read.write(&CompressedModel::pruned(vec![2, 5], &rule), OutputKind::Splatv, &kept, &Limits::NONE).unwrap();
+    read.write(&CompressedModel::pruned(vec![2, 5], &rule), OutputKind::Splatv, &kept, &Limits::NONE, &Events::IGNORED)
+        .unwrap();
     let small = Splatv::open(&kept).unwrap();
     assert_eq!((small.count(), small.words(0), small.words(1)), (2, file.words(2), file.words(5)));
     assert_eq!(small.cameras(), file.cameras());
     let mut by = Gaussians { position: Column::zeros(3, 2), ..Gaussians::default() };
     by.position.set_row(1, [1.0, 0.0, 0.0]);
     let moved = CompressedModel { change: ParamDelta(by), ..CompressedModel::pruned(vec![2, 5], &rule) };
-    read.write(&moved, OutputKind::Splatv, &kept, &Limits::NONE).unwrap();
+    read.write(&moved, OutputKind::Splatv, &kept, &Limits::NONE, &Events::IGNORED).unwrap();
     let moved = Splatv::open(&kept).unwrap();
     assert_eq!(moved.words(0), file.words(2));
     let (to, from) = (SplatvGaussian::of_words(&moved.words(1)), SplatvGaussian::of_words(&file.words(5)));
     assert_eq!(to, SplatvGaussian { position: [from.position[0] + 1.0, from.position[1], from.position[2]], ..from });
     // Without cameras of its own there is one that a viewer can start at.
     fs::remove_file(root.path().join(CAMERAS)).unwrap();
-    opened(root.path()).write(&all, OutputKind::Splatv, &kept, &Limits::NONE).unwrap();
+    opened(root.path()).write(&all, OutputKind::Splatv, &kept, &Limits::NONE, &Events::IGNORED).unwrap();
     assert_eq!(Splatv::open(&kept).unwrap().cameras()[0]["rotation"].as_array().map(Vec::len), Some(3));
 }
 

@@ -16,7 +16,6 @@ use crate::passes::{Batch, Subject, show, spread};
 use crate::pipeline::planning::Planning;
 use crate::pipeline::request::Request;
 use crate::pipeline::stage::{EstimateInput, Phase, RunState, Stage, StageList};
-use crate::progress::Progress;
 use crate::pruning::score::scored_memory;
 use crate::recipe::WhichBands;
 use crate::render::{self, render};
@@ -150,7 +149,7 @@ impl ShDegreeStage {
 /// Mean PSNR over `pictures` of `result` against the original, and of `result` with harmonics up to `degree` against itself
 /// with all, dB.
 fn without_bands(scene: &Scene, result: &dyn FrameSource, degree: usize, pictures: &[Picture]) -> Result<[f64; 2]> {
-    let progress = Progress::new(NAME, "pictures", pictures.len() as u64);
+    let progress = scene.events.task(NAME, "pictures", pictures.len() as u64);
     let mut sums = [0.0; 2];
     let subjects = [Subject::all(scene.source()), Subject::all(result)];
     show(subjects, &scene.schedule.cameras, pictures, Batch::of_frame(&scene.limits), |views| {

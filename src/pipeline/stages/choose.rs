@@ -14,7 +14,7 @@ use crate::model::{Columns, Picture};
 use crate::passes::{Batch, Subject, VIEWS_AT_ONCE, ViewStates, show, spread};
 use crate::pipeline::planning::Planning;
 use crate::pipeline::stage::{EstimateInput, Phase, RunState, Stage, StageList};
-use crate::progress::Progress;
+use crate::progress::Message;
 use crate::pruning::Ranking;
 use crate::pruning::score::{Scored, scored_memory};
 use crate::render::{self, Image};
@@ -124,7 +124,7 @@ impl Choose {
             "at the same {count} Gaussians scoring pictures keep {} without it, {with:.2} with it",
             decibels_text(without, 2)
         );
-        Progress::report_skipped("merging", &why);
+        scene.events.send(Message::Discarded { stage: "merging", why: &why });
         journal.leave_out("merging", why);
         let kept = if self.has_target { pruned } else { ranked.take(scored.selection.counts.kept) };
         Ok(Outcome { reduction: CompressedModel::pruned(kept, &reduction.rule), summary: None })
@@ -134,7 +134,7 @@ impl Choose {
 /// Mean PSNR of the Gaussians `pruned` and of `merged` against the original over `pictures`, dB.
 fn mean_psnr(scene: &Scene, pruned: &[u32], merged: &CompressedModel, pictures: &[Picture]) -> Result<[f64; 2]> {
     let result = scene.input.reduced(merged)?;
-    let progress = Progress::new(NAME, "pictures", pictures.len() as u64);
+    let progress = scene.events.task(NAME, "pictures", pictures.len() as u64);
     let mut sums = [0.0; 2];
     let pictures_together = AT_ONCE.min(scene.limits.pictures_together);
     let batch = Batch { pictures: pictures_together, ..Batch::of_frame(&scene.limits) };

@@ -15,7 +15,6 @@ use crate::passes::{Batch, Subject, show, spread};
 use crate::pipeline::planning::Planning;
 use crate::pipeline::request::Request;
 use crate::pipeline::stage::{EstimateInput, Phase, RunState, Stage, StageList};
-use crate::progress::Progress;
 use crate::pruning::score::scored_memory;
 use crate::recipe::Precision;
 use crate::refinement::CLOSE_ENOUGH;
@@ -134,7 +133,7 @@ pub(crate) fn least(result: f64, margin: f64) -> f64 {
 
 /// Mean PSNR between two sources over `pictures`, dB.
 fn closeness(scene: &Scene, [a, b]: [&dyn FrameSource; 2], pictures: &[Picture]) -> Result<f64> {
-    let progress = Progress::new(NAME, "pictures", pictures.len() as u64);
+    let progress = scene.events.task(NAME, "pictures", pictures.len() as u64);
     let mut sum = 0.0;
     let subjects = [Subject::all(a), Subject::all(b)];
     show(subjects, &scene.schedule.cameras, pictures, Batch::of_frame(&scene.limits), |views| {

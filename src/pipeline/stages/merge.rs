@@ -184,7 +184,7 @@ impl MergeStage {
         let run = |journal: &mut Journal| {
             journal.stage(NAME, survivors, scene.source(), |_| {
                 // Proxies belong to it, too.
-                let progress = Progress::counting(NAME, "sets of survivors");
+                let progress = scene.events.counting_task(NAME, "sets of survivors");
                 let mut trial = Trial::new(scene, scored, self, ranking.take(survivors), &progress)?;
                 let mut merged = match self.target {
                     None => trial.merge(&ranking.take(survivors), None)?,
@@ -287,6 +287,7 @@ impl<'a> Trial<'a> {
             gate: MotionGate::new(&merge, unit),
             frames_held: scene.limits.frames_held,
             scratch: scene.scratch.clone(),
+            events: scene.events.clone(),
             gathered: None,
         };
         let (pairs_together, known) = (scene.limits.pairs_together, KnownPairs::default());

@@ -186,7 +186,7 @@ impl Rounds {
         }
         let pictures =
             (done..sizes.len()).map(|round| looking(&turns, round).map(|turn| turns[turn].len()).sum::<usize>());
-        let progress = Progress::new(NAME, "pictures", pictures.sum::<usize>() as u64);
+        let progress = scene.events.task(NAME, "pictures", pictures.sum::<usize>() as u64);
         let RoundState { free, gone, .. } = journal.stage(NAME, first, scene.source(), |_| {
             for (round, &left) in sizes.iter().enumerate().skip(done) {
                 state = self.round(scene, scored, (state, &turns), round, (key, left), &progress)?;

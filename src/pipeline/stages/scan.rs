@@ -60,7 +60,7 @@ impl ScanStage {
         let source = scene.source();
         let info = source.info();
         let plan = ScanPlan::new(&self.recipe, &info.times, &scene.schedule)?;
-        let compute = |blocks| scan_blocks(source, &scene.schedule, &plan, blocks);
+        let compute = |blocks| scan_blocks(source, &scene.schedule, &plan, blocks, &scene.events);
         journal.stage(NAME, info.count, source, |_| {
             let units = scan_units(info);
             let found = scene.work.divided(NAME, scene.work.key(&plan), units, compute, |parts| {

@@ -25,7 +25,7 @@ use crate::outputs::kind::OutputKind;
 use crate::pipeline::planning::Planning;
 use crate::pipeline::stage::{Archived, EstimateInput, Phase, RunState, Stage, StageList};
 use crate::pipeline::summary::{self, CameraSummary, InputSummary, Summary};
-use crate::progress::Progress;
+use crate::progress::Events;
 use crate::pruning::score::scored_memory;
 use crate::scene::Scene;
 use crate::source::FrameSource;
@@ -228,7 +228,7 @@ impl Emit {
     pub fn bytes(&self, scene: &Scene, reduction: &CompressedModel, recipe: u64) -> Result<u64> {
         let folder = ScratchFolder::new(&scene.scratch)?;
         let path = folder.path().join("result");
-        let written = write_alone(&*scene.input, reduction, self.kind, &path, &scene.limits)?;
+        let written = write_alone(&*scene.input, reduction, self.kind, &path, &scene.limits, &scene.events)?;
         let beside = BESIDE + recipe + size_of::<i64>() as u64 * scene.source().info().count as u64;
         Ok(written + beside)
     }
@@ -255,11 +255,17 @@ impl Emit {
                         encoded.parts.into()
                     }
                     Some(Archived::Frames(bounds)) => {
-                        write_within(&*scene.input.reduced(reduction)?, *bounds, path)?;
+                        write_within(&*scene.input.reduced(reduction)?, *bounds, path, &scene.events)?;
                         Size::of_frames(fs::metadata(path).map_err(Error::io("read", path))?.len())
                     }
                     None => {
-                        journal.notes.extend(scene.input.write(reduction, self.kind, path, &scene.limits)?);
+                        journal.notes.extend(scene.input.write(
+                            reduction,
+                            self.kind,
+                            path,
+                            &scene.limits,
+                            &scene.events,
+                        )?);
                         scene.input.size_written(self.kind, path)?
                     }
                 };
@@ -300,18 +306,19 @@ pub fn write_alone(
     kind: OutputKind,
     path: &Path,
     limits: &Limits,
+    events: &Events,
 ) -> Result<u64> {
     if kind.is_folder() {
         fs::create_dir(path).map_err(Error::io("create", path))?;
     }
-    input.write(reduction, kind, path, limits)?;
+    input.write(reduction, kind, path, limits, events)?;
     Ok(input.size_written(kind, path)?.whole())
 }
 
 /// Writes a container within `bounds`.
-fn write_within(source: &dyn FrameSource, bounds: Bounds, path: &Path) -> Result<()> {
+fn write_within(source: &dyn FrameSource, bounds: Bounds, path: &Path, events: &Events) -> Result<()> {
     let info = source.info();
-    let progress = Progress::new(NAME, "states", (info.count * info.times.len()) as u64);
+    let progress = events.task(NAME, "states", (info.count * info.times.len()) as u64);
     write_container(source, path, bounds::packing(bounds), BTreeMap::new(), |done| progress.advance(done))
 }
 
