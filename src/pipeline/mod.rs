@@ -37,7 +37,7 @@ use planning::InputMeta;
 use stage::Measured;
 use stage::{Phase, RunState};
 use stages::measure::Measure;
-use summary::Summary;
+use summary::{InputSummary, Summary};
 
 /// Writes a smaller model and says what was done.
 ///
@@ -112,14 +112,16 @@ fn run_stages(
     journal.whole = scene.whole()?;
     let (work, measured) = (scene.workload(), arrived.as_ref().map(Measured::kinds).unwrap_or_default());
     let _numbered = scene.events.begin_run(&seconds(&work, &plan.remaining_estimates(&work, &scene.limits, measured)));
-    let recipe = recipe_text(scene, plan, request, &mut journal)?;
+    let input = InputSummary::from_scene(scene)?.without_folders();
+    let recipe = recipe_text(&input.digest, plan, request, &mut journal);
     let sh_degree = match request.recipe.bands.bands {
         WhichBands::UpTo(degree) => stages::bands::highest(scene, degree, &mut journal),
         WhichBands::All | WhichBands::Needed => ALL_HARMONICS,
     };
     let template = CompressedModel { sh_degree, ..CompressedModel::pruned(Vec::new(), &request.recipe.merge) };
     let mut run = RunState::new(scene, request, &plan.stages, template);
-    (run.journal, run.recipe, run.arrived, run.target) = (journal, recipe, arrived, plan.target);
+    (run.journal, run.input, run.recipe) = (journal, Some(input), recipe);
+    (run.arrived, run.target) = (arrived, plan.target);
 
     plan.stages.run(Phase::Rank, &mut run)?;
     match &plan.search {
@@ -138,14 +140,14 @@ fn run_stages(
     run.written.ok_or_else(|| Error::internal("no stage of the plan wrote a result"))
 }
 
-/// Returns the text of `recipe.toml` beside the result, and notes where the recipe was made for another input.
-fn recipe_text(scene: &Scene, plan: &RunPlan, request: &Request, journal: &mut Journal) -> Result<String> {
-    let own = scene.digest()?;
-    if let Some(other) = request.made_for.as_ref().filter(|digest| **digest != own) {
+/// Returns the text of `recipe.toml` beside the result of an input with the digest `own`, and notes where the recipe was
+/// made for another input.
+fn recipe_text(own: &str, plan: &RunPlan, request: &Request, journal: &mut Journal) -> String {
+    if let Some(other) = request.made_for.as_ref().filter(|digest| *digest != own) {
         journal.notes.push(format!("the recipe was made for another input, with digest {other}; this one has {own}"));
     }
     let folder = plan.output.as_ref().map(stages::write::Emit::recipe_folder).unwrap_or_default();
-    Ok(RecipeRecord::new(request, &plan.measure.score.user, own).text(request, &folder))
+    RecipeRecord::new(request, &plan.measure.score.user, own.to_owned()).text(request, &folder)
 }
 
 /// That no Gaussian is left: nothing renders such a result.

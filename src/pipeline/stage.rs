@@ -9,7 +9,7 @@ use std::sync::Arc;
 use serde::{Deserialize, Serialize};
 
 use super::request::Request;
-use super::summary::{ArchiveSummary, GoalSummary, MergeSummary, Summary};
+use super::summary::{ArchiveSummary, GoalSummary, InputSummary, MergeSummary, Summary};
 use crate::archive::Encoded;
 use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result};
@@ -279,6 +279,8 @@ pub struct RunState<'a> {
     pub stages: &'a StageList,
     /// What goes into the summary.
     pub journal: Journal,
+    /// The input for the summary. Its digest reads the whole input, so that it is computed once.
+    pub input: Option<InputSummary>,
     /// Text of the file `recipe.toml` beside the result.
     pub recipe: String,
     /// Statistics of a stream, taken as it arrived.
@@ -324,6 +326,7 @@ impl<'a> RunState<'a> {
             request,
             stages,
             journal: Journal::default(),
+            input: None,
             recipe: String::new(),
             arrived: None,
             scored: None,

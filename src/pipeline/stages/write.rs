@@ -24,7 +24,7 @@ use crate::outputs::index_map::write_index_map;
 use crate::outputs::kind::OutputKind;
 use crate::pipeline::planning::Planning;
 use crate::pipeline::stage::{Archived, EstimateInput, Phase, RunState, Stage, StageList};
-use crate::pipeline::summary::{self, CameraSummary, InputSummary, Summary};
+use crate::pipeline::summary::{self, CameraSummary, Summary};
 use crate::progress::Events;
 use crate::pruning::score::scored_memory;
 use crate::scene::Scene;
@@ -98,7 +98,8 @@ impl Stage for Emit {
             reorder(&mut map, &encoded.order);
         }
         let journal = std::mem::take(&mut run.journal);
-        let input = InputSummary::from_scene(run.scene)?.without_folders();
+        let input =
+            run.input.take().ok_or_else(|| Error::internal("the input was not described before it was written"))?;
         let (merge, goal, archive) = (run.merge.take(), run.goal.take(), run.archive.take());
         let summarize = |journal: Journal, output: Size| Summary {
             schema: summary::SCHEMA,
