@@ -8,7 +8,7 @@ use std::sync::Arc;
 /// Receives the events of runs, from any thread. Default implementations ignore an event.
 pub trait EventSink: Send + Sync {
     /// A run begins that consists of `stages`, in order. Each stage begins with the task of its name.
-    fn run_begun(&self, stages: &[StageForecast]) {
+    fn run_begun(&self, stages: &[ExpectedStage]) {
         let _ = stages;
     }
 
@@ -38,7 +38,7 @@ pub trait TaskSink: Debug + Send + Sync {
 }
 
 /// Name of a stage and its expected duration in seconds.
-pub type StageForecast = (&'static str, f64);
+pub type ExpectedStage = (&'static str, f64);
 
 /// A task that begins.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -86,7 +86,7 @@ impl Events {
     }
 
     /// Announces a run of `stages`. It lasts as long as the returned value lives.
-    pub fn begin_run(&self, stages: &[StageForecast]) -> RunOfStages {
+    pub fn begin_run(&self, stages: &[ExpectedStage]) -> RunOfStages {
         if let Some(sink) = &self.0 {
             sink.run_begun(stages);
         }
@@ -179,7 +179,7 @@ mod tests {
     }
 
     impl EventSink for Recorder {
-        fn run_begun(&self, stages: &[StageForecast]) {
+        fn run_begun(&self, stages: &[ExpectedStage]) {
             self.record(format!("run {stages:?}"));
         }
 

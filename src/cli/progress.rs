@@ -15,7 +15,7 @@ use indicatif::{HumanCount, MultiProgress, ProgressBar, ProgressDrawTarget, Prog
 
 use super::message::{is_terminal, tell};
 use splatsieve::error::printable;
-use splatsieve::progress::{EventSink, Message, StageForecast, Task, TaskSink, duration};
+use splatsieve::progress::{EventSink, ExpectedStage, Message, Task, TaskSink, duration};
 
 /// Seconds between two lines of one task in a log.
 const LINE_EVERY: u64 = 60;
@@ -59,7 +59,7 @@ impl Display {
         let bar = self.shared.bars.add(task.total.map_or_else(ProgressBar::no_length, ProgressBar::new));
         if let Ok(style) = ProgressStyle::with_template("{line}") {
             let (unit, shared) = (task.unit.to_owned(), self.shared.clone());
-            // For a task outside the stages, nobody knows how the time left of the run follows from it.
+            // Time left in a task that is no stage says nothing about the rest of the run.
             let is_stage = name != task.name;
             let line = move |state: &ProgressState, out: &mut dyn std::fmt::Write| {
                 let columns = Term::stderr().size_checked().map_or(USUAL_COLUMNS, |(_, columns)| columns);
@@ -79,7 +79,7 @@ impl Display {
 
 impl EventSink for Display {
     /// From now on a bar or line of one of `stages` says `[k/n]`, and a bar how long the whole run will take yet.
-    fn run_begun(&self, stages: &[StageForecast]) {
+    fn run_begun(&self, stages: &[ExpectedStage]) {
         *self.shared.run() = Some(RunPosition { stages: stages.to_vec(), start: Instant::now(), at: None });
     }
 

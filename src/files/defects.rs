@@ -1,14 +1,12 @@
 //! Rows of a file that are not as its format says, and what its reader did about them.
 
-use serde::{Deserialize, Serialize};
-
 /// Number of row ids that a note lists per defect.
 const LISTED: usize = 5;
 /// Fraction of a file's rows above which leaving rows out is the first thing said about the file.
 const LOUD: f64 = 0.01;
 
 /// What a reader did about the defective rows of a file.
-#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Defects {
     /// Rows of the file, without padding.
     pub rows: usize,
@@ -21,7 +19,7 @@ pub struct Defects {
 }
 
 /// Rows with one kind of defect.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq)]
 pub struct DefectCount {
     /// Kind of the defect, such as "zero quaternion".
     pub what: String,
@@ -99,34 +97,6 @@ impl Defects {
     }
 }
 
-/// Which rows of a file became Gaussians, where its reader left some out.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct FileRows {
-    /// Number of rows of the file.
-    pub count: usize,
-    /// Row of each Gaussian, increasing.
-    pub rows: Vec<u32>,
-}
-
-impl FileRows {
-    /// Returns the Gaussians of the rows `rows`, in their order, without the rows that were left out.
-    pub fn gaussians(&self, rows: &[u32]) -> Vec<u32> {
-        rows.iter().filter_map(|row| self.rows.binary_search(row).ok()).map(|id| id as u32).collect()
-    }
-
-    /// Returns the first of the rows `rows` that was left out.
-    pub fn first_dropped(&self, rows: &[u32]) -> Option<u32> {
-        rows.iter().copied().find(|row| self.rows.binary_search(row).is_err())
-    }
-
-    /// Spreads `values`, one per Gaussian, over the rows of the file; rows that were left out get `None`.
-    pub fn spread<T: Clone>(&self, values: &[Option<T>]) -> Vec<Option<T>> {
-        let mut spread = vec![None; self.count];
-        self.rows.iter().zip(values).for_each(|(&row, value)| spread[row as usize] = value.clone());
-        spread
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -152,13 +122,5 @@ mod tests {
         (20..40).for_each(|row| defects.add(row, &[nan]));
         assert!(defects.notes()[0].starts_with("31 of 1000 rows have defects: 21 (2.10%) left out"));
         assert_eq!(Defects::new(7).notes(), [""; 0]);
-    }
-
-    #[test]
-    fn rows_and_gaussians_lead_to_each_other() {
-        let rows = FileRows { count: 6, rows: vec![0, 2, 5] };
-        assert_eq!(rows.gaussians(&[5, 1, 2]), [2, 1]);
-        assert_eq!((rows.first_dropped(&[0, 5]), rows.first_dropped(&[0, 3, 4])), (None, Some(3)));
-        assert_eq!(rows.spread(&[Some(7), None, Some(9)]), [Some(7), None, None, None, None, Some(9)]);
     }
 }

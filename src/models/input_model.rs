@@ -10,7 +10,6 @@ use crate::archive::Content;
 use crate::compressed_model::{Cluster, CompressedModel, Proxies, Reference};
 use crate::error::{Error, Result, ShowPath};
 use crate::files::cameras::Clock;
-use crate::files::defects::{Defects, FileRows};
 use crate::files::ply::PlyOptions;
 use crate::files::splatv::rows::ZeroRotation;
 use crate::limits::{Limits, ReadLimit};
@@ -97,16 +96,6 @@ pub trait InputModel: Send + Sync {
     /// Things a person should know of it.
     fn notes(&self) -> Vec<String> {
         Vec::new()
-    }
-
-    /// Rows of its file that are not as the format says, and what the reader did about them.
-    fn defects(&self) -> Option<&Defects> {
-        None
-    }
-
-    /// Rows of its file that its Gaussians are, where some rows were left out.
-    fn file_rows(&self) -> Option<&FileRows> {
-        None
     }
 
     /// Folder of the data it was trained on, as the input names it, where it does: there cameras may be.

@@ -84,11 +84,11 @@ pub fn foresee(request: &Request) -> Result<Foreseen> {
     scene.follow(&plan);
     let forecast = forecast(&mut scene, &plan, &run, MeasuredOnArrival::default())?;
     let mut journal = Journal::default();
-    run.record_left_out(&scene.workload(), &scene.limits, &mut journal);
+    run.stages.record_left_out(&scene.workload(), &scene.limits, &mut journal);
     let info = scene.source().info();
     let gaussians = request.target.map(|target| target.count(outlook.gaussians)).transpose()?;
     let output = request.output.to_string_lossy().into_owned();
-    let output_kind = OutputKind::from_path(&request.output, request.kind, outlook.own_output);
+    let output_kind = run.output.as_ref().map_or(outlook.own_output, |output| output.kind);
     Ok(Foreseen {
         tool: TOOL.to_owned(),
         dry_run: true,

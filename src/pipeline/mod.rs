@@ -34,8 +34,7 @@ use crate::pruning::score::{Scored, UserOverrides};
 use crate::recipe::{Recipe, WhichBands};
 use crate::scene::{InputOptions, Scene};
 use planning::InputMeta;
-use stage::Measured;
-use stage::{Phase, RunState};
+use stage::{Measured, Phase, RunState};
 use stages::measure::Measure;
 use summary::{InputSummary, Summary};
 
@@ -55,7 +54,7 @@ fn compress_whole(request: &Request) -> Result<Summary> {
         Ok(plan)
     };
     let (scene, plan, arrived) = open_to_measure(&request.input, plan, &mut journal)?;
-    Ok(run_stages(&scene, &plan, arrived, request, journal)?.1)
+    Ok(run_stages(&scene, &plan, arrived, request, journal)?.0)
 }
 
 /// [`compress`] of a scene that is open already; also gives every Gaussian's place in the output.
@@ -65,8 +64,7 @@ fn compress_whole(request: &Request) -> Result<Summary> {
 pub fn compress_scene(scene: &Scene, request: &Request) -> Result<(Summary, Vec<Option<u32>>)> {
     let plan = RunPlan::within_memory(request, InputMeta::from_scene(scene), &scene.workload())?;
     plan.check_target(&scene.path)?;
-    let (map, summary) = run_stages(scene, &plan, None, request, Journal::default())?;
-    Ok((summary, map))
+    run_stages(scene, &plan, None, request, Journal::default())
 }
 
 /// The stages of a run that can be divided among several, in order, with what their parts are made of.
@@ -98,15 +96,15 @@ pub fn score_scene(scene: &Scene, recipe: &Recipe, user: &UserOverrides) -> Resu
     Measure::new(recipe, scene.has_cameras, user.clone()).measure(scene, None, &mut Journal::default())
 }
 
-/// Runs the stages of `plan`, one after the other. Returns where each Gaussian of the input is in the output, and the
-/// summary.
+/// Runs the stages of `plan`, one after the other. Returns the summary, and where each Gaussian of the input is in the
+/// output.
 fn run_stages(
     scene: &Scene,
     plan: &RunPlan,
     arrived: Option<Measured>,
     request: &Request,
     mut journal: Journal,
-) -> Result<(Vec<Option<u32>>, Summary)> {
+) -> Result<(Summary, Vec<Option<u32>>)> {
     plan.check(scene)?;
     journal.notes.extend(scene.notes.iter().cloned());
     journal.whole = scene.whole()?;
@@ -134,7 +132,7 @@ fn run_stages(
         return Err(nothing_left(scene, &scored));
     }
     run.journal.notes.extend(run.result.proxies.notes.iter().cloned());
-    plan.record_left_out(&work, &scene.limits, &mut run.journal);
+    plan.stages.record_left_out(&work, &scene.limits, &mut run.journal);
     run.journal.notes.extend(scene.work.take_notes());
     plan.stages.run(Phase::Write, &mut run)?;
     run.written.ok_or_else(|| Error::internal("no stage of the plan wrote a result"))

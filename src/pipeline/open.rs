@@ -141,7 +141,8 @@ fn receive_measured(
         FrameQuota::new(options.memory, |budget, frames| receive(budget, Some(visible.is_some()), frames)).most;
     if options.memory.tell == Verbosity::Plan {
         let most = room.most;
-        let text = format!("frames: there is memory for {most}, for {to_measure} to be measured as they arrive");
+        let text =
+            format!("frames: at most {most} fit the memory limit; up to {to_measure} are measured while they arrive");
         options.events.send(Message::Plan(&text));
     }
     // Without cameras the rig stands around the first frame, and everything else around the rig.

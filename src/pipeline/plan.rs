@@ -12,7 +12,6 @@ use super::stages::STAGES;
 use super::stages::measure::Measure;
 use super::stages::write::Emit;
 use crate::error::{Error, Result};
-use crate::journal::Journal;
 use crate::limits::Limits;
 use crate::memory_plan::{Plan, ResourceEstimate, Workload};
 use crate::outputs::kind::OutputKind;
@@ -134,12 +133,13 @@ impl RunPlan {
         Ok(plan)
     }
 
-    /// Returns what all stages take.
+    /// Returns the estimates of all stages.
     pub fn estimates(&self, work: &Workload, limits: &Limits) -> Vec<ResourceEstimate> {
         self.remaining_estimates(work, limits, MeasuredOnArrival::default())
     }
 
-    /// Returns what the stages take that are not done yet.
+    /// Returns the estimates of the stages that are still to run: those of a stream need not measure what was measured while it
+    /// arrived.
     pub fn remaining_estimates(
         &self,
         work: &Workload,
@@ -149,8 +149,8 @@ impl RunPlan {
         self.estimates_of(self.estimate_input(work, limits, measured), |_| true)
     }
 
-    /// Returns what the stages take at best that are not done yet: where views hardly differ without a part `hardly_seen` of
-    /// the Gaussians.
+    /// Returns the estimates of the stages that are still to run, without those that may turn out to be unnecessary because
+    /// views hardly differ without a part `hardly_seen` of the Gaussians.
     pub fn shortest_estimates(
         &self,
         work: &Workload,
@@ -174,7 +174,7 @@ impl RunPlan {
 
     fn estimates_of(&self, input: EstimateInput<'_>, runs: impl Fn(&dyn Stage) -> bool) -> Vec<ResourceEstimate> {
         let of = |phase: Phase| -> Vec<ResourceEstimate> {
-            self.stages.of(phase).filter(|stage| runs(*stage)).flat_map(|stage| stage.estimates(input)).collect()
+            self.stages.in_phase(phase).filter(|stage| runs(*stage)).flat_map(|stage| stage.estimates(input)).collect()
         };
         let reduce = match &self.search {
             Some(search) => vec![search.estimate(input, &of(Phase::Reduce))],
@@ -183,7 +183,7 @@ impl RunPlan {
         [of(Phase::Rank), reduce, of(Phase::Write)].concat()
     }
 
-    /// Returns whether it is only found on the way how much there is to do.
+    /// Returns whether the amount of work depends on what stages find, so that time estimates are wide.
     pub fn is_open_ended(&self) -> bool {
         self.search.is_some() || self.stages.is_open_ended()
     }
@@ -225,11 +225,6 @@ impl RunPlan {
         }
         self.stages.all().try_for_each(|stage| stage.check(scene))
     }
-
-    /// Writes down what the run goes without.
-    pub fn record_left_out(&self, work: &Workload, limits: &Limits, journal: &mut Journal) {
-        self.stages.record_left_out(work, limits, journal);
-    }
 }
 
 /// Returns the kind of result that `request` asks for, of an input whose own kind of result is `own`.
@@ -269,6 +264,7 @@ fn checked_output(request: &Request, own: OutputKind) -> Result<OutputKind> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::journal::Journal;
     use crate::memory_plan::Budget;
     use crate::model::ALL_HARMONICS;
     use crate::pipeline::request::Target;
@@ -319,7 +315,7 @@ mod tests {
             request.input.memory = budget(bytes);
             let plan = RunPlan::within_memory(&request, OUTLOOK, &work).unwrap();
             let mut journal = Journal::default();
-            plan.record_left_out(&work, &Limits::NONE, &mut journal);
+            plan.stages.record_left_out(&work, &Limits::NONE, &mut journal);
             let left_out =
                 |what: &str| journal.left_out.iter().find(|left| left.what == what).map(|left| left.why.clone());
             let whats = ["refining along time", "refining of harmonics above the first", "refinement"];
@@ -381,7 +377,7 @@ mod tests {
         let needs = plan.estimates(&work(1000), &Limits::NONE);
         assert_eq!(needs.iter().map(|need| need.stage).collect::<Vec<_>>(), ["scan", "score", "emit"]);
         let mut journal = Journal::default();
-        plan.record_left_out(&work(1000), &Limits::NONE, &mut journal);
+        plan.stages.record_left_out(&work(1000), &Limits::NONE, &mut journal);
         assert_eq!(journal.left_out.len(), 1);
         assert_eq!(journal.left_out[0].why, "the recipe has no merge pass");
     }

@@ -1,8 +1,9 @@
 //! What stages are planned from: the request and the input, as far as several stages depend on them.
 
-use super::request::Request;
+use super::request::{Goal, Request};
 use crate::outputs::kind::OutputKind;
 use crate::pruning::score::UserOverrides;
+use crate::recipe::WhichBands;
 use crate::refinement::RefineStage;
 use crate::scene::Scene;
 
@@ -56,6 +57,12 @@ impl Planning<'_> {
     /// Returns the part of the Gaussians that is asked for.
     pub fn part(&self) -> Option<f64> {
         self.target.map(|target| target as f64 / self.input.gaussians.max(1) as f64)
+    }
+
+    /// Returns whether the SH degree is chosen of which most Gaussians fit a size on disk: refinement tells which is best.
+    pub fn chooses_degree(&self) -> bool {
+        let has_byte_limit = matches!(self.request.goal, Some(Goal::Bytes(_)));
+        has_byte_limit && self.refine.is_some() && self.request.recipe.bands.bands == WhichBands::Needed
     }
 
     /// Returns whether Gaussians are ranked by views of the scene and removed.

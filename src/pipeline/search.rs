@@ -101,8 +101,8 @@ impl SearchStage {
         format!("search: {} sizes at most, for {} {}", MOST_TRIED, self.name(), self.goal())
     }
 
-    /// Returns what a search takes whose sizes go through stages that take `repeated`: the largest of them beside what is
-    /// kept of the way down and of the best.
+    /// Returns the estimate of the search. `repeated` are those of the stages that every size goes through: memory is that of
+    /// the largest of them and of the models that the search keeps, time and reads are those of all, for each size.
     pub fn estimate(&self, input: EstimateInput<'_>, repeated: &[ResourceEstimate]) -> ResourceEstimate {
         let EstimateInput { work, limits, .. } = input;
         let whole = work.state(Columns::all());

@@ -22,6 +22,7 @@ use crate::pruning::Ranking;
 use crate::pruning::contribution::VisibleContribution;
 use crate::pruning::score::Scored;
 use crate::refinement::prune_steps::PruneSteps;
+use crate::refinement::start_count;
 use crate::scene::Scene;
 use crate::statistics::pass::Scanned;
 
@@ -128,8 +129,7 @@ pub struct CountPlan {
 impl CountPlan {
     /// Returns how many of `all` Gaussians refinement begins with, if `wanted` are to stay.
     pub fn before_refinement(&self, wanted: usize, all: usize) -> usize {
-        let start = self.refinement_starts_at.map_or(0, |part| (part * all as f64).ceil() as usize);
-        wanted.max(start.min(all))
+        start_count(self.refinement_starts_at, wanted, all)
     }
 
     /// Returns how many of `all` Gaussians ranking goes down to, if `wanted` are to stay. A search ranks as far down as its
@@ -179,7 +179,7 @@ pub struct StageList {
     left_out: Vec<LeftOutStage>,
     /// How many Gaussians ranking and refinement leave.
     pub counts: CountPlan,
-    /// Whether it is only found on the way how much there is to do.
+    /// Whether the amount of work depends on what stages find, so that time estimates are wide.
     is_open_ended: bool,
 }
 
@@ -204,12 +204,12 @@ impl StageList {
         self.left_out.push(LeftOutStage { what, why: why.into(), estimate: Some(Box::new(estimate)) });
     }
 
-    /// Records that the run cannot say before how much there is to do.
+    /// Records that the amount of work depends on what stages find.
     pub fn set_open_ended(&mut self) {
         self.is_open_ended = true;
     }
 
-    /// Returns whether it is only found on the way how much there is to do.
+    /// Returns whether the amount of work depends on what stages find.
     pub fn is_open_ended(&self) -> bool {
         self.is_open_ended
     }
@@ -220,7 +220,7 @@ impl StageList {
     }
 
     /// Returns the stages of `phase`.
-    pub fn of(&self, phase: Phase) -> impl Iterator<Item = &dyn Stage> {
+    pub fn in_phase(&self, phase: Phase) -> impl Iterator<Item = &dyn Stage> {
         self.stages.iter().filter(move |(of, _)| *of == phase).map(|(_, stage)| &**stage)
     }
 
@@ -229,7 +229,7 @@ impl StageList {
     /// # Errors
     /// Those of the stages.
     pub fn run(&self, phase: Phase, run: &mut RunState<'_>) -> Result<()> {
-        self.of(phase).try_for_each(|stage| stage.run(run))
+        self.in_phase(phase).try_for_each(|stage| stage.run(run))
     }
 
     /// Returns what the run goes without, a line each, for a person.
@@ -309,8 +309,8 @@ pub struct RunState<'a> {
     pub archived: Option<Archived>,
     /// How close the archive is.
     pub archive: Option<ArchiveSummary>,
-    /// Where each Gaussian of the input is in the output, and the summary, once the result is written.
-    pub written: Option<(Vec<Option<u32>>, Summary)>,
+    /// The summary, and where each Gaussian of the input is in the output, once the result is written.
+    pub written: Option<(Summary, Vec<Option<u32>>)>,
 }
 
 impl<'a> RunState<'a> {

@@ -170,7 +170,7 @@ impl RefineStage {
 
     /// How many of `all` Gaussians to begin with, if `wanted` are to stay.
     pub fn first(&self, wanted: usize, all: usize) -> usize {
-        if self.cuts { wanted.max((CUTS_FROM * all as f64).ceil() as usize).min(all) } else { wanted }
+        start_count(self.starts_at(), wanted, all)
     }
 
     /// States, the descent, and a picture that is differentiated.
@@ -292,6 +292,12 @@ impl RefineStage {
         let all = || Ok(walk.all(reduction, wanted, steps, &mut Journal::default())?.1);
         scene.work.known(&format!("{stage}-size"), key, all)
     }
+}
+
+/// Returns how many of `all` Gaussians refinement begins with, if `wanted` are to stay: at least the part `starts_at`, the
+/// rest of which goes in prune steps. None: as many as stay.
+pub(crate) fn start_count(starts_at: Option<f64>, wanted: usize, all: usize) -> usize {
+    starts_at.map_or(wanted, |part| wanted.max((part * all as f64).ceil() as usize).min(all))
 }
 
 /// Steps along time behind `steps` steps of all times together.

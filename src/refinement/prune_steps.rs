@@ -5,21 +5,21 @@ use crate::compressed_model::CompressedModel;
 use crate::error::Result;
 use crate::journal::Journal;
 
-/// The way of a search to smaller and smaller sizes: what its prune steps left.
+/// Models that a search has pruned and refined so far. A smaller size starts from the smallest of them that is large enough.
 pub struct PruneSteps<'a> {
     refinement: RefineRun<'a>,
-    /// Larger ones first.
+    /// From large to small.
     models: Vec<CompressedModel>,
 }
 
 impl<'a> PruneSteps<'a> {
-    /// Returns the way before its first step.
+    /// Returns an empty list of models, to be made by `refinement`.
     pub(crate) fn new(refinement: RefineRun<'a>) -> PruneSteps<'a> {
         PruneSteps { refinement, models: Vec::new() }
     }
 
-    /// Returns the best model of `size` Gaussians. Goes on from the smallest model on the way that has as many, or from
-    /// `start`, what ranking alone leaves for that size.
+    /// Returns the best model of `size` Gaussians. Starts from the smallest model so far that has as many or more, else from
+    /// `start`, the Gaussians that ranking alone leaves for that size.
     ///
     /// # Errors
     /// Frames that cannot be read; a scratch file that cannot be written.

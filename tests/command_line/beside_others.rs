@@ -62,18 +62,10 @@ fn send(signal: &str, child: &Child) {
 
 /// The program in a namespace of process ids of its own, as in a container, with a number above `before`.
 fn contained(workplace: &Workplace, before: usize, arguments: &str) -> Command {
-    let alone = ["-p", "--fork", "--mount-proc"];
-    let rootless = ["-U", "-r", "-p", "--fork", "--mount-proc"];
-    let works = |flags: &[&str]| {
-        let quiet = Command::new("unshare").args(flags).arg("true").stderr(Stdio::null()).status();
-        quiet.is_ok_and(|status| status.success())
-    };
-    let flags = [&alone[..], &rootless[..]].into_iter().find(|flags| works(flags));
-    let flags = flags.expect("a machine that allows namespaces of process ids");
-    let mut command = Command::new("unshare");
+    let mut command = crate::unshare(&["-p", "--fork", "--mount-proc"]);
     // Every number up to `before` is taken by a process that has ended.
     let script = format!("for i in $(seq {before}); do /bin/true; done; {} {arguments}; exit $?", program().display());
-    command.args(flags).args(["sh", "-c", &script]).current_dir(workplace.path(""));
+    command.args(["sh", "-c", &script]).current_dir(workplace.path(""));
     command
 }
 

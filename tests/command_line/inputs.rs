@@ -187,18 +187,8 @@ fn a_full_disk_is_blamed_on_what_was_being_written() {
         (format!("compress {tiny} -o x.gseq --scratch-dir disk"), "write a scratch file in disk: No space"),
     ] {
         let script = format!("mount -t tmpfs -o size=24k none disk && {program} --quiet {run}; ls -A disk | wc -l");
-        let shell = |arguments: &[&str]| {
-            Command::new("unshare")
-                .args(arguments)
-                .args(["sh", "-c", &script])
-                .current_dir(workplace.path(""))
-                .output()
-                .unwrap()
-        };
-        let mut output = shell(&["-m"]);
-        if String::from_utf8_lossy(&output.stderr).contains("unshare") {
-            output = shell(&["-U", "-r", "-m"]);
-        }
+        let mut shell = crate::unshare(&["-m"]);
+        let output = shell.args(["sh", "-c", &script]).current_dir(workplace.path("")).output().unwrap();
         let told = String::from_utf8_lossy(&output.stderr);
         assert!(told.contains(named) && told.contains("make room"), "{run}: {told}");
         for part in ["Os {", "splatsieve-tmp", "content", "ZipWriter", "Some("] {

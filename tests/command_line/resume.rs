@@ -210,18 +210,8 @@ fn a_full_disk_under_the_work_folder_is_named_and_more_room_goes_on() {
         "mount -t tmpfs -o size=300k none disk && ({0} {run}; echo \"code $?\" >&2; mount -o remount,size=300m disk && {0} {run})",
         program().display()
     );
-    let shell = |arguments: &[&str]| {
-        Command::new("unshare")
-            .args(arguments)
-            .args(["sh", "-c", &script])
-            .current_dir(workplace.path(""))
-            .output()
-            .unwrap()
-    };
-    let output = match shell(&["-m"]) {
-        output if output.status.success() => output,
-        _ => shell(&["-U", "-r", "-m"]),
-    };
+    let mut shell = crate::unshare(&["-m"]);
+    let output = shell.args(["sh", "-c", &script]).current_dir(workplace.path("")).output().unwrap();
     let told = told(&output);
     assert!(output.status.success(), "{told}");
     assert!(told.contains("code 1") && told.contains("disk/work") && told.contains("No space left"), "{told}");

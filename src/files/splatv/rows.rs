@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{Splatv, SplatvGaussian, WORDS};
 use crate::error::{Error, Result};
-use crate::files::defects::{Defects, FileRows};
+use crate::files::defects::Defects;
 
 /// What becomes of rows whose quaternion is 0 at every time.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -21,7 +21,7 @@ pub enum ZeroRotation {
     Identity,
 }
 
-/// A defect of a row: its name, whether it drops the row, and why.
+/// A kind of defect: its name, whether rows with it are left out, and why.
 type Defect = (&'static str, bool, &'static str);
 
 const POSITION: Defect = ("NaN or infinite position", true, "no player draws them");
@@ -52,15 +52,16 @@ fn defects(row: &SplatvGaussian, zero_rotation: ZeroRotation) -> Vec<Defect> {
 }
 
 /// Returns whether a row's quaternion is 0 at every time. One that is 0 at one instant only is no defect.
-fn is_unturned(row: &SplatvGaussian) -> bool {
+pub(crate) fn is_unturned(row: &SplatvGaussian) -> bool {
     row.rotation == [0.0; 4] && row.omega == [0.0; 4]
 }
 
-/// Looks at every row of `file`. Gives what was found, and which rows are Gaussians where some are left out.
+/// Looks at every row of `file`. Returns the defects found and, where some rows are left out, the numbers of the others,
+/// increasing.
 ///
 /// # Errors
 /// A file all of whose rows would be left out.
-pub fn inspect(file: &Splatv, zero_rotation: ZeroRotation) -> Result<(Defects, Option<FileRows>)> {
+pub fn inspect(file: &Splatv, zero_rotation: ZeroRotation) -> Result<(Defects, Option<Vec<u32>>)> {
     let count = file.count();
     let mut found = Defects::new(count);
     let mut rows: Option<Vec<u32>> = None;
@@ -83,7 +84,7 @@ pub fn inspect(file: &Splatv, zero_rotation: ZeroRotation) -> Result<(Defects, O
             false => error.hint("the model did not train, or its conversion failed: export it again"),
         });
     }
-    Ok((found, rows.map(|rows| FileRows { count, rows })))
+    Ok((found, rows))
 }
 
 /// Repairs the words of a row that is kept: an infinite width becomes the largest half, a quaternion that is 0 at every time
@@ -171,10 +172,10 @@ mod tests {
         let (found, rows) = inspect(&file, ZeroRotation::Drop).unwrap();
         // A row of zeros has neither a width nor a rotation.
         assert_eq!((counts(&found), found.defective, found.dropped), ([3, 3, 2, 3, 2], 10, 9));
-        assert_eq!(rows.unwrap(), FileRows { count: 12, rows: vec![0, 9, 10] });
+        assert_eq!(rows.unwrap(), [0, 9, 10]);
         let (found, rows) = inspect(&file, ZeroRotation::Identity).unwrap();
         assert_eq!((counts(&found), found.defective, found.dropped), ([3, 3, 2, 3, 2], 10, 8));
-        assert_eq!(rows.unwrap().rows, [0, 8, 9, 10]);
+        assert_eq!(rows.unwrap(), [0, 8, 9, 10]);
     }
 
     #[test]

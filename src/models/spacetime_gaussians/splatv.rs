@@ -16,10 +16,10 @@ use crate::compressed_model::{Cluster, CompressedModel, Proxies, Reference};
 use crate::error::{Error, Result};
 use crate::files::accuracy::Accuracy;
 use crate::files::cameras::Clock;
-use crate::files::defects::{Defects, FileRows};
+use crate::files::defects::Defects;
 use crate::files::digest::hash_file;
 use crate::files::json::read_json;
-use crate::files::splatv::rows::{inspect, repair};
+use crate::files::splatv::rows::{inspect, is_unturned, repair};
 use crate::files::splatv::write::{measure, seen_whole, words, write as write_file};
 use crate::files::splatv::{MAGIC, Splatv, SplatvGaussian};
 use crate::limits::Limits;
@@ -56,8 +56,8 @@ pub(in super::super) const SPLATV: ModelFormat = ModelFormat {
 #[derive(Debug)]
 struct SplatvModel {
     file: Splatv,
-    /// Rows that the Gaussians are, where some were left out.
-    rows: Option<FileRows>,
+    /// Row of each Gaussian, where some rows were left out.
+    rows: Option<Vec<u32>>,
     defects: Defects,
     model: MotionModelFrames<Spacetime>,
 }
@@ -73,24 +73,23 @@ impl SplatvModel {
         let count = file.count() - defects.dropped;
         let mut raw = Raw { gaussians: Gaussians::zeros(count, 0), own: Column::zeros(WIDTH, count) };
         for i in 0..count {
-            set(&mut raw, i, &SplatvGaussian::of_words(&file.words(file_row(rows.as_ref(), i))));
+            set(&mut raw, i, &SplatvGaussian::of_words(&file.words(file_row(rows.as_deref(), i))));
         }
         let model = MotionModelFrames::new(Spacetime { is_full: false, decoder: None }, raw, 0);
         Ok(SplatvModel { file, rows, defects, model })
     }
 }
 
-/// Row of the file that Gaussian `i` is.
-fn file_row(rows: Option<&FileRows>, i: usize) -> usize {
-    rows.map_or(i, |rows| rows.rows[i] as usize)
+/// Returns the row of Gaussian `i` in the file.
+fn file_row(rows: Option<&[u32]>, i: usize) -> usize {
+    rows.map_or(i, |rows| rows[i] as usize)
 }
 
 /// Makes Gaussian `i` what `row` is.
 fn set(raw: &mut Raw, i: usize, row: &SplatvGaussian) {
     let log = |length: f32| f64::from(length).max(LEAST_LENGTH).ln() as f32;
     raw.gaussians.position.set_row(i, row.position);
-    let is_unturned = row.rotation == [0.0; 4] && row.omega == [0.0; 4];
-    raw.gaussians.rotation.set_row(i, if is_unturned { [1.0, 0.0, 0.0, 0.0] } else { row.rotation });
+    raw.gaussians.rotation.set_row(i, if is_unturned(row) { [1.0, 0.0, 0.0, 0.0] } else { row.rotation });
     // Players square scales: the sign is nothing.
     raw.gaussians.log_scale.set_row(i, row.scale.map(|scale| log(scale.abs())));
     raw.gaussians.opacity_logit.set_row(i, [logit(row.opacity).clamp(-MOST, MOST) as f32]);
@@ -181,14 +180,6 @@ impl InputModel for SplatvModel {
         self.defects.notes().into_iter().chain(self.file.note()).collect()
     }
 
-    fn defects(&self) -> Option<&Defects> {
-        Some(&self.defects).filter(|defects| !defects.is_empty())
-    }
-
-    fn file_rows(&self) -> Option<&FileRows> {
-        self.rows.as_ref()
-    }
-
     fn timing(&self) -> Timing {
         Timing::Continuous
     }
@@ -248,7 +239,7 @@ impl InputModel for SplatvModel {
             if now != before {
                 return words(&now);
             }
-            let mut stored = self.file.words(file_row(self.rows.as_ref(), reduction.kept[i] as usize));
+            let mut stored = self.file.words(file_row(self.rows.as_deref(), reduction.kept[i] as usize));
             repair(&mut stored);
             stored
         };

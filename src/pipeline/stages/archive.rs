@@ -44,7 +44,7 @@ pub struct ArchiveStage {
     pub psnr: Option<f64>,
 }
 
-/// Adds the stage where an archive is written.
+/// Adds the stage if the output is an archive.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     if planning.output == OutputKind::Archive {
         stages.add(Phase::Write, ArchiveStage { psnr: planning.request.archive_psnr });

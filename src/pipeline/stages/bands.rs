@@ -51,7 +51,7 @@ pub(crate) struct ShDegreeStage {
     pub margin: f64,
 }
 
-/// Adds the stage where the output may have fewer.
+/// Adds the stage if the output may have a lower SH degree.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     if let Some(stage) = ShDegreeStage::from_request(planning.request, planning.output) {
         stages.add(Phase::Reduce, stage);

@@ -40,7 +40,7 @@ pub(crate) struct Choose {
     pub has_target: bool,
 }
 
-/// Adds the stage where survivors both are pruned by views and merge.
+/// Adds the stage if survivors are both pruned by views and merged.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     if planning.prunes_by_views() && planning.merges && planning.request.recipe.select.choose_by_views {
         stages.add(Phase::Reduce, Choose { has_target: planning.target.is_some() });

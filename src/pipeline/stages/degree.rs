@@ -12,11 +12,9 @@ use crate::journal::Journal;
 use crate::limits::Limits;
 use crate::memory_plan::{ResourceEstimate, Workload};
 use crate::pipeline::planning::Planning;
-use crate::pipeline::request::Goal;
 use crate::pipeline::stage::{ByteLimitFit, EstimateInput, Phase, RunState, Stage, StageList};
 use crate::pruning::Ranking;
 use crate::pruning::score::Scored;
-use crate::recipe::WhichBands;
 use crate::refinement::RefineStage;
 use crate::refinement::targets::Targets;
 use crate::scene::Scene;
@@ -35,9 +33,7 @@ pub(crate) struct Degree {
 
 /// Adds the stage to a run that is asked for so many bytes, refines, and may drop bands.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
-    let request = planning.request;
-    let chooses = matches!(request.goal, Some(Goal::Bytes(_))) && request.recipe.bands.bands == WhichBands::Needed;
-    if let Some(refine) = planning.refine.as_ref().filter(|_| chooses) {
+    if let Some(refine) = planning.refine.as_ref().filter(|_| planning.chooses_degree()) {
         stages.set_open_ended();
         stages.add(Phase::Rank, Degree { refine: refine.in_part(STEPS) });
     }

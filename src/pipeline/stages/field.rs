@@ -34,7 +34,7 @@ pub(crate) struct FieldPrecisionStage {
     pub margin: f64,
 }
 
-/// Adds the stage where the field may change.
+/// Adds the stage if the deformation field may be stored in half precision.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     if let Some(stage) = FieldPrecisionStage::from_request(planning.request, planning.output) {
         stages.add(Phase::Reduce, stage);

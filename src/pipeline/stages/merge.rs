@@ -84,7 +84,7 @@ pub(crate) struct Outcome {
     pub summary: Option<MergeSummary>,
 }
 
-/// Adds the stage where survivors merge.
+/// Adds the stage if survivors are merged; else records why they are not.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     let recipe = &planning.request.recipe;
     let stage = MergeStage {

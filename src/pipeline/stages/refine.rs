@@ -8,7 +8,7 @@ use crate::refinement::RefineStage;
 use crate::refinement::targets;
 use crate::scene::Scene;
 
-/// Adds the stage where anything may move and there is memory for it.
+/// Adds the stage if the recipe refines and memory suffices; records what is left out for lack of memory.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     for (what, bytes) in planning.fallback.left_out() {
         let why = format!("memory: expected at least {}MiB for it (--memory)", bytes.div_ceil(1 << 20));

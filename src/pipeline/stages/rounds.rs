@@ -52,7 +52,7 @@ const FEWEST: f64 = 0.05;
 /// And usually this one.
 const USUAL: f64 = 0.5;
 
-/// Adds the stage where Gaussians are ranked by views.
+/// Adds the stage if Gaussians are ranked by views.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     let rounds = Rounds::from_recipe(&planning.request.recipe.select, planning.part());
     if let Some(rounds) = rounds.filter(|_| planning.prunes_by_views()) {

@@ -16,7 +16,7 @@ use crate::pipeline::stages::field::FieldPrecisionStage;
 use crate::pipeline::stages::write::Emit;
 use crate::pruning::removal::removal_error;
 use crate::pruning::score::Scored;
-use crate::recipe::{Precision, WhichBands};
+use crate::recipe::Precision;
 use crate::scene::Scene;
 
 /// What the stage is called.
@@ -31,7 +31,7 @@ const PICTURES: usize = 48;
 /// Adds the stage that finds how many Gaussians fit.
 pub(super) fn plan_count(planning: &Planning<'_>, stages: &mut StageList) {
     if let Some(limit) = ByteLimit::from_planning(planning) {
-        stages.add(Phase::Rank, CountByBytes { drops_bands: drops_bands(planning), limit });
+        stages.add(Phase::Rank, CountByBytes { drops_bands: planning.chooses_degree(), limit });
     }
 }
 
@@ -40,10 +40,6 @@ pub(super) fn plan_shrink(planning: &Planning<'_>, stages: &mut StageList) {
     if let Some(limit) = ByteLimit::from_planning(planning).filter(|_| planning.output != OutputKind::Archive) {
         stages.add(Phase::Reduce, ShrinkToBytes { limit });
     }
-}
-
-fn drops_bands(planning: &Planning<'_>) -> bool {
-    planning.refine.is_some() && planning.request.recipe.bands.bands == WhichBands::Needed
 }
 
 /// The stage that finds how many Gaussians fit.

@@ -131,7 +131,7 @@ impl Stage for Emit {
         // The file has names alone, for it is published; whoever asked for the run sees the paths as they were given.
         summary.input.path = run.scene.path.to_string_lossy().into_owned();
         summary.output = self.output.to_string_lossy().into_owned();
-        run.written = Some((map, summary));
+        run.written = Some((summary, map));
         Ok(())
     }
 }
