@@ -30,7 +30,7 @@ impl EventSink for Printer {
 
     fn message(&self, message: Message<'_>) {
         match message {
-            Message::Plan(text) => println!("{text}"),
+            Message::Plan(text) | Message::Warning(text) => println!("{text}"),
             Message::Discarded { stage, why } => println!("{stage} is left out: {why}"),
         }
     }

@@ -113,13 +113,13 @@ def timed(*command):
 def whole(binary, model, scratch):
     """Every column of a model's frames; gives the exact container."""
     exact = scratch / "exact.gseq"
-    seconds, _ = timed(binary, "pack", model, "--cameras", model, "-o", exact)
+    seconds, _ = timed(binary, "convert", model, exact, "--cameras", model)
     columns = json.loads(run(binary, "info", exact, "--json"))["columns"]
     raw = sum(column["raw_bytes"] for column in columns)
     row(model.name, "exact", exact.stat().st_size, raw, math.inf, seconds)
     for name, bounds in [("fine", FINE), ("coarse", COARSE)]:
         within = scratch / "within.gseq"
-        seconds, _ = timed(binary, "pack", exact, "-o", within, "--max-error", bounds, "--force")
+        seconds, _ = timed(binary, "convert", exact, within, "--max-error", bounds, "--overwrite")
         row(model.name, f"within {name} bounds", within.stat().st_size, raw, psnr(binary, exact, within, model), seconds)
     return exact
 
@@ -127,7 +127,7 @@ def whole(binary, model, scratch):
 def plain(binary, model, exact, peer, fourdgs, scratch):
     """Frames without harmonics above the constant one, here and by the peers."""
     frames, ply, splat = scratch / "frames", scratch / "ply", scratch / "splat"
-    run(binary, "unpack", exact, "-o", frames)
+    run(binary, "convert", exact, frames, "--as", "ply-sequence")
     ply.mkdir()
     splat.mkdir()
     for i, path in enumerate(sorted(frames.glob("*.ply"))):
@@ -139,7 +139,7 @@ def plain(binary, model, exact, peer, fourdgs, scratch):
     within = scratch / "plain.gseq"
     for part, name in [(1, "plain, within 2 mm, 2%, 4 levels"), (2, "plain, within half of that")]:
         bounds = ",".join(f"{column}={bound / part:.4g}" for column, bound in BOUNDS.items())
-        pack = ["pack", ply, "--cameras", model, "-o", within, "--max-error", bounds, "--level", "19", "--force"]
+        pack = ["convert", ply, within, "--cameras", model, "--max-error", bounds, "--level", "19", "--overwrite"]
         seconds, _ = timed(binary, *pack)
         row(model.name, name, within.stat().st_size, raw, psnr(binary, ply, within, model), seconds)
     if peer:

@@ -14,7 +14,7 @@ every frame the script writes a file of the same name into OUT in which
 OUT/truth.npz says of the rows of all frames, one after the other, `gaussian` and `life`, both counted from 0, and with
 `starts`, [T + 1], where those of each frame begin.
 
-With --score: LINKED.gseq is what `splatsieve pack OUT -o LINKED.gseq --link apart` gives, which holds every row. A link is
+With --score: LINKED.gseq is what `splatsieve convert OUT LINKED.gseq --link apart` gives, which holds every row. A link is
 two rows of neighbouring frames in one track. Prints how many of the true ones, two rows of one life, were found, and how
 many that are there are wrong, both by life and by Gaussian, as parts of the true links, and how many tracks, lives and
 Gaussians there are.

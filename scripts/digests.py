@@ -66,7 +66,7 @@ def cases(binary, data, scratch):
     run([binary, "demo", "--gaussians", "3000", "--frames", "64", "-o", demo])
     rig = demo / "cameras.json"
     packed, frames = scratch / "model.gseq", scratch / "frames"
-    run([binary, "pack", small, "--cameras", small, "-o", packed])
+    run([binary, "convert", small, packed, "--cameras", small])
     run([binary, "compress", demo / "scene.gseq", "--cameras", rig, "-o", frames, "--as", "ply-sequence",
          "--preset", "gentle", "--prune-only"])
     one = sorted(frames.glob("*.ply"))[0]
@@ -85,14 +85,14 @@ def cases(binary, data, scratch):
         "paper prune-only": ["--preset", "paper", "--prune-only"],
         "paper merge-only": ["--preset", "paper", "--merge-only"],
         "strong merge-only": ["--preset", "strong", "--merge-only"],
-        "ratio 0.3": ["--target-ratio", "0.3"],
-        "count 5000 strong": ["--target-count", "5000", "--preset", "strong"],
-        "ratio 0.9 merge-only": ["--target-ratio", "0.97", "--merge-only", "--preset", "paper"],
-        "ratio 0.5 paper": ["--target-ratio", "0.5", "--preset", "paper"],
+        "ratio 0.3": ["--ratio", "0.3"],
+        "count 5000 strong": ["--count", "5000", "--preset", "strong"],
+        "ratio 0.9 merge-only": ["--ratio", "0.97", "--merge-only", "--preset", "paper"],
+        "ratio 0.5 paper": ["--ratio", "0.5", "--preset", "paper"],
         "ids": ["--keep-ids", "3,10-200", "--drop-ids", "5000-5100"],
         "box": ["--keep-box", box],
-        "projected": ["--coverage", "projected", "--choose-by-views=false"],
-        "mean placement": ["--preset", "strong", "--placement", "mean"],
+        "projected": ["--set", "coverage=projected", "--set", "choose_by_views=false"],
+        "mean placement": ["--preset", "strong", "--set", "placement=mean"],
     }
     for name, options in variants.items():
         yield f"{small.name} {name}", compress(small, *options, cameras=small), "small"
@@ -107,26 +107,26 @@ def cases(binary, data, scratch):
                    compress(demo / "scene.gseq", "--preset", preset, "--as", kind, cameras=rig), output)
         yield (f"demo stream {preset}",
                compress("-", "--preset", preset, cameras=rig,
-                        stdin=[binary, "unpack", demo / "scene.gseq", "--stream"]), "small.gseq")
+                        stdin=[binary, "convert", demo / "scene.gseq", "-"]), "small.gseq")
         yield f"demo frames {preset}", compress(frames, "--preset", preset, cameras=rig), "small"
         yield f"demo frames {preset} as gseq", compress(frames, "--preset", preset, cameras=rig), "small.gseq"
         yield f"demo ply {preset}", compress(one, "--preset", preset, cameras=rig), "small.ply"
         yield f"{small.name} container {preset}", compress(packed, "--preset", preset, cameras=small), "small.gseq"
-    for options in (["--prune-only"], ["--merge-only"], ["--target-ratio", "0.2"],
-                    ["--target-count", "900", "--preset", "strong"], ["--merge-only", "--preset", "strong"]):
+    for options in (["--prune-only"], ["--merge-only"], ["--ratio", "0.2"],
+                    ["--count", "900", "--preset", "strong"], ["--merge-only", "--preset", "strong"]):
         for what, source in (("container", demo / "scene.gseq"), ("frames", frames), ("ply", one)):
             output = "small.ply" if what == "ply" else "small.gseq" if what == "container" else "small"
             yield f"demo {what} {' '.join(options)}", compress(source, *options, cameras=rig), output
     yield "demo container without cameras", compress(demo / "scene.gseq"), "small.gseq"
     for path in sorted((data / "static").glob("*.ply")):
-        yield f"{path.stem} ratio 0.3", compress(path, "--target-ratio", "0.3"), "small.ply"
-        yield f"{path.stem} strong visible", compress(path, "--preset", "strong", "--coverage", "visible"), "small.ply"
+        yield f"{path.stem} ratio 0.3", compress(path, "--ratio", "0.3"), "small.ply"
+        yield f"{path.stem} strong visible", compress(path, "--preset", "strong", "--set", "coverage=visible"), "small.ply"
     yield "score npz", lambda out: run([binary, "score", small, "--cameras", small, "-o", out]), "rows.npz"
     yield "score csv paper", lambda out: run(
         [binary, "score", demo / "scene.gseq", "--cameras", rig, "--preset", "paper", "-o", out]), "rows.csv"
-    yield "pack", lambda out: run([binary, "pack", small, "--cameras", small, "-o", out]), "packed.gseq"
-    yield "pack raw", lambda out: run([binary, "pack", frames, "--raw", "-o", out]), "packed.gseq"
-    yield "unpack", lambda out: run([binary, "unpack", demo / "scene.gseq", "-o", out]), "frames"
+    yield "pack", lambda out: run([binary, "convert", small, out, "--cameras", small]), "packed.gseq"
+    yield "pack raw", lambda out: run([binary, "convert", frames, out, "--raw"]), "packed.gseq"
+    yield "unpack", lambda out: run([binary, "convert", demo / "scene.gseq", out, "--as", "ply-sequence"]), "frames"
     yield "render", lambda out: run(
         [binary, "render", small, "--cameras", small, "--frame", "7", "--view", "1", "-o", out]), "picture.npy"
     yield "render all", lambda out: run(

@@ -17,13 +17,13 @@ import time
 from pathlib import Path
 
 CASES = [
-    ["--target-ratio", "0.6"],
-    ["--target-ratio", "0.3"],
-    ["--target-ratio", "0.1"],
-    ["--target-ratio", "0.1", "--effort", "fast"],
-    ["--target-ratio", "0.5", "--no-refine"],
-    ["--target-ratio", "0.1", "--no-refine"],
-    ["--target-ratio", "0.3", "--preset", "paper"],
+    ["--ratio", "0.6"],
+    ["--ratio", "0.3"],
+    ["--ratio", "0.1"],
+    ["--ratio", "0.1", "--effort", "fast"],
+    ["--ratio", "0.5", "--no-refine"],
+    ["--ratio", "0.1", "--no-refine"],
+    ["--ratio", "0.3", "--preset", "paper"],
 ]
 
 

@@ -2,7 +2,7 @@
 """Streams any model given as arrays to standard output.
 
     python3 scripts/export_arrays.py model.npz | splatsieve compress - --cameras data -o small.gseq
-    python3 scripts/export_arrays.py folder_of_npy/ | splatsieve pack - -o scene.gseq
+    python3 scripts/export_arrays.py folder_of_npy/ | splatsieve convert - scene.gseq
 
 An .npz, or a folder of .npy files (mapped, not loaded), with these arrays; T frames, N Gaussians:
 

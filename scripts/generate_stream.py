@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Streams a made-up sequence of any size to standard output.
 
-    python3 scripts/generate_stream.py 200000 600 | splatsieve pack - -o big.gseq      # 200,000 Gaussians, 600 frames
+    python3 scripts/generate_stream.py 200000 600 | splatsieve convert - big.gseq      # 200,000 Gaussians, 600 frames
 
 The scene is a room of 4 x 4 x 2.5 units: floor, walls, eight bodies that move, faint dust, near-duplicates that merge.
 Every value of position, rotation, log_scale and opacity differs from frame to frame for every Gaussian, along a smooth

@@ -78,7 +78,7 @@ def pack_lives(binary, cut, times, out):
             held[name][life[new]] = column[new]
         seen[life] = True
     degree = round((held["sh"].shape[1] / 3) ** 0.5) - 1
-    command = [str(part) for part in (binary, "pack", "-", "-o", out, "--quiet")]
+    command = [str(part) for part in (binary, "convert", "-", out, "--quiet")]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL) as packing:
         with StreamWriter(packing.stdin, len(names), degree, {}) as stream:
             for frame, path in enumerate(paths):
@@ -102,7 +102,7 @@ def curve(binary, model, source, name, ratios, extra, scratch):
     points = []
     for ratio in ratios:
         out = scratch / "small.gseq"
-        compress = ["compress", source, "--cameras", model, "-o", out, "--target-ratio", ratio, "--force", "--json"]
+        compress = ["compress", source, "--cameras", model, "-o", out, "--ratio", ratio, "--overwrite", "--json"]
         summary = json.loads(run(binary, *compress, *extra))
         quality = json.loads(run(binary, "evaluate", model, out, "--cameras", model, "--max-frames", 15, "--json"))
         points.append((summary["gaussians"], gaussian_frames(out), quality["psnr"]))
@@ -149,8 +149,8 @@ def main():
         with tempfile.TemporaryDirectory() as folder:
             scratch = Path(folder)
             exact, frames, cut, lives = (scratch / name for name in ("exact.gseq", "frames", "cut", "lives.gseq"))
-            run(binary, "pack", model, "--cameras", model, "-o", exact)
-            run(binary, "unpack", exact, "-o", frames)
+            run(binary, "convert", model, exact, "--cameras", model)
+            run(binary, "convert", exact, frames, "--as", "ply-sequence")
             cutting = ["--lives", "4-12", "--noise", 0.02, "--jitter", 0.02, "--overlap", args.overlap]
             run(sys.executable, Path(__file__).parent / "cut_lives.py", frames, cut, *cutting)
             pack_lives(binary, cut, Gseq(str(exact)).times, lives)

@@ -57,7 +57,7 @@ def orbit(ply, path, pixels=300, focal=330):
 def point(binary, model, cameras, ratio, output, *options):
     start = time.monotonic()
     summary = run(
-        binary, "compress", model, "--cameras", cameras, "-o", output, "--target-ratio", ratio, "--json", *options
+        binary, "compress", model, "--cameras", cameras, "-o", output, "--ratio", ratio, "--json", *options
     )
     wall = time.monotonic() - start
     quality = evaluated(binary, model, output, cameras)
@@ -140,7 +140,7 @@ def rigs(binary, models, ratios):
             for ratio in ratios:
                 given, found = (Path(folder) / f"{model.stem}{ratio}{name}.ply" for name in ("given", "found"))
                 best = point(binary, model, cameras, ratio, given)["psnr"]
-                run(binary, "compress", model, "-o", found, "--target-ratio", ratio, "--json")
+                run(binary, "compress", model, "-o", found, "--ratio", ratio, "--json")
                 alone = evaluated(binary, model, found, cameras)["psnr"]
                 print(f"| {model.stem} | {100 * float(ratio):.0f}% | {best:.1f} | {alone:.1f} |", flush=True)
 

@@ -69,7 +69,7 @@ def pack(args, gaussians, frames, packed):
     generator = [sys.executable, Path(__file__).with_name("generate_stream.py"), gaussians, frames]
     generator += ["--sh-degree", args.sh_degree]
     with subprocess.Popen([str(part) for part in generator], stdout=subprocess.PIPE) as source:
-        command = [args.binary, "pack", "-", "-o", packed, *["--raw"][: args.raw], *memory(args.budgets[0])]
+        command = [args.binary, "convert", "-", packed, *["--raw"][: args.raw], *memory(args.budgets[0])]
         return measured(command, stdin=source.stdout)[1]
 
 

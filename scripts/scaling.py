@@ -57,25 +57,25 @@ def units(command):
 
 def in_parts(command, of, work, program):
     """Stage by stage the cost of every part of `of`, of one that has nothing to do, and bytes of pieces; and the rest."""
-    command = [*command, "--work", work]
+    command = [*command, "--cache", work]
     stages = []
     while True:
         parts, again = [], None
         for index in range(1, of + 1):
-            said, cost = measured([*command, "--part", f"{index}/{of}"])
+            said, cost = measured([*command, "--shard", f"{index}/{of}"])
             if "nothing to do" in said:
                 break
             parts.append(cost)
             if index == 1 < of:
                 # Done already: it opens the input and what earlier stages found, and ends.
-                again = measured([*command, "--part", f"1/{of}"])[1]
+                again = measured([*command, "--shard", f"1/{of}"])[1]
             name = said.split(":")[0]
         if not parts:
             break
         stages.append({"stage": name, "parts": parts, "again": again})
         print(f"{of} parts, {name}: {sum(part['processor'] for part in parts):.1f} s", file=sys.stderr, flush=True)
     printed, cost = measured([*command, "--json"])
-    pieces = json.loads(measured([program, "work", work, "--json"])[0])
+    pieces = json.loads(measured([program, "cache", work, "--json"])[0])
     for stage in stages:
         for kind, wanted in (("part_bytes", of), ("whole_bytes", 1)):
             stage[kind] = sum(piece["bytes"] for piece in pieces if (piece["stage"], piece["parts"]) == (stage["stage"], wanted))

@@ -64,7 +64,7 @@ def main():
         for output, how in zip(shown[1:], (["--no-refine", "--prune-only"], [])):
             run(
                 args.binary, "compress", args.model, "--cameras", args.model, "-o", output,
-                "--target-ratio", args.ratio, "--json", *how,
+                "--ratio", args.ratio, "--json", *how,
             )  # fmt: skip
         file = Path(folder) / "picture.npy"
         pictures = []

@@ -7,7 +7,7 @@
 DATA/<name>/ is a 4DGaussians model folder with its cameras inside; DATA/static/<name>.ply is a model without cameras, for
 which an orbit is made as refine_table.py does. Prints for each, by the part of the Gaussians that was kept, the mean PSNR
 of held-out pictures against the original's own, and bytes as a part of the original's files that a renderer opens: of the
-archive (.gsz, preset default); of what pruning alone leaves (--no-refine --prune-only --field exact), packed by
+archive (.gsz, preset default); of what pruning alone leaves (--no-refine --prune-only --set field=exact), packed by
 `zstd -19` if that program is there, else by xz of Python's own library, which packs about as tightly; and of static models
 what COMMAND, a splat-transform of PlayCanvas, makes of as many (.sog and .spz, decimated by itself). With --frames instead
 the archive of the model's frames as PLY files, which say nothing of what they follow from, as a part of those. Standard
@@ -49,10 +49,10 @@ def packed(path):
 def ours(binary, model, cameras, ratio, folder):
     """Method, what to compare, bytes, and files of the original: of the archive, and of pruning alone."""
     archive, pruned = folder / "small.gsz", folder / f"pruned{model.suffix}"
-    common = ["compress", model, "--cameras", cameras, "--target-ratio", ratio, "--json", "-o"]
+    common = ["compress", model, "--cameras", cameras, "--ratio", ratio, "--json", "-o"]
     run(binary, *common, archive)
     yield "archive (.gsz)", archive, size([archive]), files(model)
-    run(binary, *common, pruned, "--no-refine", "--prune-only", "--field", "exact")
+    run(binary, *common, pruned, "--no-refine", "--prune-only", "--set", "field=exact")
     packer = "zstd -19" if shutil.which("zstd") else "xz"
     yield f"pruned alone, {packer}", pruned, sum(map(packed, files(pruned))), files(model)
 
@@ -60,9 +60,9 @@ def ours(binary, model, cameras, ratio, folder):
 def of_frames(binary, model, cameras, ratio, folder):
     """The same of the archive of a model's frames, whose files are the original."""
     packed, frames, archive = folder / "all.gseq", folder / "frames", folder / "frames.gsz"
-    for words in [["pack", model, "--cameras", cameras, "-o", packed], ["unpack", packed, "-o", frames]]:
+    for words in [["convert", model, packed, "--cameras", cameras], ["convert", packed, frames, "--as", "ply-sequence"]]:
         subprocess.run([binary, *words], check=True, capture_output=True)
-    run(binary, "compress", frames, "--cameras", cameras, "--target-ratio", ratio, "--json", "-o", archive)
+    run(binary, "compress", frames, "--cameras", cameras, "--ratio", ratio, "--json", "-o", archive)
     yield "of PLY frames (.gsz)", archive, size([archive]), sorted(frames.glob("*.ply"))
 
 

@@ -4,7 +4,7 @@
     python3 scripts/split_model.py MODEL FOLDER [--side 3] [--frames 30] [--views 18] [--size 1352x1014]
     python3 scripts/split_model.py MODEL FOLDER --compare target/release/splatsieve   # README's figures of refining it
     python3 scripts/split_model.py MODEL FOLDER --row target/release/splatsieve [OPTION ...]   # a row of README's table
-    python3 scripts/split_model.py MODEL FOLDER --row target/release/splatsieve --look-pictures 0   # having looked at all
+    python3 scripts/split_model.py MODEL FOLDER --row target/release/splatsieve --set look_pictures=0   # having looked at all
 
 They stand in a grid of SIDE x SIDE along a Gaussian's two longest axes (of nine a standard deviation apart, √⅓ as wide along
 these): mass and variance stay. FOLDER gets its views at every frame: the model's own, of which those of
@@ -119,7 +119,7 @@ def compare(binary, folder):
         for name, options in (("pruned", ["--no-refine", "--prune-only"]), ("refined", [])):
             output = Path(results) / name
             summary = run(
-                binary, "compress", folder, "--cameras", folder, "-o", output, "--target-ratio", 0.2,
+                binary, "compress", folder, "--cameras", folder, "-o", output, "--ratio", 0.2,
                 "--memory", "1GiB", "--json", *options,
             )  # fmt: skip
             seconds = sum(stage["seconds"] for stage in summary["stages"])
@@ -131,7 +131,7 @@ def row(binary, folder, options):
     with tempfile.TemporaryDirectory(dir=folder.parent) as results:
         output = Path(results) / "small"
         summary = run(
-            binary, "compress", folder, "--cameras", folder, "-o", output, "--target-ratio", 0.3, "--no-refine", "--json", *options
+            binary, "compress", folder, "--cameras", folder, "-o", output, "--ratio", 0.3, "--no-refine", "--json", *options
         )  # fmt: skip
         psnr = evaluated(binary, folder, output, folder)["psnr"]
     stages = summary["stages"]

@@ -57,6 +57,8 @@ pub enum Message<'a> {
     /// Part of the memory plan or the forecast of a run: lines of text. Sent if [`crate::memory_plan::Budget::tell`] asks
     /// for it.
     Plan(&'a str),
+    /// Something that the user should change before the run goes on, such as missing cameras.
+    Warning(&'a str),
     /// The result of a stage is discarded.
     Discarded {
         /// Name of the stage.

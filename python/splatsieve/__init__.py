@@ -55,7 +55,7 @@ def stream(
     sh_degree: int,
     constant: Mapping[str, ArrayLike] | None = None,
     *,
-    verb: str = "compress",
+    command: str = "compress",
     log: Log | None = None,
     **options: Option,
 ) -> Stream:
@@ -66,13 +66,13 @@ def stream(
     name, the others come with every frame: position [N, 3]; rotation [N, 4], wxyz; log_scale [N, 3], natural logs;
     opacity_logit [N] or [N, 1]; sh [N, (d+1)^2, 3]. Where the block ends the program goes on to the end of its work, and
     `summary` of `compress` is there; where the block raises, the program is told that the stream broke off, and writes
-    nothing. `verb` may be "pack". Options are those of `compress`.
+    nothing. `command` may be "convert". Options are those of `compress`.
 
     Raises Error with the program's message, also from `frame` once the program has ended.
     """
     from ._stream import Stream
 
-    return Stream(output, count, sh_degree, constant, verb=verb, log=log, options=options)
+    return Stream(output, count, sh_degree, constant, command=command, log=log, options=options)
 
 
 def __getattr__(name: str) -> Any:

@@ -20,7 +20,7 @@ Log = Callable[[str], object]
 
 # Options that take no value at all; the others that are True or False take `=true` and `=false`.
 SWITCHES = frozenset(
-    "all clean dry_run explain flip force json list_stages merge_only no_refine overwrite prune_only quiet raw stream".split()
+    "all check clean dry_run explain flip json list_stages merge_only no_refine overwrite prune_only quiet raw".split()
 )
 
 
@@ -49,7 +49,8 @@ def program() -> str:
 
 
 def flags(options: Mapping[str, Option]) -> list[str]:
-    """Options as the command line has them: `dry_run=True` is `--dry-run`, `keep_box=(0, 1)` is `--keep-box=0,1`."""
+    """Returns options as words of a command line: `dry_run=True` is `--dry-run`, `keep_box=(0, 1)` is `--keep-box=0,1`,
+    `set={"mu": 2}` is `--set=mu=2`."""
     words = []
     for key, value in options.items():
         flag = "--" + key.rstrip("_").replace("_", "-")
@@ -57,6 +58,8 @@ def flags(options: Mapping[str, Option]) -> list[str]:
             continue
         if value is True and key in SWITCHES:
             words.append(flag)
+        elif key == "set" and isinstance(value, Mapping):
+            words += [f"{flag}={name}={text(one)}" for name, one in value.items()]
         elif isinstance(value, (list, tuple)) and value and all(isinstance(one, (list, tuple)) for one in value):
             words += [f"{flag}={text(one)}" for one in value]
         else:
@@ -134,9 +137,9 @@ def message(said: str) -> str:
 
 
 def run(verb: str, *arguments: str | os.PathLike[str], log: Log | None = None, **options: Option) -> str:
-    """Runs any verb of the program with any of its options; gives what it printed to standard output.
+    """Runs any command of the program with any of its options; gives what it printed to standard output.
 
-        splatsieve.run("pack", "frames/", output="scene.gseq", max_error={"position": 1e-3})
+        splatsieve.run("convert", "frames/", "scene.gseq", max_error={"position": 1e-3})
 
     `log` is called with every line about its progress. Raises Error.
     """
@@ -148,7 +151,7 @@ def parsed(printed: str) -> dict[str, Any]:
     try:
         found = json.loads(printed)
     except ValueError:
-        # `--part` and the like print a line instead.
+        # `--shard` and the like print a line instead.
         raise Error(f"no table came back (use splatsieve.run): {printed.strip()}", 0) from None
     return dict(found)
 
@@ -159,7 +162,7 @@ def compress(
     """Writes a smaller model of `input` to `output`; gives its summary (format/SUMMARY.md),
     which lies beside it as JSON with the list of its files.
 
-        splatsieve.compress("model", "small", cameras="data", target_ratio=0.3, preset="default")
+        splatsieve.compress("model", "small", cameras="data", ratio=0.3, preset="default")
 
     Options are those of `splatsieve compress --help`. Raises Error.
     """

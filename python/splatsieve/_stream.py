@@ -72,7 +72,7 @@ def planes(column: ArrayLike) -> bytes:
 class Stream:
     """What `splatsieve.stream` gives: the program, with a frame stream going in."""
 
-    # What `compress` wrote into its summary; None before the block has ended, and of other verbs.
+    # What `compress` wrote into its summary; None before the block has ended, and of other commands.
     summary: dict[str, Any] | None = None
 
     def __init__(
@@ -82,15 +82,15 @@ class Stream:
         sh_degree: int,
         constant: Mapping[str, ArrayLike] | None = None,
         *,
-        verb: str = "compress",
+        command: str = "compress",
         log: Log | None = None,
         options: Mapping[str, Option] | None = None,
     ) -> None:
-        options = {"output": output, **(options or {})} | ({"json": True} if verb == "compress" else {})
-        words = [verb, *flags(options), "--", "-"]
+        options = {"output": output, **(options or {})} | ({"json": True} if command == "compress" else {})
+        words = [command, *flags(options), "--", "-"]
         self.words, self.log = words, log
         self.shape = (count, sh_degree, {name: np.asarray(column) for name, column in (constant or {}).items()})
-        self.reads = verb == "compress"
+        self.reads = command == "compress"
 
     def __enter__(self) -> Stream:
         self.running = Running(self.words, self.log, stdin=subprocess.PIPE)

@@ -63,7 +63,7 @@ class Installed(unittest.TestCase):
     def test_compress_gives_the_summary_that_lies_beside_the_result(self):
         lines = []
         summary = splatsieve.compress(
-            self.at / "demo" / "scene.gseq", self.at / "half.gseq", target_ratio=0.5, refine_steps=2, log=lines.append
+            self.at / "demo" / "scene.gseq", self.at / "half.gseq", ratio=0.5, set={"refine_steps": 2}, log=lines.append
         )
         written = json.loads((self.at / "half.gseq.summary.json").read_text())
         self.assertIn("half.gseq", written.pop("files"))
@@ -98,7 +98,7 @@ class Installed(unittest.TestCase):
     def test_frames_streamed_into_a_container_are_read_back_to_the_bit(self):
         columns = self.columns(300)
         position = columns.pop("position")
-        with splatsieve.stream(self.at / "s.gseq", 300, 0, columns, verb="pack") as out:
+        with splatsieve.stream(self.at / "s.gseq", 300, 0, columns, command="convert") as out:
             for frame in range(5):
                 out.frame(frame / 4, {"position": position + np.float32(frame)})
         scene = splatsieve.read_gseq(str(self.at / "s.gseq"))
@@ -117,14 +117,14 @@ class Installed(unittest.TestCase):
 
     def test_an_exporter_that_fails_leaves_no_file_and_its_own_error(self):
         with self.assertRaisesRegex(ZeroDivisionError, "exporter"):
-            with splatsieve.stream(self.at / "f.gseq", 200, 0, self.columns(200), verb="pack") as out:
+            with splatsieve.stream(self.at / "f.gseq", 200, 0, self.columns(200), command="convert") as out:
                 out.frame(0.0, {})
                 raise ZeroDivisionError("exporter")
         self.assertFalse((self.at / "f.gseq").exists())
 
     def test_what_the_program_refuses_of_a_stream_is_raised(self):
         with self.assertRaisesRegex(splatsieve.Error, "frame 1.*above 1"):
-            with splatsieve.stream(self.at / "t.gseq", 200, 0, self.columns(200), verb="pack") as out:
+            with splatsieve.stream(self.at / "t.gseq", 200, 0, self.columns(200), command="convert") as out:
                 out.frame(1.0, {})
                 for _ in range(1000):
                     out.frame(0.5, {})
@@ -142,9 +142,9 @@ class Installed(unittest.TestCase):
 
     def test_options_become_words_of_the_command_line(self):
         words = _program.flags({"as_": "ply", "overwrite": False, "dry_run": True, "choose_by_views": False, "cameras": None})
-        self.assertEqual(words, ["--as=ply", "--dry-run", "--choose-by-views=false"])
+        self.assertEqual(words, ["--as=ply", "--dry-run", "--set choose_by_views=false"])
         words = _program.flags({"keep_box": (-1, 0, 1.5), "max_error": {"position": 1e-3}, "merge_pass": [(1, 2), (3, 4)]})
-        self.assertEqual(words, ["--keep-box=-1,0,1.5", "--max-error=position=0.001", "--merge-pass=1,2", "--merge-pass=3,4"])
+        self.assertEqual(words, ["--keep-box=-1,0,1.5", "--max-error=position=0.001", "--set passes=1,2", "--set passes=3,4"])
 
 
 if __name__ == "__main__":

@@ -2,9 +2,9 @@
 """Prints, or submits, the Slurm jobs that compress one long scene: an array for every stage that can be divided, each
 when the one before is done, and a job for the rest.
 
-    scripts/slurm/long_scene.py --parts 8 --work WORK -- MODEL --cameras DATA -o SMALL            # prints the commands
-    scripts/slurm/long_scene.py --parts 8 --work WORK --submit --partition=short --time=1:00:00 --cpus-per-task=4 \\
-        --mem=8G -- MODEL --cameras DATA -o SMALL --target-ratio 0.3
+    scripts/slurm/long_scene.py --parts 8 --cache CACHE -- MODEL --cameras DATA -o SMALL            # prints the commands
+    scripts/slurm/long_scene.py --parts 8 --cache CACHE --submit --partition=short --time=1:00:00 --cpus-per-task=4 \\
+        --mem=8G -- MODEL --cameras DATA -o SMALL --ratio 0.3
 
 Options that it does not know are handed to every sbatch; behind -- stands what `splatsieve compress` takes. Paths are as
 from the folder it is called in, which must be the same folder, with the same files, on all nodes. A task that is
@@ -39,7 +39,7 @@ def quoted(words):
 
 
 def stages(compress):
-    """Stages that --part divides."""
+    """Stages that --shard divides."""
     listed = subprocess.run([*compress, "--list-stages"], stdout=subprocess.PIPE, text=True, check=False)
     if listed.returncode != 0:
         sys.exit(listed.returncode)
@@ -50,7 +50,7 @@ def lines(args, sbatch, compress):
     """A script that submits it all and prints the number of the last job."""
     common = ["sbatch", *OPTIONS, f"--chdir={os.getcwd()}", *sbatch]
     names = stages(compress)[: args.arrays]
-    compress = [*compress, "--work", args.work]
+    compress = [*compress, "--cache", args.cache]
     # What the job has, unless its user says otherwise.
     for option, value in (("--threads", "@THREADS@"), ("--memory", "@MEMORY@")):
         if not any(word.split("=")[0] == option for word in compress):
@@ -60,7 +60,7 @@ def lines(args, sbatch, compress):
     after = ""
     for number, name in enumerate(names):
         words = [*common, f"--job-name={args.name}-{name}", f"--output={args.logs}/%x.%A_%a.log", f"--array=1-{args.parts}"]
-        part = [TASK, *compress, "--part", f"@TASK@/{args.parts}"]
+        part = [TASK, *compress, "--shard", f"@TASK@/{args.parts}"]
         yield f"job{number}=$({quoted(words)}{after} {quoted(part)})"
         # --parsable prints JOB or JOB;CLUSTER.
         after = f' "--dependency=afterok:${{job{number}%%;*}}"'
@@ -71,7 +71,7 @@ def lines(args, sbatch, compress):
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False)
     parser.add_argument("--parts", type=int, required=True, help="tasks of every array")
-    parser.add_argument("--work", required=True, help="work folder, on a file system that all nodes share")
+    parser.add_argument("--cache", required=True, help="cache folder, on a file system that all nodes share")
     parser.add_argument("--submit", action="store_true", help="submit the jobs; print the number of the last one")
     parser.add_argument("--arrays", type=int, help="at most so many arrays before the last job [default: one a stage]")
     parser.add_argument("--name", default="splatsieve", help="first word of the jobs' names [default: splatsieve]")
@@ -83,9 +83,9 @@ def main():
     compress = words[cut + 1 :]
     if not compress or args.parts < 1:
         parser.error("expected at least one part and, behind --, what splatsieve compress takes")
-    if taken := [word for word in compress if word.split("=")[0] in ("--work", "--part", "--list-stages", "--dry-run")]:
+    if taken := [word for word in compress if word.split("=")[0] in ("--cache", "--shard", "--list-stages", "--dry-run")]:
         parser.error(f"{taken[0]} is this script's own")
-    args.work, args.logs = os.path.abspath(args.work), os.path.abspath(args.logs or args.work.rstrip("/") + ".logs")
+    args.cache, args.logs = os.path.abspath(args.cache), os.path.abspath(args.logs or args.cache.rstrip("/") + ".logs")
     script = "\n".join(lines(args, sbatch, [found(args.program), "compress", *compress])) + "\n"
     if not args.submit:
         print(script, end="")

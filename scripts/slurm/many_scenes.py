@@ -117,7 +117,7 @@ def compress(folder, run, scene):
     """The command of a scene."""
     source, cameras, output, *options = scene["words"]
     cameras = [] if cameras == "-" else ["--cameras", cameras]
-    return [run["program"], "compress", source, *cameras, "-o", output, *options, "--work", str(folder / "work" / scene["name"])]
+    return [run["program"], "compress", source, *cameras, "-o", output, *options, "--cache", str(folder / "work" / scene["name"])]
 
 
 def task(folder, number, threads, memory):
@@ -142,7 +142,7 @@ def task(folder, number, threads, memory):
         if value and not any(word.split("=")[0] == option for word in options):
             command += [option, value]
     command += ["--json"] if "--json" not in options else []
-    if ours and record["starts"] > 1 and not {"--overwrite", "--force"} & set(options):
+    if ours and record["starts"] > 1 and "--overwrite" not in options:
         command.append("--overwrite")
 
     begun, heard = time.monotonic(), []
@@ -169,7 +169,7 @@ def task(folder, number, threads, memory):
     printed.unlink()
     write(record_path, record)
     if status == 0 and not run["keep_work"]:
-        clean = [run["program"], "work", folder / "work" / scene["name"], "--clean", "--quiet"]
+        clean = [run["program"], "cache", folder / "work" / scene["name"], "--clean", "--quiet"]
         subprocess.run(clean, check=False, stdout=subprocess.DEVNULL)
     return status
 

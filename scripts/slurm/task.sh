@@ -2,7 +2,7 @@
 # A job or a task of an array: runs a command, hands SIGTERM on to it, and puts itself back into the queue when the
 # command ends with 143, as splatsieve does when it is told to end.
 #
-#     sbatch --requeue --signal=B:TERM@60 --array=1-8 task.sh splatsieve compress ... --part @TASK@/8 --threads=@THREADS@
+#     sbatch --requeue --signal=B:TERM@60 --array=1-8 task.sh splatsieve compress ... --shard @TASK@/8 --threads=@THREADS@
 #
 # Of the command's words these are replaced; a word of which nobody knows the value is left out:
 #     @TASK@     number of the task

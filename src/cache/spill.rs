@@ -79,7 +79,7 @@ impl SpillWriter {
 
     /// An empty one that gets the name `target` at its end.
     pub(super) fn named(target: &Path, key: u128, about: &str) -> Result<SpillWriter> {
-        let staged = StagedFile::new(target, Replace::Any)?;
+        let staged = StagedFile::new(target, Replace::Existing)?;
         let file = File::options().read(true).write(true).create_new(true).open(staged.path());
         let file = file.map_err(Error::io("create", target))?;
         let writer = EntryWriter::new(file, key, about).map_err(Error::io("write", target))?;

@@ -1,299 +1,103 @@
-//! The command line, declared.
+//! Declaration of the command line: commands and their options.
+
+mod shared;
+mod study;
+mod values;
 
 use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 
-use super::recipe_flags::{RecipeFlags, numbers};
-use splatsieve::cache::Shard;
-use splatsieve::diagnostics::precision::Turned;
-use splatsieve::error::quoted;
-use splatsieve::evaluation::method::Method;
-use splatsieve::files::atomic::Replace;
-use splatsieve::files::cameras::Times;
-use splatsieve::models::Link;
+pub(super) use self::shared::{
+    CacheArgs, CameraFile, Cameras, Earlier, Input, LinkArg, Memory, Rot4d, SplitArg, Trained, ZeroRotationArg,
+};
+pub(super) use self::study::{PrecisionArgs, Sweep};
+use self::values::{parse_box, parse_bytes, parse_color, parse_decibels, parse_ratio};
+use super::recipe_flags::RecipeFlags;
 use splatsieve::outputs::bounds::MaxError;
 
-/// Headings of groups of options.
+/// Headings of the groups of options in the help.
 const CAMERAS: &str = "Cameras";
 const HOW_SMALL: &str = "How small";
-const WHAT_STAYS: &str = "What stays";
+const WHAT_STAYS: &str = "What is kept";
 const MACHINE: &str = "Machine";
-const IN_PARTS: &str = "Work that is kept and shared";
+const CACHE: &str = "Resuming and sharing a run";
 
-/// Shrinks trained dynamic (4D) Gaussian-splatting models after training: no retraining, the same renderers open the result
+/// Makes trained dynamic (4D) Gaussian-splatting models much smaller. Needs no GPU and no training code; your renderer opens the result
 #[derive(Debug, Parser)]
 #[command(name = "splatsieve", version, about, max_term_width = 110)]
 pub(super) struct Cli {
-    /// What to do.
+    /// Command to run.
     #[command(subcommand)]
-    pub(super) verb: Verb,
-    /// Threads to work on; the result does not depend on it [default: all]
+    pub(super) command: CommandArgs,
+    /// Number of threads; does not change the result [default: all cores]
     #[arg(long, global = true, help_heading = MACHINE, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
     pub(super) threads: Option<u16>,
-    /// Show no progress: no bars on a terminal, no lines in a log
+    /// Show no progress
     #[arg(long, global = true, help_heading = MACHINE)]
     pub(super) quiet: bool,
 }
 
-/// The verbs.
+/// The commands.
 #[derive(Debug, Subcommand)]
-pub(super) enum Verb {
-    /// Write a smaller model that the same renderer opens
+pub(super) enum CommandArgs {
+    /// Write a smaller model that your renderer opens
     Compress(Box<Compress>),
-    /// Write the statistics and scores of every Gaussian as .npz or .csv
+    /// Write statistics and scores of every Gaussian as .npz or .csv
     Score(ScoreArgs),
-    /// Render an input as its cameras see it, into PNG or float32 NPY files
+    /// Render views to PNG or NPY files, or a video
     Render(Render),
-    /// Compare the pictures of two models: PSNR, SSIM, FLIP and the error of what moves
+    /// Compare a compressed model with its original on test views: PSNR, SSIM, FLIP, temporal error
     Evaluate(Evaluate),
-    /// Trade-off curves: quality, size, time and memory of every method at every kept fraction
+    /// Measure quality, size, time and memory of several methods at several fractions
     Sweep(Sweep),
-    /// Work-precision diagrams: what every knob of a run costs, and what error it leaves
+    /// Measure error against run time for the settings of each stage
     Precision(PrecisionArgs),
-    /// Write a page that shows what compression cost: pictures, curves, failure modes
+    /// Write an HTML page that shows what compression lost: renders, plots, worst views
     Report(ReportArgs),
-    /// Write a page that plays a scene in any browser: one model, or the original and the compressed one side by side
+    /// Write an HTML page that plays a model in any browser, or two models side by side
     View(ViewArgs),
-    /// Write an input as another kind of file: for a viewer, a player, another program
+    /// Write an input in another format, with all its Gaussians: for a viewer, a player, another program
     Convert(Convert),
-    /// Pack any input into a .gseq container
-    Pack(Pack),
-    /// Say what an input holds
+    /// Print what an input holds; check or repair a .gseq container
     Info(InfoArgs),
-    /// Check every byte of a .gseq container
-    Verify(Verify),
-    /// Write the model in an archive; of other inputs the frames, as PLY files or a stream
-    Unpack(Unpack),
-    /// Save the complete frames of a .gseq container that was cut short
-    Recover(Recover),
-    /// Say what is in a work folder, or remove it
-    Work(WorkArgs),
-    /// Generate a small dynamic scene, compress it, say what happened
+    /// List what a cache folder holds, or remove it
+    Cache(CacheFolder),
+    /// Make a small scene, compress it, and show the result
     Demo(Demo),
-    /// Check the numbers of this program on this machine; takes no files
+    /// Check the numerics of this program on this machine
     Selfcheck(Selfcheck),
-    /// Print a recipe file with every parameter documented
-    Recipe(RecipeVerb),
+    /// Print a recipe file with all parameters
+    Recipe(RecipeArgs),
     /// Print a completion script for a shell
     Completions(Completions),
-    /// Write manual pages of the program and of every verb
+    /// Write manual pages
     Man(Man),
 }
 
-impl Verb {
-    /// Whether it is to say what memory it takes. A sweep's table does, run by run.
+impl CommandArgs {
+    /// Returns whether `--explain` was given.
     pub(super) fn explains(&self) -> bool {
         match self {
-            Verb::Compress(args) => args.input.memory.explain,
-            Verb::Score(ScoreArgs { input, .. })
-            | Verb::Render(Render { input, .. })
-            | Verb::View(ViewArgs { input, .. })
-            | Verb::Convert(Convert { input, .. })
-            | Verb::Pack(Pack { input, .. })
-            | Verb::Info(InfoArgs { input, .. })
-            | Verb::Unpack(Unpack { input, .. }) => input.memory.explain,
-            Verb::Evaluate(Evaluate { models, .. }) | Verb::Report(ReportArgs { models, .. }) => models.memory.explain,
-            Verb::Demo(Demo { memory, .. }) => memory.explain,
-            Verb::Sweep(_)
-            | Verb::Precision(_)
-            | Verb::Verify(_)
-            | Verb::Recover(_)
-            | Verb::Work(_)
-            | Verb::Selfcheck(_)
-            | Verb::Recipe(_)
-            | Verb::Completions(_)
-            | Verb::Man(_) => false,
+            CommandArgs::Compress(args) => args.input.memory.explain,
+            CommandArgs::Score(ScoreArgs { input, .. })
+            | CommandArgs::Render(Render { input, .. })
+            | CommandArgs::View(ViewArgs { input, .. })
+            | CommandArgs::Convert(Convert { input, .. })
+            | CommandArgs::Info(InfoArgs { input, .. }) => input.memory.explain,
+            CommandArgs::Evaluate(Evaluate { models, .. }) | CommandArgs::Report(ReportArgs { models, .. }) => {
+                models.memory.explain
+            }
+            CommandArgs::Demo(Demo { memory, .. }) => memory.explain,
+            CommandArgs::Sweep(_)
+            | CommandArgs::Precision(_)
+            | CommandArgs::Cache(_)
+            | CommandArgs::Selfcheck(_)
+            | CommandArgs::Recipe(_)
+            | CommandArgs::Completions(_)
+            | CommandArgs::Man(_) => false,
         }
     }
-}
-
-/// What to read.
-#[derive(Debug, Args)]
-pub(super) struct Input {
-    /// Model folder or checkpoint of any family (README, Formats), folder of PLY frames, one .ply, .splatv, .gsz, .gseq,
-    /// or - for a frame stream on standard input
-    pub(super) input: PathBuf,
-    /// Training iteration of a model folder [default: the largest]
-    #[arg(long, value_name = "K", hide_short_help = true)]
-    pub(super) iteration: Option<u32>,
-    #[command(flatten)]
-    pub(super) trained: Trained,
-    /// Take a folder of PLY frames with a gap in its numbers, or with entries that are no files, as it is
-    #[arg(long, hide_short_help = true)]
-    pub(super) allow_gaps: bool,
-    /// Whether to find out which Gaussian of a folder's frames is which: where they differ in number, or their order does
-    /// not tell, `always` (and so of a container or stream, whose lives may be short), or `never`; `apart`: always, and
-    /// neither are lives joined that seem to be one, nor is held what hardly changes along them [default: auto]
-    #[arg(long, hide_short_help = true)]
-    pub(super) link: Option<LinkArg>,
-    /// Folder for scratch files while the run lasts: the packed frames of a stream or of linked frames, what does not fit
-    /// into --memory [default: that of the output, else the system's]
-    #[arg(long, value_name = "FOLDER", help_heading = MACHINE, hide_short_help = true)]
-    pub(super) scratch_dir: Option<PathBuf>,
-    #[command(flatten)]
-    pub(super) memory: Memory,
-}
-
-/// What a model's files do not say of how it was trained.
-#[derive(Debug, Args)]
-pub(super) struct Trained {
-    /// Length of a 4D Gaussian Splatting checkpoint's time_duration, or both its ends A,B [default: that in a YAML
-    /// beside it, else 10 where frames lie beyond 1, else 1]
-    #[arg(long, value_name = "L", hide_short_help = true, value_parser = parse_duration, allow_hyphen_values = true)]
-    pub(super) time_duration: Option<f64>,
-    /// How its rotations of four dimensions are written: unflipped before 15 September 2024 [default: flipped]
-    #[arg(long, value_name = "HOW", hide_short_help = true)]
-    pub(super) rot4d: Option<Rot4d>,
-    /// What becomes of Gaussians of a .splatv whose quaternion is zero, which no player draws [default: drop]
-    #[arg(long, value_name = "HOW", hide_short_help = true)]
-    pub(super) zero_rotation: Option<ZeroRotationArg>,
-}
-
-/// What becomes of zero quaternions of a .splatv.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub(super) enum ZeroRotationArg {
-    /// They are left out
-    Drop,
-    /// They are kept without a rotation
-    Identity,
-}
-
-/// How rotations of four dimensions are written.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub(super) enum Rot4d {
-    /// With the order of both axes reversed
-    Flipped,
-    /// As the product of both quaternions
-    Unflipped,
-}
-
-/// A length, or the ends of a span.
-fn parse_duration(text: &str) -> Result<f64, String> {
-    let numbers: Result<Vec<f64>, _> = text.split(',').map(|part| part.trim().parse::<f64>()).collect();
-    let length = match numbers.as_deref() {
-        Ok(&[length]) => length,
-        Ok(&[start, end]) => end - start,
-        _ => return Err("expected a length such as 10, or two times such as 0,10".to_owned()),
-    };
-    let is_length = length.is_finite() && length > 0.0;
-    is_length.then_some(length).ok_or_else(|| format!("expected a length above 0, found {length}"))
-}
-
-/// Where results of stages stay, so that a run goes on where another was cut short, and several runs share the work.
-#[derive(Debug, Args)]
-pub(super) struct CacheArgs {
-    /// Keep what stages find in this folder: a run that was cut short goes on from there
-    #[arg(long, help_heading = IN_PARTS, value_name = "FOLDER")]
-    pub(super) work: Option<PathBuf>,
-    /// Compute part I of N of the next stage that can be divided, in the work folder, and nothing else; a run without
-    /// this joins them and does the rest
-    #[arg(long, help_heading = IN_PARTS, value_name = "I/N", requires = "work", hide_short_help = true)]
-    pub(super) part: Option<Shard>,
-}
-
-/// What to do with what has the output's name.
-#[derive(Debug, Args)]
-pub(super) struct Earlier {
-    /// Replace an earlier result of splatsieve; files in its folder that are not its own stay
-    #[arg(long)]
-    pub(super) overwrite: bool,
-    /// Replace whatever is there, a folder with everything in it
-    #[arg(long)]
-    pub(super) force: bool,
-}
-
-impl Earlier {
-    pub(super) fn replace(&self) -> Replace {
-        match (self.force, self.overwrite) {
-            (true, _) => Replace::Any,
-            (false, true) => Replace::Ours,
-            (false, false) => Replace::Never,
-        }
-    }
-}
-
-/// How much memory to take.
-#[derive(Debug, Args)]
-pub(super) struct Memory {
-    /// Most memory to take, such as 512MiB or 4GB [default: a quarter of the machine's]
-    ///
-    /// The result does not depend on it, but that nothing is refined where that takes more, which the summary says.
-    #[arg(long, help_heading = MACHINE, value_name = "SIZE", value_parser = parse_bytes)]
-    pub(super) memory: Option<u64>,
-    /// Say, before any work, what will take how much memory and time
-    ///
-    /// And how often the frames are read; at the end, what was taken.
-    #[arg(long, help_heading = MACHINE)]
-    pub(super) explain: bool,
-}
-
-/// The file of the cameras.
-#[derive(Debug, Args)]
-pub(super) struct CameraFile {
-    /// transforms*.json, cameras.json, poses_bounds.npy, a COLMAP reconstruction, dataset.json of NeRFies and HyperNeRF, or
-    /// a folder with one; a file stands for itself alone, a folder for all its splits [default: beside the model's
-    /// data if cfg_args names it, else a virtual rig]
-    #[arg(long, help_heading = CAMERAS, value_name = "PATH")]
-    pub(super) cameras: Option<PathBuf>,
-    /// Number of frames of a model that is continuous in time, evenly spaced [default: the cameras' times]
-    #[arg(long, help_heading = CAMERAS, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
-    pub(super) frames: Option<u32>,
-    /// Picture size where the cameras name none; pictures of COLMAP, NeRFies and LLFF are scaled to it
-    #[arg(long, help_heading = CAMERAS, value_name = "WxH", value_parser = parse_size)]
-    pub(super) size: Option<(u32, u32)>,
-    /// When pictures of COLMAP, or of a cameras.json without times, were taken: `names`, by the numbers in their names;
-    /// `none`, every picture shows every frame; or a CSV table of name,time [default: names of COLMAP where all have
-    /// numbers and the input is no still scene, else none]
-    #[arg(long, help_heading = CAMERAS, hide_short_help = true, value_name = "names|none|FILE", value_parser = parse_times)]
-    pub(super) times: Option<Times>,
-}
-
-/// From where to look.
-#[derive(Debug, Args)]
-pub(super) struct Cameras {
-    #[command(flatten)]
-    pub(super) file: CameraFile,
-    /// Which of the cameras' pictures to score with [default: train]
-    #[arg(long, value_enum, help_heading = CAMERAS)]
-    pub(super) split: Option<SplitArg>,
-}
-
-/// Whether frames are linked.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub(super) enum LinkArg {
-    /// Where they differ in number, or their order does not tell which Gaussian is which
-    Auto,
-    /// Whatever their order tells, or a container or stream
-    Always,
-    /// Whatever their order tells; lives that seem to be one stay apart, and what hardly changes is not held
-    Apart,
-    /// The same place means the same Gaussian
-    Never,
-}
-
-impl From<LinkArg> for Link {
-    fn from(given: LinkArg) -> Link {
-        match given {
-            LinkArg::Auto => Link::Auto,
-            LinkArg::Always => Link::Always,
-            LinkArg::Apart => Link::Apart,
-            LinkArg::Never => Link::Never,
-        }
-    }
-}
-
-/// A part of a data set.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub(super) enum SplitArg {
-    /// Pictures the model was trained on
-    Train,
-    /// Pictures held out while it was trained (transforms_val.json)
-    Val,
-    /// Held-out pictures
-    Test,
-    /// All of them
-    All,
 }
 
 /// `compress`
@@ -301,88 +105,86 @@ pub(super) enum SplitArg {
 pub(super) struct Compress {
     #[command(flatten)]
     pub(super) cameras: Cameras,
-    /// Where to write: a folder, NAME.gsz, .gseq, .ply, .splatv, .4dgs or .spz
+    /// Output: a folder (same format as the input), NAME.gsz (archive, smallest), .gseq, .ply, .splatv, .4dgs or .spz
     #[arg(short, long, value_name = "PATH")]
     pub(super) output: PathBuf,
-    /// What to write [default: by the output's name; a folder is of the input's own kind]
-    #[arg(long = "as", value_enum, value_name = "KIND")]
+    /// Format of the output [default: by its name]
+    #[arg(long = "as", value_enum, value_name = "FORMAT")]
     pub(super) kind: Option<OutputKindArg>,
-    /// How close the pictures of an archive (NAME.gsz) are to be to those of the result before its values were put on
-    /// grids, or within bounds: mean PSNR, such as 45dB [default: 9 dB above the result's own, which costs half a
-    /// decibel; 50dB where that is closer]
+    /// PSNR of an archive (NAME.gsz) against the result before quantization, such as 45dB [default: 9 dB above the PSNR of the result
+    /// against the original, which costs about 0.5 dB; at most 50dB]
     #[arg(long, value_name = "DB", help_heading = HOW_SMALL, hide_short_help = true, value_parser = parse_decibels)]
     pub(super) archive_psnr: Option<f64>,
     #[command(flatten)]
     pub(super) size: OutputSize,
-    /// Prune, do not merge
+    /// Prune, but do not merge
     #[arg(long, help_heading = WHAT_STAYS, hide_short_help = true, conflicts_with = "merge_only")]
     pub(super) prune_only: bool,
-    /// Merge, do not prune
+    /// Merge, but do not prune
     #[arg(long, help_heading = WHAT_STAYS, hide_short_help = true)]
     pub(super) merge_only: bool,
     #[command(flatten)]
     pub(super) overrides: OverrideArgs,
-    /// Say what would be done, what it would take and what would be written, in seconds; write nothing
+    /// Check everything and print the plan, time and memory; write nothing
     #[arg(long)]
     pub(super) dry_run: bool,
     #[command(flatten)]
     pub(super) kept: CacheArgs,
-    /// List the stages that --part divides, in order, with the units that parts are made of, and do nothing else
-    #[arg(long, conflicts_with = "part", help_heading = IN_PARTS, hide_short_help = true)]
+    /// List the stages that --shard divides, in order, with their units, and do nothing else
+    #[arg(long, conflicts_with = "shard", help_heading = CACHE, hide_short_help = true)]
     pub(super) list_stages: bool,
-    /// Write a page too that plays the result beside the original in any browser, as `view` does [default: the output's name
-    /// with .html behind]
+    /// Also write a page that plays the result beside the original, as `view` does [default: OUTPUT.html]
     #[arg(long, value_name = "PATH", num_args = 0..=1, require_equals = true, hide_short_help = true)]
-    #[arg(conflicts_with_all = ["dry_run", "part"])]
+    #[arg(conflicts_with_all = ["dry_run", "shard"])]
     pub(super) view: Option<Option<PathBuf>>,
     #[command(flatten)]
     pub(super) earlier: Earlier,
     /// Print the summary as JSON
     #[arg(long)]
     pub(super) json: bool,
-    /// Say everything at the end: stages with their times, what was left out and why, all notes
+    /// Print stages with their times, what was left out and why, and all notes
     #[arg(short, long, conflicts_with = "json")]
     pub(super) verbose: bool,
-    // Groups of options come in the order of these fields: those of the machine last but the recipe's.
+    // The help shows groups of options in the order of these fields.
     #[command(flatten)]
     pub(super) input: Input,
     #[command(flatten)]
     pub(super) recipe: RecipeFlags,
 }
 
-/// How large the output is to be [default: what pictures can do without goes].
+/// Target of the compression [default: remove Gaussians that views hardly show].
 #[derive(Debug, Args)]
 #[command(group(clap::ArgGroup::new("size_of_output")))]
 pub(super) struct OutputSize {
-    /// Exactly this many Gaussians in the output
+    /// Fraction of the Gaussians to keep, exactly: 0.1, 10% or 10x (a tenth)
+    #[arg(long, help_heading = HOW_SMALL, value_name = "FRACTION", group = "size_of_output", value_parser = parse_ratio)]
+    pub(super) ratio: Option<f64>,
+    /// Number of Gaussians to keep, exactly
     #[arg(long, help_heading = HOW_SMALL, value_name = "N", group = "size_of_output")]
-    pub(super) target_count: Option<u64>,
-    /// Exactly this fraction of the Gaussians in the output
-    #[arg(long, help_heading = HOW_SMALL, value_name = "R", group = "size_of_output")]
-    pub(super) target_ratio: Option<f64>,
-    /// The smallest output whose pictures stay this close to the original's: mean PSNR, such as 35dB
+    pub(super) count: Option<u64>,
+    /// Best output of at most this many bytes, such as 5MB
+    ///
+    /// The files beside the output (summary, recipe, index map) count too, except beside an archive.
+    #[arg(long, help_heading = HOW_SMALL, value_name = "BYTES", group = "size_of_output", value_parser = parse_bytes)]
+    pub(super) size: Option<u64>,
+    /// Smallest output whose renders have at least this mean PSNR against the original's, such as 35dB
     #[arg(long, help_heading = HOW_SMALL, value_name = "DB", group = "size_of_output", value_parser = parse_decibels)]
     pub(super) min_psnr: Option<f64>,
-    /// The smallest output that loses at most this much PSNR against --ground-truth, such as 0.5dB
+    /// Smallest output that loses at most this much PSNR against the photographs of --ground-truth, such as 0.5dB
     #[arg(long, help_heading = HOW_SMALL, value_name = "DB", group = "size_of_output", value_parser = parse_decibels, requires = "ground_truth")]
     pub(super) max_loss: Option<f64>,
-    /// The best output that is at most this large, such as 5MB
+    /// Folder with photographs of the test views, for --max-loss
     ///
-    /// With everything written beside it; an archive without.
-    #[arg(long, help_heading = HOW_SMALL, value_name = "SIZE", group = "size_of_output", value_parser = parse_bytes)]
-    pub(super) target_size: Option<u64>,
-    /// Folder of photographs of the held-out cameras for --max-loss
-    ///
-    /// tNNN_vNN.png, or named as the cameras name them. A quarter of them is not searched on and gives the figure that is
-    /// reported.
+    /// Files as the cameras name them, else tNNN_vNN.png. A quarter of them is kept apart from the search and gives the figure
+    /// that is reported.
     #[arg(long, help_heading = HOW_SMALL, value_name = "FOLDER", requires = "max_loss")]
     pub(super) ground_truth: Option<PathBuf>,
 }
 
-/// What the user knows better.
+/// Gaussians that the user keeps or drops.
 #[derive(Debug, Args)]
 pub(super) struct OverrideArgs {
-    /// Keep every Gaussian inside this box (at the reference frame), unmerged
+    /// Keep every Gaussian whose center is inside this box at the reference frame, unmerged
     #[arg(long, help_heading = WHAT_STAYS, value_name = "X0,Y0,Z0,X1,Y1,Z1", hide_short_help = true, value_parser = parse_box, allow_hyphen_values = true)]
     pub(super) keep_box: Option<[f64; 6]>,
     /// Keep these Gaussians, unmerged: a file with one id per line, or a list such as 3,10-20
@@ -393,25 +195,25 @@ pub(super) struct OverrideArgs {
     pub(super) drop_ids: Option<String>,
 }
 
-/// Kinds of output.
+/// Formats of an output.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub(super) enum OutputKindArg {
-    /// 4DGaussians model folder
+    /// Model folder in the format of the input
     Model,
-    /// Container
+    /// Container with all frames (.gseq)
     Gseq,
-    /// Folder with one PLY per frame
+    /// Folder with one PLY file per frame
     PlySequence,
-    /// One PLY: the canonical cloud of a model, or a sequence of one frame
+    /// One PLY file: the canonical Gaussians of a model, or a single frame
     Ply,
-    /// Archive of a model, of one PLY or of frames, the smallest: to store and to send
+    /// Archive (.gsz), the smallest: to store and to send
     Archive,
-    /// Curved motion in windows of time, for splaTV and WebGS
+    /// Gaussians with cubic motion in time windows, for splaTV and WebGS
     Splatv,
-    /// Pieces of straight motion, for readers of 4dgs
+    /// Gaussians with piecewise linear motion, for readers of 4dgs
     #[value(name = "4dgs")]
     FourDgs,
-    /// One frame, for most web viewers
+    /// One frame, for web viewers (.spz)
     Spz,
 }
 
@@ -440,33 +242,32 @@ pub(super) struct Render {
     pub(super) input: Input,
     #[command(flatten)]
     pub(super) cameras: CameraFile,
-    /// Frame of the one picture to render, from 0
+    /// Frame to render, from 0
     #[arg(long, value_name = "T", requires = "view")]
     pub(super) frame: Option<u32>,
-    /// View of the one picture to render, or that --video follows through time
+    /// View to render, or the view of --video
     #[arg(long, value_name = "V", conflicts_with = "all")]
     pub(super) view: Option<u32>,
-    /// Render every picture of the split, into a folder of tNNN_vNN files
+    /// Render every view of the split into a folder, as tNNN_vNN files
     #[arg(long)]
     pub(super) all: bool,
-    /// Write a film, a picture for every frame: NAME.png or NAME.apng (animated PNG, every bit), NAME.gif, or with ffmpeg
-    /// NAME.mp4 or NAME.webm. From --view [default: the first], or along --path. --frames of a model that is continuous
-    /// in time need not be the cameras'
+    /// Write a video with one image per frame: NAME.png or NAME.apng (animated PNG, lossless), NAME.gif, or NAME.mp4 or NAME.webm
+    /// (needs ffmpeg), from --view [default: the first] or along --path
     #[arg(long, value_name = "FILE")]
     pub(super) video: Option<PathBuf>,
-    /// Move through the cameras of these views as time goes on, such as 0,2,5 [default: of all that --all would render]
+    /// Move the camera of --video through these views, such as 0,2,5 [default: all views of the split]
     #[arg(long, value_name = "VIEWS", num_args = 0..=1, value_delimiter = ',', conflicts_with = "view")]
     pub(super) path: Option<Vec<u32>>,
-    /// Frames of --video a second [default: 25]
+    /// Frames per second of --video [default: 25]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=100))]
     pub(super) fps: Option<u32>,
-    /// Show another model of the same frames to the right in --video
+    /// Model to show beside the input in --video, with the same frames
     #[arg(long, value_name = "MODEL")]
     pub(super) beside: Option<PathBuf>,
-    /// Which of the cameras' pictures [default: with --all and --path test, or all if none is held out; else all]
+    /// Split of the views [default: test with --all and --path, if there is one; else all]
     #[arg(long, value_enum)]
     pub(super) split: Option<SplitArg>,
-    /// Format of the files of --all [default: png]
+    /// Format of the images of --all [default: png]
     #[arg(long = "as", value_enum, value_name = "KIND", requires = "all")]
     pub(super) format: Option<ImageKind>,
     #[command(flatten)]
@@ -480,7 +281,7 @@ pub(super) struct Render {
     pub(super) earlier: Earlier,
 }
 
-/// Kinds of picture files.
+/// Formats of images.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub(super) enum ImageKind {
     /// 8 bits per channel, clamped
@@ -489,49 +290,51 @@ pub(super) enum ImageKind {
     Npy,
 }
 
-/// What is behind the scene.
+/// Background color.
 #[derive(Debug, Args)]
 pub(super) struct Background {
-    /// Colour behind the scene, each from 0 to 1 [default: the cameras' own, else the model's, else
-    /// that of the model in whose folder the cameras are, else black]
-    #[arg(long, value_name = "R,G,B", value_parser = parse_colour, allow_hyphen_values = true)]
+    /// Background color, each channel from 0 to 1 [default: that of the cameras, else of the model, else black]
+    #[arg(long, value_name = "R,G,B", value_parser = parse_color, allow_hyphen_values = true)]
     pub(super) background: Option<[f32; 3]>,
 }
 
-/// Two models, and the pictures to compare them on.
+/// Two models and the views that they are compared on.
 #[derive(Debug, Args)]
 pub(super) struct CompareArgs {
-    /// The model before compression: whatever `compress` reads
+    /// Original model: any input of `compress`
     pub(super) original: PathBuf,
-    /// The model after it, of any kind
+    /// Compressed model, in any format
     pub(super) compressed: PathBuf,
-    /// Training iteration of the original, if a model folder [default: the largest]
+    /// Training iteration of the original, if it is a model folder [default: the largest]
     #[arg(long, value_name = "K")]
     pub(super) iteration: Option<u32>,
     #[command(flatten)]
     pub(super) trained: Trained,
-    /// Take folders of PLY frames with a gap in their numbers as they are
+    /// Accept folders of PLY frames with missing frame numbers
     #[arg(long)]
     pub(super) allow_gaps: bool,
-    /// Whether to find out which Gaussian of a folder's frames is which, as `compress` does [default: auto]
+    /// Tracking of frames, as for `compress` [default: auto]
     #[arg(long)]
     pub(super) link: Option<LinkArg>,
     #[command(flatten)]
     pub(super) memory: Memory,
     #[command(flatten)]
     pub(super) cameras: CameraFile,
-    /// Which of the cameras' pictures [default: test, or all if none is held out]
+    /// Split of the views [default: test, else val, else all]
     #[arg(long, value_enum)]
     pub(super) split: Option<SplitArg>,
-    /// Folder of photographs to compare both models with: tNNN_vNN.png, or named as the cameras name them
+    /// Folder with photographs to compare both models with: files as the cameras name them, else tNNN_vNN.png
     #[arg(long, value_name = "FOLDER")]
     pub(super) ground_truth: Option<PathBuf>,
-    /// Compare at most this many frames, evenly from first to last [default: all]
+    /// Maximum number of frames, spread evenly [default: all]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     pub(super) max_frames: Option<u32>,
+    /// Maximum number of views, spread over frames and cameras [default: all]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    pub(super) max_views: Option<u32>,
     #[command(flatten)]
     pub(super) background: Background,
-    /// Compute FLIP too, the difference a person would see; takes some times longer
+    /// Also compute FLIP, a perceptual difference; takes several times longer
     #[arg(long)]
     pub(super) flip: bool,
 }
@@ -541,13 +344,13 @@ pub(super) struct CompareArgs {
 pub(super) struct ReportArgs {
     #[command(flatten)]
     pub(super) models: CompareArgs,
-    /// The sweep.json that `sweep` wrote, for its curves
+    /// sweep.json that `sweep` wrote, to include its curves
     #[arg(long, value_name = "FILE")]
     pub(super) sweep: Option<PathBuf>,
-    /// The precision.json that `precision` wrote, for its diagrams
+    /// precision.json that `precision` wrote, to include its plots
     #[arg(long, value_name = "FILE")]
     pub(super) precision: Option<PathBuf>,
-    /// Folder to write report.html into, and all it shows as JSON and CSV
+    /// Output folder: report.html, and its data as JSON and CSV
     #[arg(short, long, value_name = "FOLDER")]
     pub(super) output: PathBuf,
     #[command(flatten)]
@@ -561,7 +364,7 @@ pub(super) struct ReportArgs {
 pub(super) struct Evaluate {
     #[command(flatten)]
     pub(super) models: CompareArgs,
-    /// Write the scores of every picture
+    /// Write the scores of every view
     #[arg(long, value_name = "FILE")]
     pub(super) csv: Option<PathBuf>,
     #[command(flatten)]
@@ -573,145 +376,44 @@ pub(super) struct Evaluate {
     pub(super) json: bool,
 }
 
-/// `sweep`
-#[derive(Debug, Args)]
-pub(super) struct Sweep {
-    #[command(flatten)]
-    pub(super) input: Input,
-    #[command(flatten)]
-    pub(super) cameras: CameraFile,
-    /// Methods to compare: `default` and `paper`, the presets; `no-refine`, the first without refining; `paper-prune`,
-    /// `paper-merge`, the paper's ablations; prunings by `visible` contribution, `projected` coverage, `opacity` or `scale` alone, and at `random`
-    #[arg(long, value_name = "METHODS", value_delimiter = ',', default_values_t = Method::ALL.map(Method::name).map(str::to_owned),
-          value_parser = clap::builder::PossibleValuesParser::new(Method::ALL.map(Method::name)))]
-    pub(super) methods: Vec<String>,
-    /// Fractions of the Gaussians to keep
-    #[arg(long, value_name = "FRACTIONS", value_delimiter = ',', default_values_t = [0.8, 0.6, 0.4, 0.2, 0.1])]
-    pub(super) fractions: Vec<f64>,
-    /// Run `default` with these steps of refinement too, for error against run time; 0 refines nothing. Steps before
-    /// cuts are as many in proportion
-    #[arg(long, value_name = "STEPS", value_delimiter = ',', value_parser = clap::value_parser!(u32).range(..=1_000_000))]
-    pub(super) steps: Vec<u32>,
-    /// Fraction of the Gaussians to keep with --steps
-    #[arg(long, value_name = "FRACTION", default_value_t = 0.1, requires = "steps")]
-    pub(super) steps_at: f64,
-    /// Run every point so often and give the median time
-    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=100))]
-    pub(super) repeat: u32,
-    /// Compare on at most this many frames, evenly from first to last
-    #[arg(long, value_name = "N", default_value_t = 15, value_parser = clap::value_parser!(u32).range(1..))]
-    pub(super) max_frames: u32,
-    #[command(flatten)]
-    pub(super) background: Background,
-    /// Folder to write sweep.html into, a page with the curves, and what it shows as JSON and CSV
-    #[arg(short, long, value_name = "FOLDER")]
-    pub(super) output: PathBuf,
-    #[command(flatten)]
-    pub(super) earlier: Earlier,
-    /// Print JSON
-    #[arg(long)]
-    pub(super) json: bool,
-}
-
-/// `precision`
-#[derive(Debug, Args)]
-pub(super) struct PrecisionArgs {
-    #[command(flatten)]
-    pub(super) input: Input,
-    #[command(flatten)]
-    pub(super) cameras: CameraFile,
-    /// What to turn: pictures and strides of the first `look`; pictures and cuts of `rounds`; bits of `percentiles`; f32
-    /// and f64 `sums`; radius and passes of `merging`; steps and pictures of `refining`; threads and memory of the
-    /// `machine` [default: all, of long inputs without the last three, whose settings are whole runs]
-    #[arg(long, value_name = "KNOBS", value_delimiter = ',',
-          value_parser = clap::builder::PossibleValuesParser::new(Turned::ALL.map(Turned::name)))]
-    pub(super) knobs: Vec<String>,
-    /// Fraction of the Gaussians that every setting keeps
-    #[arg(long, value_name = "FRACTION", default_value_t = 0.3)]
-    pub(super) target_ratio: f64,
-    /// Look at and rank by pictures of at most this many frames, evenly from first to last; whole runs have all
-    #[arg(long, value_name = "N", default_value_t = 60, value_parser = clap::value_parser!(u32).range(1..))]
-    pub(super) max_frames: u32,
-    /// Run every setting up to so often and give median and range; fewer times where that takes 10 s
-    #[arg(long, value_name = "N", default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..=100))]
-    pub(super) repeat: u32,
-    /// Folder to write precision.html into, a page with the diagrams, and what it shows as JSON and CSV
-    #[arg(short, long, value_name = "FOLDER")]
-    pub(super) output: PathBuf,
-    #[command(flatten)]
-    pub(super) earlier: Earlier,
-    /// Print JSON
-    #[arg(long)]
-    pub(super) json: bool,
-    #[command(flatten)]
-    pub(super) recipe: RecipeFlags,
-}
-
 /// `view`
 #[derive(Debug, Args)]
 pub(super) struct ViewArgs {
     #[command(flatten)]
     pub(super) input: Input,
-    /// The model after compression, of any kind, to show beside it
+    /// Compressed model, in any format, to show beside the input
     pub(super) compressed: Option<PathBuf>,
     #[command(flatten)]
     pub(super) cameras: CameraFile,
-    /// Show at most this many frames, evenly from first to last
+    /// Maximum number of frames, spread evenly
     #[arg(long, value_name = "N", default_value_t = DEFAULT_FRAMES, value_parser = clap::value_parser!(u32).range(1..))]
     pub(super) max_frames: u32,
-    /// Show at most this many of the original beside a compressed model [default: --max-frames]
+    /// Maximum number of frames of the original beside a compressed model [default: --max-frames]
     #[arg(long, value_name = "N", requires = "compressed", value_parser = clap::value_parser!(u32).range(1..))]
     pub(super) original_frames: Option<u32>,
-    /// Show the original beside a compressed model with harmonics of this degree at most [default: its own]
+    /// Maximum SH degree of the original beside a compressed model [default: its own]
     #[arg(long, value_name = "DEGREE", requires = "compressed", value_parser = clap::value_parser!(u8).range(0..=3))]
     pub(super) original_degree: Option<u8>,
     #[command(flatten)]
     pub(super) background: Background,
-    /// Write a folder instead of one page where its frames take more than this
+    /// Maximum size of a single page; more is written as a folder
     #[arg(long, value_name = "SIZE", default_value = DEFAULT_PAGE, value_parser = parse_bytes)]
     pub(super) page_limit: u64,
-    /// NAME.html, one page with everything in it, or a folder, whose index.html is the page; both open without a server
+    /// Output: NAME.html, a single page, or a folder with index.html; both open without a server
     #[arg(short, long, value_name = "PATH")]
     pub(super) output: PathBuf,
     #[command(flatten)]
     pub(super) earlier: Earlier,
 }
 
-/// Frames that a page shows at most.
+/// Default maximum number of frames of a page.
 pub(super) const DEFAULT_FRAMES: u32 = 60;
-/// Bytes of frames that one page holds.
+/// Default maximum size of a single page.
 const DEFAULT_PAGE: &str = "64MB";
 
-/// The limit of a page that nobody chose.
+/// Returns the default of `--page-limit` in bytes.
 pub(super) fn default_page_limit() -> u64 {
     parse_bytes(DEFAULT_PAGE).expect("a size")
-}
-
-/// `pack`
-#[derive(Debug, Args)]
-pub(super) struct Pack {
-    #[command(flatten)]
-    pub(super) input: Input,
-    #[command(flatten)]
-    pub(super) cameras: Cameras,
-    /// Container to write
-    #[arg(short, long, value_name = "FILE.gseq")]
-    pub(super) output: PathBuf,
-    /// Let values of columns be so far off: `position=1e-3` in the column's unit (scene units, components of
-    /// quaternions, logs of scales, logits, harmonics), or `position=0.01%` of the scene's extent; columns that are not named
-    /// keep every bit. Each value is checked as it is written, and the file says its bounds
-    #[arg(long, value_name = "COLUMN=BOUND", value_delimiter = ',', conflicts_with = "raw")]
-    pub(super) max_error: Vec<MaxError>,
-    /// Store tiles as they are, to be used in place
-    #[arg(long, conflicts_with = "level")]
-    pub(super) raw: bool,
-    /// zstd level [default: 1, with --max-error 15]
-    #[arg(long, value_name = "1-19", value_parser = clap::value_parser!(i32).range(1..=19))]
-    pub(super) level: Option<i32>,
-    #[command(flatten)]
-    pub(super) kept: CacheArgs,
-    #[command(flatten)]
-    pub(super) earlier: Earlier,
 }
 
 /// `convert`
@@ -719,15 +421,39 @@ pub(super) struct Pack {
 pub(super) struct Convert {
     #[command(flatten)]
     pub(super) input: Input,
-    /// What to write: NAME.splatv, .4dgs, .spz, .gseq, .ply, or a folder of the input's own kind
-    #[arg(value_name = "OUTPUT")]
-    pub(super) output: PathBuf,
+    /// NAME.gseq, .ply, .splatv, .4dgs or .spz; a folder (the model in an archive, a PLY per frame of a sequence, or a model
+    /// of the input's own format); - for a frame stream on standard output (format/STREAM.md)
+    #[arg(value_name = "OUTPUT", required_unless_present = "output_option")]
+    pub(super) output: Option<PathBuf>,
+    /// The output, as other commands name it
+    #[arg(
+        id = "output_option",
+        short = 'o',
+        long = "output",
+        value_name = "OUTPUT",
+        conflicts_with = "output",
+        hide = true
+    )]
+    pub(super) output_option: Option<PathBuf>,
     #[command(flatten)]
     pub(super) cameras: Cameras,
-    /// Kind of result, whatever it is called
-    #[arg(long = "as", value_name = "KIND", value_enum)]
+    /// Format of the output [default: by its name]
+    #[arg(long = "as", value_name = "FORMAT", value_enum)]
     pub(super) kind: Option<OutputKindArg>,
-    /// Print what was written as JSON
+    /// Maximum error of an attribute in a .gseq: `position=1e-3` in the attribute's unit (scene units, components of
+    /// quaternions, logs of scales, opacity logits, SH coefficients) or `position=0.01%` of the scene's extent; attributes that are
+    /// not named keep every bit. Every value is checked as it is written, and the file states its bounds
+    #[arg(long, value_name = "ATTRIBUTE=BOUND", value_delimiter = ',', conflicts_with = "raw")]
+    pub(super) max_error: Vec<MaxError>,
+    /// Store the tiles of a .gseq uncompressed, for use in place
+    #[arg(long, conflicts_with = "level")]
+    pub(super) raw: bool,
+    /// zstd level of a .gseq [default: 1, with --max-error 15]
+    #[arg(long, value_name = "1-19", value_parser = clap::value_parser!(i32).range(1..=19))]
+    pub(super) level: Option<i32>,
+    #[command(flatten)]
+    pub(super) kept: CacheArgs,
+    /// Print the result as JSON
     #[arg(long)]
     pub(super) json: bool,
     #[command(flatten)]
@@ -739,78 +465,47 @@ pub(super) struct Convert {
 pub(super) struct InfoArgs {
     #[command(flatten)]
     pub(super) input: Input,
+    /// Read every byte of a .gseq container and check it against its checksums
+    #[arg(long, conflicts_with = "repair")]
+    pub(super) check: bool,
+    /// Write the complete frames of a damaged or truncated .gseq container to a new one
+    #[arg(long, value_name = "FILE.gseq")]
+    pub(super) repair: Option<PathBuf>,
     /// Print JSON
     #[arg(long)]
     pub(super) json: bool,
-}
-
-/// `verify`
-#[derive(Debug, Args)]
-pub(super) struct Verify {
-    /// Container to check
-    pub(super) input: PathBuf,
-    /// Print JSON
-    #[arg(long)]
-    pub(super) json: bool,
-}
-
-/// `unpack`
-#[derive(Debug, Args)]
-pub(super) struct Unpack {
-    #[command(flatten)]
-    pub(super) input: Input,
-    #[command(flatten)]
-    pub(super) cameras: Cameras,
-    /// Folder to write frame_NNNNN.ply into; of an archive (.gsz) the model folder, or the name of its PLY
-    #[arg(short, long, value_name = "PATH", required_unless_present = "stream", conflicts_with = "stream")]
-    pub(super) output: Option<PathBuf>,
-    /// Write a frame stream to standard output instead, for another program to read (format/STREAM.md)
-    #[arg(long)]
-    pub(super) stream: bool,
     #[command(flatten)]
     pub(super) earlier: Earlier,
 }
 
-/// `work`
+/// `cache`
 #[derive(Debug, Args)]
-pub(super) struct WorkArgs {
-    /// The folder
+pub(super) struct CacheFolder {
+    /// Folder that was given to --cache
     pub(super) folder: PathBuf,
-    /// Remove everything that stages have kept in it, and the folder if nothing else is in it
+    /// Remove all cached results in it, and the folder if nothing else is in it
     #[arg(long, conflicts_with = "json")]
     pub(super) clean: bool,
-    /// Print what is there as JSON
+    /// Print JSON
     #[arg(long)]
     pub(super) json: bool,
-}
-
-/// `recover`
-#[derive(Debug, Args)]
-pub(super) struct Recover {
-    /// Container that was cut short
-    pub(super) input: PathBuf,
-    /// Container to write
-    #[arg(short, long, value_name = "FILE.gseq")]
-    pub(super) output: PathBuf,
-    #[command(flatten)]
-    pub(super) earlier: Earlier,
 }
 
 /// `demo`
 #[derive(Debug, Args)]
 pub(super) struct Demo {
-    /// Keep the scene and the results in this folder [default: a temporary one]
+    /// Folder for the scene and the results [default: a temporary one]
     #[arg(short, long, value_name = "FOLDER")]
     pub(super) output: Option<PathBuf>,
-    /// Gaussians of the scene
+    /// Number of Gaussians of the scene
     #[arg(long, value_name = "N", default_value_t = 6000, value_parser = clap::value_parser!(u32).range(100..=10_000_000))]
     pub(super) gaussians: u32,
-    /// Frames of the scene
+    /// Number of frames of the scene
     #[arg(long, value_name = "T", default_value_t = 48, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     pub(super) frames: u32,
     /// Fraction of the Gaussians to keep
-    #[arg(long, value_name = "R", default_value_t = 0.3)]
-    pub(super) target_ratio: f64,
+    #[arg(long, value_name = "FRACTION", default_value = "0.3", value_parser = parse_ratio)]
+    pub(super) ratio: f64,
     #[command(flatten)]
     pub(super) memory: Memory,
     #[command(flatten)]
@@ -829,9 +524,9 @@ pub(super) struct Selfcheck {
 
 /// `recipe`
 #[derive(Debug, Args)]
-pub(super) struct RecipeVerb {
-    /// `default`, `paper` (which documents every parameter), `gentle` or `strong`
-    #[arg(long, default_value = "paper")]
+pub(super) struct RecipeArgs {
+    /// `default`, `paper` (with a description of every parameter), `gentle` or `strong`
+    #[arg(long, default_value = "default")]
     pub(super) preset: String,
 }
 
@@ -846,50 +541,6 @@ pub(super) struct Completions {
 /// `man`
 #[derive(Debug, Args)]
 pub(super) struct Man {
-    /// Folder to write them into, which is made
+    /// Output folder
     pub(super) folder: PathBuf,
-}
-
-fn parse_size(text: &str) -> Result<(u32, u32), String> {
-    let expected = || format!("expected WIDTHxHEIGHT such as 800x800, found {}", quoted(text));
-    let (width, height) = text.split_once('x').ok_or_else(expected)?;
-    match (width.parse(), height.parse()) {
-        (Ok(width @ 1..=65_535), Ok(height @ 1..=65_535)) => Ok((width, height)),
-        _ => Err(expected()),
-    }
-}
-
-fn parse_times(text: &str) -> Result<Times, String> {
-    Ok(Times::named(text))
-}
-
-fn parse_bytes(text: &str) -> Result<u64, String> {
-    match text.parse::<bytesize::ByteSize>() {
-        Ok(bytes) if bytes.as_u64() > 0 => Ok(bytes.as_u64()),
-        _ => Err(format!("expected a size such as 512MiB or 4GB, found {}", quoted(text))),
-    }
-}
-
-fn parse_decibels(text: &str) -> Result<f64, String> {
-    let number = text.trim().trim_end_matches(['b', 'B']).trim_end_matches(['d', 'D']).trim_end();
-    match number.parse::<f64>() {
-        Ok(decibels) if decibels > 0.0 && decibels <= 100.0 => Ok(decibels),
-        _ => Err(format!("expected decibels above 0 and at most 100, such as 0.5 or 35dB, found {}", quoted(text))),
-    }
-}
-
-fn parse_colour(text: &str) -> Result<[f32; 3], String> {
-    let channels: Vec<f32> = numbers(text)?;
-    channels.try_into().map_err(|c: Vec<f32>| format!("expected three numbers, found {}", c.len()))
-}
-
-fn parse_box(text: &str) -> Result<[f64; 6], String> {
-    let corners: [f64; 6] =
-        numbers(text)?.try_into().map_err(|n: Vec<f64>| format!("expected six numbers, found {}", n.len()))?;
-    // A NaN is in no order.
-    let in_order = |axis: usize| corners[axis].partial_cmp(&corners[axis + 3]).is_some_and(|order| order.is_le());
-    match (0..3).find(|&axis| !in_order(axis)) {
-        Some(axis) => Err(format!("axis {axis}: {} is not below {}", corners[axis], corners[axis + 3])),
-        None => Ok(corners),
-    }
 }

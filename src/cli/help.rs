@@ -1,4 +1,4 @@
-//! Help: what the tool and each verb is, examples, then options in groups; and the same as manual pages.
+//! Help of the program and of each command: description, examples, options in groups; and the same as manual pages.
 
 use std::fs;
 use std::path::Path;
@@ -9,66 +9,77 @@ use super::args::Cli;
 use splatsieve::error::{Error, Result, ShowPath};
 use splatsieve::files::atomic::{Kind, Replace, StagedFile, StagedFolder, check_target};
 
-/// Text that every manual page of this program holds: its title.
+/// Title in the source of every manual page of this program.
 const PAGE: &str = ".TH splatsieve";
 
-/// What it is comes first, then how it is used.
+/// Order of the help of a command: description, examples, usage, options.
 const TEMPLATE: &str = "{about-section}\n{before-help}{usage-heading} {usage}\n\n{all-args}{after-help}";
+
+/// Order of the help of the program: description, examples, usage, groups of commands, options.
+const TOP_TEMPLATE: &str = "{about-section}\n{before-help}{usage-heading} {usage}\n\n{after-help}\n{options}";
 
 const EXAMPLES: &str = "\
 Examples:
-  splatsieve demo                                    a scene of its own
-  splatsieve compress model --cameras data -o small  a 4DGaussians model
-  splatsieve evaluate model small --cameras data     what it cost
+  splatsieve demo                                    try it on a built-in scene
+  splatsieve compress model --cameras data -o small --ratio 10%
+  splatsieve evaluate model small --cameras data     what was lost
   splatsieve report model small -o page              the same, as a page
   splatsieve view model small -o scene.html          both moving, in a browser
-  splatsieve compress model -o small.gsz             smallest, to send
-  splatsieve unpack small.gsz -o small               the model folder in it
-`splatsieve VERB -h`: its examples and usual options; `--help`: all of them.";
+  splatsieve compress model -o small.gsz             archive, the smallest
+  splatsieve convert small.gsz small                 the model folder in it
+`splatsieve COMMAND -h` prints examples and common options, `--help` all options.";
 
-/// Examples of every verb; two spaces stand before what is said about one.
-const OF_VERBS: &[(&str, &[&str])] = &[
+/// Groups of commands in the help of the program.
+const GROUPS: [(&str, &[&str]); 3] = [
+    ("Everyday", &["compress", "evaluate", "report", "view", "render", "convert", "info"]),
+    ("Study", &["score", "sweep", "precision"]),
+    ("Other", &["demo", "cache", "recipe", "selfcheck", "completions", "man"]),
+];
+
+/// Examples of every command. Two spaces separate a command line from its explanation.
+const COMMAND_EXAMPLES: &[(&str, &[&str])] = &[
     (
         "compress",
         &[
             "splatsieve compress model --cameras data -o small     drop-in result",
-            "splatsieve compress model -o small --target-ratio 0.3  exactly 30% of them",
-            "splatsieve compress model -o small --min-psnr 35dB    fewest as close",
-            "splatsieve compress model -o small --target-size 5MB  best no larger",
-            "splatsieve compress model -o small.gsz                smallest, to send",
-            "splatsieve compress model -o small --dry-run          what it would take",
-            "splatsieve compress frames -o small.gseq --preset paper",
+            "splatsieve compress model -o small --ratio 30%        exactly 30% of them",
+            "splatsieve compress model -o small --min-psnr 35dB    fewest at this PSNR",
+            "splatsieve compress model -o small --size 5MB         best that fits",
+            "splatsieve compress model -o small.gsz                archive, the smallest",
+            "splatsieve compress model -o small --dry-run          plan, time, memory",
+            "splatsieve compress model -o small --set refine_steps=3000",
             "exporter | splatsieve compress - -o small.gseq        frames as they come",
         ],
     ),
     (
         "score",
         &[
-            "splatsieve score model --cameras data -o rows.npz  statistics, nothing removed",
+            "splatsieve score model --cameras data -o rows.npz  nothing is removed",
             "splatsieve score model -o rows.csv --preset paper",
         ],
     ),
     (
         "render",
         &[
-            "splatsieve render model --frame 0 --view 1 -o x.png  one picture",
-            "splatsieve render model --all -o pictures            all held-out ones",
-            "splatsieve render model --video x.mp4                a film of the first view",
+            "splatsieve render model --frame 0 --view 1 -o x.png  one view",
+            "splatsieve render model --all -o renders             all test views",
+            "splatsieve render model --video x.mp4                the first view",
             "splatsieve render model --video x.gif --path 0,3,5 --beside small",
         ],
     ),
     (
         "evaluate",
         &[
-            "splatsieve evaluate model small --cameras data       on held-out pictures",
+            "splatsieve evaluate model small --cameras data       on test views",
+            "splatsieve evaluate model small --ground-truth data  against photographs",
             "splatsieve evaluate model small --flip --csv scores.csv",
         ],
     ),
     (
         "sweep",
         &[
-            "splatsieve sweep model --cameras data -o curves      every method and size",
-            "splatsieve sweep model -o curves --methods default,paper --fractions 0.5,0.2",
+            "splatsieve sweep model --cameras data -o curves      methods and fractions",
+            "splatsieve sweep model -o curves --methods default,paper --fractions 50%,20%",
         ],
     ),
     (
@@ -82,53 +93,51 @@ const OF_VERBS: &[(&str, &[&str])] = &[
     (
         "view",
         &[
-            "splatsieve view model small --cameras data -o scene.html  both in motion",
-            "splatsieve view scan.ply -o scan.html                a static scene",
+            "splatsieve view model small --cameras data -o scene.html  side by side",
+            "splatsieve view scan.ply -o scan.html                a still",
             "splatsieve view long.gseq --max-frames 600 -o scene  open scene/index.html",
         ],
     ),
     (
         "convert",
         &[
+            "splatsieve convert small.gsz small                   the model in an archive",
             "splatsieve convert model scene.splatv --cameras data  for splaTV and WebGS",
-            "splatsieve convert small.gseq scene.4dgs             pieces of straight motion",
-            "splatsieve convert scan.ply scan.spz                 for most web viewers",
-            "splatsieve convert model frames --as ply-sequence    a PLY per frame",
+            "splatsieve convert scan.ply scan.spz                 for web viewers",
+            "splatsieve convert scene.gseq frames                 one PLY per frame",
+            "splatsieve convert frames scene.gseq --max-error position=0.01%",
+            "splatsieve convert scene.gseq - | splatsieve compress - -o small.gseq",
         ],
     ),
     (
-        "pack",
+        "info",
         &[
-            "splatsieve pack frames -o scene.gseq                 every bit kept",
-            "splatsieve pack frames -o scene.gseq --max-error position=0.01%",
+            "splatsieve info model",
+            "splatsieve info scene.gseq --check                   verify every byte",
+            "splatsieve info cut.gseq --repair saved.gseq         save complete frames",
         ],
     ),
-    ("info", &["splatsieve info scene.gseq", "splatsieve info model --json"]),
-    ("verify", &["splatsieve verify scene.gseq"]),
-    (
-        "unpack",
-        &[
-            "splatsieve unpack small.gsz -o small                 the model in an archive",
-            "splatsieve unpack scene.gseq -o frames               a PLY per frame",
-            "splatsieve unpack scene.gseq --stream | splatsieve compress - -o small.gseq",
-        ],
-    ),
-    ("recover", &["splatsieve recover cut.gseq -o saved.gseq"]),
-    ("work", &["splatsieve work folder                               what is in it", "splatsieve work folder --clean"]),
-    ("demo", &["splatsieve demo", "splatsieve demo -o folder --gaussians 20000          keep what it makes"]),
+    ("cache", &["splatsieve cache folder                              list", "splatsieve cache folder --clean"]),
+    ("demo", &["splatsieve demo", "splatsieve demo -o folder                            keep what it makes"]),
     ("selfcheck", &["splatsieve selfcheck                                 are the numbers right?"]),
-    ("recipe", &["splatsieve recipe > recipe.toml                      every parameter"]),
+    ("recipe", &["splatsieve recipe --preset paper > recipe.toml       every parameter"]),
     ("completions", &["splatsieve completions bash > splatsieve.bash"]),
     ("man", &["splatsieve man share/man/man1                       man splatsieve-compress"]),
 ];
 
-/// The command line with its examples.
+/// Returns the command line with examples and groups of commands.
 pub(super) fn command() -> Command {
-    let command = Cli::command().help_template(TEMPLATE).before_help(EXAMPLES);
-    OF_VERBS.iter().fold(command, |command, (verb, examples)| {
+    let command = Cli::command().before_help(EXAMPLES);
+    let command = COMMAND_EXAMPLES.iter().fold(command, |command, (name, examples)| {
         let examples = format!("Examples:\n  {}", examples.join("\n  "));
-        command.mut_subcommand(verb, |verb| verb.help_template(TEMPLATE).before_help(examples))
-    })
+        command.mut_subcommand(name, |command| command.help_template(TEMPLATE).before_help(examples))
+    });
+    let groups = GROUPS.map(|(title, names)| {
+        let about = |name: &&str| command.find_subcommand(name).and_then(Command::get_about).map(ToString::to_string);
+        let lines = names.iter().map(|name| format!("  {name:<12} {}", about(name).unwrap_or_default()));
+        format!("{title}:\n{}\n", lines.collect::<Vec<_>>().join("\n"))
+    });
+    command.help_template(TOP_TEMPLATE).after_help(groups.join("\n") + "\nOptions:")
 }
 
 /// Writes a manual page of the program and one of each command into `folder`, all or none; returns their number. Other files
@@ -144,30 +153,30 @@ pub(super) fn write_pages(folder: &Path) -> Result<usize> {
     fs::create_dir_all(parent).map_err(Error::io("create", parent))?;
     let written = if folder.exists() { write_beside(&pages, folder) } else { write_folder(&pages, folder) };
     if written.is_err() {
-        // Whatever else is in them meanwhile keeps them.
+        // Folders that hold other files by now stay.
         made.iter().for_each(|folder| drop(fs::remove_dir(folder)));
     }
     written.map(|()| pages.len())
 }
 
-/// File name and text of every page.
+/// Returns file name and text of every page.
 fn pages() -> Result<Vec<(String, Vec<u8>)>> {
     let mut command = command().disable_help_subcommand(true);
     command.build();
-    let of_verbs = command.get_subcommands().filter(|verb| !verb.is_hide_set());
+    let subcommands = command.get_subcommands().filter(|command| !command.is_hide_set());
     let page = |page: &Command| {
         let name = page.get_display_name().unwrap_or(page.get_name()).to_owned();
         let file = format!("{name}.1");
         let mut text = Vec::new();
-        // Manual pages have examples at their end, and one line each.
+        // Manual pages have the examples at the end, one per line.
         let examples = page.get_before_help().map(ToString::to_string).unwrap_or_default();
-        let page = page.clone().name(name).before_help("");
+        let page = page.clone().name(name).before_help("").after_help("");
         clap_mangen::Man::new(page).render(&mut text).map_err(Error::io("make", Path::new(&file)))?;
         let lines = examples.lines().skip(1).map(|line| format!("{}\n", line.trim().replace('-', "\\-")));
         text.extend(format!(".SH EXAMPLES\n.nf\n{}.fi\n", lines.collect::<String>()).bytes());
         Ok((file, text))
     };
-    std::iter::once(&command).chain(of_verbs).map(page).collect()
+    std::iter::once(&command).chain(subcommands).map(page).collect()
 }
 
 /// Writes pages into a folder that is not there yet.
@@ -193,7 +202,7 @@ fn write_beside(pages: &[(String, Vec<u8>)], folder: &Path) -> Result<()> {
                 path.shown()
             )));
         }
-        let file = StagedFile::new(&path, Replace::Any)?;
+        let file = StagedFile::new(&path, Replace::Existing)?;
         fs::write(file.path(), text).map_err(Error::io("write", file.path()))?;
         staged.push(file);
     }
@@ -205,13 +214,31 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_verb_has_examples_and_every_example_is_understood() {
-        for verb in command().get_subcommands() {
-            let help = verb.clone().render_help().to_string();
+    fn every_command_is_in_one_group() {
+        let grouped: Vec<&str> = GROUPS.iter().flat_map(|(_, names)| names.iter().copied()).collect();
+        let command = command();
+        let names: Vec<&str> = command.get_subcommands().map(Command::get_name).collect();
+        assert!(names.len() <= 16 && names.len() == grouped.len(), "{names:?}");
+        assert!(names.iter().all(|name| grouped.contains(name)), "{names:?}");
+    }
+
+    #[test]
+    fn compress_has_at_most_45_options() {
+        let mut command = command();
+        command.build();
+        let compress = command.find_subcommand("compress").unwrap();
+        let options: Vec<&str> = compress.get_arguments().filter_map(clap::Arg::get_long).collect();
+        assert!(options.len() <= 45, "{}: {options:?}", options.len());
+    }
+
+    #[test]
+    fn every_command_has_examples_that_parse() {
+        for subcommand in command().get_subcommands() {
+            let help = subcommand.clone().render_help().to_string();
             let examples: Vec<&str> = help.lines().filter(|line| line.starts_with("  splatsieve ")).collect();
-            assert!(!examples.is_empty(), "{}: give it an example in OF_VERBS", verb.get_name());
+            assert!(!examples.is_empty(), "{}: give it an example in COMMAND_EXAMPLES", subcommand.get_name());
             for example in examples {
-                // What follows two spaces is said about it.
+                // Two spaces separate the command line from its explanation.
                 let line = example.trim().split("  ").next().unwrap_or_default();
                 for one in line.split(" | ").filter_map(|one| one.split(" > ").next()) {
                     let parsed = command().try_get_matches_from(one.split_whitespace());
@@ -222,10 +249,10 @@ mod tests {
     }
 
     #[test]
-    fn help_says_first_what_a_thing_is_then_how_it_is_used_and_its_examples_fit_80_columns() {
-        for mut verb in command().get_subcommands().cloned().chain([command()]) {
-            let about = verb.get_about().map(ToString::to_string).unwrap_or_default();
-            let help = verb.render_help().to_string();
+    fn help_starts_with_the_description_and_fits_80_columns() {
+        for mut subcommand in command().get_subcommands().cloned().chain([command()]) {
+            let about = subcommand.get_about().map(ToString::to_string).unwrap_or_default();
+            let help = subcommand.render_help().to_string();
             let first = about.split_whitespace().next().unwrap_or_default();
             assert!(!first.is_empty() && help.starts_with(first), "{help}");
             let [examples, usage] = ["Examples:\n", "Usage: "].map(|part| help.find(part));

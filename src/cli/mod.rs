@@ -16,8 +16,8 @@ use clap::FromArgMatches;
 use gseq::Compression;
 
 use args::{
-    CacheArgs, CameraFile, Cameras, Cli, CompareArgs, Compress, ImageKind, Input, Memory, OutputSize, Render, Rot4d,
-    SplitArg, Sweep, Trained, Verb, ViewArgs, ZeroRotationArg,
+    CacheArgs, CameraFile, Cameras, Cli, CommandArgs, CompareArgs, Compress, Convert, ImageKind, InfoArgs, Input,
+    Memory, OutputSize, Render, Rot4d, SplitArg, Sweep, Trained, ViewArgs, ZeroRotationArg,
 };
 use message::tell;
 use output::{print, print_as};
@@ -26,7 +26,7 @@ use splatsieve::cache::{self, Completion};
 use splatsieve::commands::container::Storing;
 use splatsieve::commands::render::{RenderOptions, RenderSelection};
 use splatsieve::commands::video::{FilmPath, VideoOptions, places, video};
-use splatsieve::commands::{archive, container, convert, render, score};
+use splatsieve::commands::{container, convert, render, score};
 use splatsieve::diagnostics::demo::DemoOptions;
 use splatsieve::diagnostics::precision::{PrecisionOptions, Turned};
 use splatsieve::diagnostics::selfcheck;
@@ -69,7 +69,7 @@ pub(crate) fn main() -> ExitCode {
     };
     // Before anything is begun.
     signals::install();
-    let explains = cli.verb.explains();
+    let explains = cli.command.explains();
     let result = run(cli);
     // Results that these warnings name are in place, so the exit code stays.
     for warning in take_warnings() {
@@ -116,8 +116,8 @@ fn run(cli: Cli) -> Result<()> {
             .map_err(|error| Error::usage(format!("--threads {threads}: {error}")))?;
     }
     let events = Events::new(Display::new(cli.quiet));
-    match cli.verb {
-        Verb::Compress(args) => {
+    match cli.command {
+        CommandArgs::Compress(args) => {
             let (json, list_stages, dry_run) = (args.json, args.list_stages, args.dry_run);
             let detail = if args.verbose { Detail::All } else { Detail::Most };
             let view_output = args.view.clone();
@@ -142,7 +142,7 @@ fn run(cli: Cli) -> Result<()> {
             }
             printed
         }
-        Verb::Score(args) => {
+        CommandArgs::Score(args) => {
             let input = input_options(args.input, Some(args.cameras), Some(&args.output), &events);
             let report = score::score(&input, &args.output, &args.recipe.recipe()?, args.earlier.replace())?;
             notes(&report.notes);
@@ -153,7 +153,7 @@ fn run(cli: Cli) -> Result<()> {
                 report.kept
             ))
         }
-        Verb::Render(mut args) => {
+        CommandArgs::Render(mut args) => {
             if let Some(output) = args.video.take() {
                 return film(args, output, &events);
             }
@@ -163,7 +163,7 @@ fn run(cli: Cli) -> Result<()> {
             let plural = if rendered.pictures == 1 { "" } else { "s" };
             print(&format!("{}: {} picture{plural}\n", options.output.shown(), rendered.pictures))
         }
-        Verb::Evaluate(args) => {
+        CommandArgs::Evaluate(args) => {
             let as_json = args.json;
             let mut options = EvaluateOptions {
                 csv: args.csv,
@@ -175,17 +175,17 @@ fn run(cli: Cli) -> Result<()> {
             notes(&found.work_notes);
             print_as(as_json, &if as_json { json(&found) } else { found.text() })
         }
-        Verb::Sweep(args) => {
+        CommandArgs::Sweep(args) => {
             let (as_json, page) = (args.json, args.output.join(trade_off::PAGE));
             let found = sweep::sweep(&sweep_options(args, &events))?;
             print_as(as_json, &if as_json { found.json() } else { format!("{}{}\n", found.text(), page.shown()) })
         }
-        Verb::Precision(args) => {
+        CommandArgs::Precision(args) => {
             let (as_json, page) = (args.json, args.output.join(report::precision::PAGE));
             let found = precision::precision(&precision_options(args, &events)?)?;
             print_as(as_json, &if as_json { found.json() } else { format!("{}{}\n", found.text(), page.shown()) })
         }
-        Verb::Report(args) => {
+        CommandArgs::Report(args) => {
             let page = args.output.join(report::PAGE);
             let mut evaluate = evaluate_options(args.models, &events);
             evaluate.original.work = work_of(args.kept);
@@ -201,97 +201,10 @@ fn run(cli: Cli) -> Result<()> {
             notes(&found.notes);
             print(&format!("{}\n{}\n", found.verdict, page.shown()))
         }
-        Verb::View(args) => print(&(viewed(&view_options(args, &events))? + "\n")),
-        Verb::Convert(args) => {
-            let input = input_options(args.input, Some(args.cameras), Some(&args.output), &events);
-            let done = convert::convert(&input, &args.output, args.kind.map(kind_of), args.earlier.replace())?;
-            if args.json {
-                return print_as(true, &json(&done));
-            }
-            notes(&done.notes);
-            print(&format!(
-                "{}: {} Gaussians x {} frames in {} bytes\n",
-                done.path.shown(),
-                done.gaussians,
-                done.frames,
-                done.bytes
-            ))
-        }
-        Verb::Pack(args) => {
-            let storing = match (args.raw, args.max_error) {
-                (true, _) => Storing::Exact(Compression::Raw),
-                (_, asked) if asked.is_empty() => Storing::Exact(Compression::Zstd(args.level.unwrap_or(1))),
-                (_, asked) => Storing::Within(asked, args.level.unwrap_or(15)),
-            };
-            let mut input = input_options(args.input, Some(args.cameras), Some(&args.output), &events);
-            input.work = work_of(args.kept);
-            let packed = container::pack(&input, &args.output, &storing, args.earlier.replace())?;
-            let Some(packed) = whole(packed)? else { return Ok(()) };
-            notes(&packed.notes);
-            print(&format!(
-                "{}: {} Gaussians x {} frames in {} bytes\n{}",
-                args.output.shown(),
-                packed.gaussians,
-                packed.frames,
-                packed.bytes,
-                packed.larger.map_or(String::new(), |why| format!("  {why}\n"))
-            ))
-        }
-        Verb::Info(args) => {
-            let info = container::info(&input_options(args.input, None, None, &events))?;
-            print_as(args.json, &if args.json { json(&info) } else { info.text() })
-        }
-        Verb::Verify(args) => {
-            let report = container::verify(&args.input)?;
-            let (frames, tiles) = (report.frames, report.tiles);
-            let (stored, decoded) = (report.stored_bytes, report.decoded_bytes);
-            let text = if args.json {
-                json(&serde_json::json!({
-                    "path": args.input.to_string_lossy(), "frames": frames, "tiles": tiles,
-                    "stored_bytes": stored, "decoded_bytes": decoded,
-                }))
-            } else {
-                let path = args.input.shown();
-                format!("{path}: sound; {frames} frames, {tiles} tiles, {stored} bytes that decode to {decoded}\n")
-            };
-            print_as(args.json, &text)
-        }
-        Verb::Unpack(args) => {
-            let input = input_options(args.input, Some(args.cameras), args.output.as_deref(), &events);
-            let Some(output) = args.output else {
-                if output::is_terminal() {
-                    return Err(Error::usage("a frame stream is not for a terminal; pipe it into a program or a file"));
-                }
-                notes(&container::unpack_stream(&input, output::stdout().lock())?.notes);
-                return Ok(());
-            };
-            if !input.is_stream() && archive::is_archive(&input.path)? {
-                let unpacked =
-                    archive::unpack_archive(&input.path, &output, args.earlier.replace(), input.memory.read_limit())?;
-                return print(&format!(
-                    "{}: {} Gaussians, {} bytes of values from {}\n",
-                    output.shown(),
-                    unpacked.gaussians,
-                    unpacked.bytes,
-                    unpacked.parts.total()
-                ));
-            }
-            let opened = container::unpack(&input, &output, args.earlier.replace())?;
-            notes(&opened.notes);
-            let frames = opened.input.source().info().times.len();
-            print(&format!("{}: {frames} PLY files\n", output.shown()))
-        }
-        Verb::Recover(args) => {
-            let report = container::recover(&args.input, &args.output, args.earlier.replace())?;
-            print(&format!(
-                "{}: {} complete frames of {} seen, {} tiles\n",
-                args.output.shown(),
-                report.frames,
-                report.frames_seen,
-                report.tiles_saved
-            ))
-        }
-        Verb::Work(args) => {
+        CommandArgs::View(args) => print(&(viewed(&view_options(args, &events))? + "\n")),
+        CommandArgs::Convert(args) => write_converted(args, &events),
+        CommandArgs::Info(args) => write_info(args, &events),
+        CommandArgs::Cache(args) => {
             if args.clean {
                 let (files, bytes) = cache::clean(&args.folder)?;
                 return print(&format!("{}: {files} files, {bytes} bytes removed\n", args.folder.shown()));
@@ -299,11 +212,11 @@ fn run(cli: Cli) -> Result<()> {
             let listed = cache::list(&args.folder)?;
             print_as(args.json, &if args.json { json(&listed) } else { cache::text(&listed) })
         }
-        Verb::Demo(args) => {
+        CommandArgs::Demo(args) => {
             let options = DemoOptions {
                 gaussians: args.gaussians as usize,
                 frames: args.frames as usize,
-                kept: Target::Ratio(args.target_ratio),
+                kept: Target::Ratio(args.ratio),
                 recipe: args.recipe.recipe()?,
                 output: args.output,
                 overwrite: args.earlier.replace(),
@@ -316,23 +229,104 @@ fn run(cli: Cli) -> Result<()> {
             }
             Ok(())
         }
-        Verb::Selfcheck(args) => {
+        CommandArgs::Selfcheck(args) => {
             let found = selfcheck::run();
             let printed = print_as(args.json, &if args.json { json(&found) } else { found.text() });
             found.verdict()?;
             printed
         }
-        Verb::Recipe(args) => print(preset_text(&args.preset)?),
-        Verb::Completions(args) => {
+        CommandArgs::Recipe(args) => print(preset_text(&args.preset)?),
+        CommandArgs::Completions(args) => {
             let mut script = Vec::new();
             clap_complete::generate(args.shell, &mut help::command(), "splatsieve", &mut script);
             output::write(&script)
         }
-        Verb::Man(args) => {
+        CommandArgs::Man(args) => {
             let pages = help::write_pages(&args.folder)?;
             print(&format!("{}: {pages} pages\n", args.folder.shown()))
         }
     }
+}
+
+/// Writes an input in another format and prints what was written.
+fn write_converted(args: Convert, events: &Events) -> Result<()> {
+    let path = args.output.or(args.output_option).ok_or_else(|| Error::internal("convert has no output"))?;
+    let is_stdout = path.as_os_str() == "-";
+    let is_stored_differently = args.raw || args.level.is_some() || !args.max_error.is_empty();
+    let storing = match (args.raw, args.max_error) {
+        (true, _) => Storing::Exact(Compression::Raw),
+        (_, bounds) if bounds.is_empty() => Storing::Exact(Compression::Zstd(args.level.unwrap_or(1))),
+        (_, bounds) => Storing::Within(bounds, args.level.unwrap_or(15)),
+    };
+    let output = (!is_stdout).then_some(path.as_path());
+    let has_cache = args.kept.cache.is_some();
+    let mut input = input_options(args.input, Some(args.cameras), output, events);
+    input.work = work_of(args.kept);
+    let asked = args.kind.map(kind_of);
+    let is_container = !is_stdout && convert::is_container(&path, asked);
+    let refuse =
+        |options: &str| Err(Error::usage(format!("{options}: expected an output NAME.gseq, found {}", path.shown())));
+    if is_stored_differently && !is_container {
+        return refuse("--max-error, --raw and --level");
+    }
+    if has_cache && !is_container {
+        return refuse("--cache");
+    }
+    if is_stdout {
+        if output::is_terminal() {
+            return Err(Error::usage("a frame stream is not for a terminal; pipe it into a program or a file"));
+        }
+        notes(&container::unpack_stream(&input, output::stdout().lock())?.notes);
+        return Ok(());
+    }
+    let converted = if is_container {
+        let Some(done) = whole(container::pack(&input, &path, &storing, args.earlier.replace())?)? else {
+            return Ok(());
+        };
+        done
+    } else {
+        convert::convert(&input, &path, asked, args.earlier.replace())?
+    };
+    if args.json {
+        return print_as(true, &json(&converted));
+    }
+    notes(&converted.notes);
+    print(&converted.text())
+}
+
+/// Prints what an input holds, or checks or repairs a container.
+fn write_info(args: InfoArgs, events: &Events) -> Result<()> {
+    let path = args.input.input.clone();
+    if let Some(output) = args.repair {
+        let report = container::recover(&path, &output, args.earlier.replace())?;
+        let value = serde_json::json!({
+            "path": output.to_string_lossy(), "frames": report.frames, "frames_seen": report.frames_seen,
+            "tiles": report.tiles_saved,
+        });
+        let text = format!(
+            "{}: {} complete frames of {} found, {} tiles\n",
+            output.shown(),
+            report.frames,
+            report.frames_seen,
+            report.tiles_saved
+        );
+        return print_as(args.json, &if args.json { json(&value) } else { text });
+    }
+    if args.check {
+        let report = container::verify(&path)?;
+        let (frames, tiles) = (report.frames, report.tiles);
+        let (stored, decoded) = (report.stored_bytes, report.decoded_bytes);
+        let value = serde_json::json!({
+            "path": path.to_string_lossy(), "frames": frames, "tiles": tiles,
+            "stored_bytes": stored, "decoded_bytes": decoded,
+        });
+        let path = path.shown();
+        let text =
+            format!("{path}: no damage; {frames} frames, {tiles} tiles, {stored} bytes that decode to {decoded}\n");
+        return print_as(args.json, &if args.json { json(&value) } else { text });
+    }
+    let info = container::info(&input_options(args.input, None, None, events))?;
+    print_as(args.json, &if args.json { json(&info) } else { info.text() })
 }
 
 fn kind_of(asked: args::OutputKindArg) -> OutputKind {
@@ -392,13 +386,13 @@ fn compress_options(args: Compress, quiet: bool, events: &Events) -> Result<Requ
         }
         None => RunOptions::default(),
     };
-    let OutputSize { target_count, target_ratio, min_psnr, max_loss, target_size, ground_truth } = args.size;
+    let OutputSize { ratio, count, size, min_psnr, max_loss, ground_truth } = args.size;
     let asked = RunOptions {
-        target_count,
-        target_ratio,
+        target_count: count,
+        target_ratio: ratio,
         min_psnr,
         max_loss,
-        target_size,
+        target_size: size,
         ground_truth,
         ..RunOptions::default()
     };
@@ -499,6 +493,7 @@ fn evaluate_options(args: CompareArgs, events: &Events) -> EvaluateOptions {
         ground_truth: args.ground_truth,
         part: args.split.map_or(PictureSet::HeldOut, part_of),
         max_frames: args.max_frames.map(|frames| frames as usize),
+        max_views: args.max_views.map(|views| views as usize),
         background: args.background.background,
         flip: args.flip,
         csv: None,
@@ -586,7 +581,7 @@ fn precision_options(args: args::PrecisionArgs, events: &Events) -> Result<Preci
         input,
         recipe: args.recipe.recipe()?,
         knobs: (!knobs.is_empty()).then_some(knobs),
-        target: Target::Ratio(args.target_ratio),
+        target: Target::Ratio(args.ratio),
         max_frames: args.max_frames as usize,
         runs: args.repeat as usize,
         output: args.output,
@@ -604,7 +599,7 @@ fn part_of(split: SplitArg) -> PictureSet {
 }
 
 fn work_of(kept: CacheArgs) -> Option<cache::CacheRequest> {
-    kept.work.map(|folder| cache::CacheRequest { folder, part: kept.part })
+    kept.cache.map(|folder| cache::CacheRequest { folder, part: kept.shard })
 }
 
 fn budget_of(memory: Memory) -> Budget {
@@ -645,7 +640,7 @@ impl CameraFile {
     /// Passes the arguments on to the options of an input.
     fn apply_to(self, options: &mut InputOptions) {
         options.cameras = self.cameras;
-        options.size = self.size;
+        options.size = self.resolution;
         options.times = self.times.unwrap_or_default();
         options.frames = self.frames.map(|frames| frames as usize);
     }

@@ -103,6 +103,7 @@ impl EventSink for Display {
     fn message(&self, message: Message<'_>) {
         match message {
             Message::Plan(text) => tell(text),
+            Message::Warning(text) => tell(&format!("warning: {text}")),
             Message::Discarded { .. } if self.is_quiet => (),
             Message::Discarded { stage, why } => {
                 let line = format!("{stage}  left out: {why}");

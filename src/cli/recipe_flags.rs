@@ -1,8 +1,8 @@
-//! One flag per hyper-parameter, made from the list in `recipe`, so that none can be forgotten.
+//! Options of the recipe: a preset, a file, an effort, and single parameters by `--set KEY=VALUE`.
 
 use std::path::{Path, PathBuf};
 
-use clap::builder::BoolishValueParser;
+use clap::builder::{PossibleValue, StringValueParser, TypedValueParser};
 use clap::{Arg, ArgMatches, Args, Command, FromArgMatches};
 
 use splatsieve::error::{Error, Result, ShowPath, quoted};
@@ -11,20 +11,30 @@ use splatsieve::pipeline::RecipeRecord;
 use splatsieve::recipe::{Effort, MergePass, PRESETS, Recipe, parameters};
 
 const RECIPE: &str = "Recipe";
-const HEADING: &str = "Recipe, every parameter (`splatsieve recipe` prints a documented file)";
 
-/// Maximum number of bytes of a recipe: a written one has about 4,000.
+/// Maximum number of bytes of a recipe file. A file that splatsieve writes has about 4,000.
 const MAX_RECIPE: u64 = 1 << 20;
 
-/// The recipe as the command line gives it: a preset or a file, and single parameters over it.
+/// Key of the list of merge passes, the one parameter whose value is no single number or word.
+const PASSES: &str = "passes";
+
+/// One `--set KEY=VALUE`.
+#[derive(Debug, Clone, PartialEq)]
+enum Setting {
+    /// Section, key and value of a parameter.
+    Parameter { section: String, key: String, value: String },
+    /// A merge pass. The passes on the command line replace those of the recipe.
+    Pass(MergePass),
+}
+
+/// Recipe as the command line gives it: a preset or a file, then single parameters.
 #[derive(Debug, Clone, Default)]
 pub(super) struct RecipeFlags {
     preset: Option<String>,
     file: Option<PathBuf>,
     effort: Option<String>,
-    /// (section, key, value as TOML)
-    set: Vec<(String, String, String)>,
-    passes: Vec<MergePass>,
+    settings: Vec<Setting>,
+    has_no_refine: bool,
 }
 
 impl RecipeFlags {
@@ -67,18 +77,25 @@ impl RecipeFlags {
         if let Some(effort) = Effort::ALL.into_iter().find(|effort| self.effort.as_deref() == Some(effort.name())) {
             recipe = recipe.at_effort(effort);
         }
-        for (section, key, value) in &self.set {
+        for setting in &self.settings {
+            let Setting::Parameter { section, key, value } = setting else { continue };
             recipe = recipe.with(section, key, value).map_err(|message| {
                 Error::usage(format!(
-                    "--{}: {} does not fit: {}",
-                    key.replace('_', "-"),
-                    quoted(value),
+                    "--set {key}={value}: {}\n  see `splatsieve recipe --preset paper`",
                     message.trim_end()
                 ))
             })?;
         }
-        if !self.passes.is_empty() {
-            recipe.merge.passes.clone_from(&self.passes);
+        if self.has_no_refine {
+            recipe = recipe.unrefined();
+        }
+        let passes = self.settings.iter().filter_map(|setting| match setting {
+            Setting::Pass(pass) => Some(*pass),
+            Setting::Parameter { .. } => None,
+        });
+        let passes: Vec<MergePass> = passes.collect();
+        if !passes.is_empty() {
+            recipe.merge.passes = passes;
         }
         recipe.validate().map_err(Error::usage)?;
         Ok(recipe)
@@ -87,63 +104,27 @@ impl RecipeFlags {
 
 impl Args for RecipeFlags {
     fn augment_args(command: Command) -> Command {
-        let mut command = command
-            .arg(
-                Arg::new("preset")
-                    .long("preset")
-                    .value_parser(PRESETS.map(|(name, _)| name))
-                    .help_heading(RECIPE)
-                    .help("Where the parameters start from: `default`, the best known; `paper`, to the letter"),
-            )
-            .arg(
-                Arg::new("recipe")
-                    .long("recipe")
-                    .value_name("FILE")
-                    .value_parser(clap::value_parser!(PathBuf))
-                    .help_heading(RECIPE)
-                    .help("TOML file with any of the parameters; the recipe.toml beside a result repeats its run"),
-            );
-        command = command.arg(
-            Arg::new("effort").long("effort").value_parser(Effort::ALL.map(Effort::name)).help_heading(RECIPE).help(
-                "How much time to take for how small an error",
-            ).long_help("How much time to take for how small an error: `fast`, a third of the steps of refinement and a coarser look and rounds; `default`; `best`, three times the steps"),
-        );
-        for parameter in parameters() {
-            let mut arg = Arg::new(parameter.key.clone())
-                .long(parameter.key.replace('_', "-"))
-                .value_name("VALUE")
-                .help(parameter.doc)
-                .help_heading(HEADING)
-                .hide_short_help(true)
-                .allow_negative_numbers(true);
-            if parameter.boolean {
-                arg = arg
-                    .num_args(0..=1)
-                    .default_missing_value("true")
-                    .value_name("true|false")
-                    .value_parser(BoolishValueParser::new());
-            }
-            command = command.arg(arg);
-        }
-        command = command.arg(
-            Arg::new("no_refine")
-                .long("no-refine")
-                .action(clap::ArgAction::SetTrue)
-                .conflicts_with("refine")
-                .help_heading(RECIPE)
-                .help("Leave what stays as it was stored; what looks and moves alike merges instead"),
-        );
-        command.arg(
-            Arg::new("merge_pass")
-                .long("merge-pass")
-                .value_name("EPSILON,D0,RHO,TAU_M")
-                .action(clap::ArgAction::Append)
-                .value_parser(parse_pass)
-                .allow_hyphen_values(true)
-                .help("A merge pass instead of the recipe's; give it once per pass")
-                .help_heading(HEADING)
-                .hide_short_help(true),
-        )
+        let arg = |name: &'static str| Arg::new(name).long(name).help_heading(RECIPE);
+        let preset = arg("preset")
+            .value_parser(PRESETS.map(|(name, _)| name))
+            .help("Recipe to start from: `default`, the best known; `paper`, as published; `gentle`; `strong`");
+        let file = arg("recipe")
+            .value_name("FILE")
+            .value_parser(clap::value_parser!(PathBuf))
+            .help("TOML file with any of the parameters; the recipe.toml beside a result repeats its run");
+        let effort = arg("effort")
+            .value_parser(Effort::ALL.map(Effort::name))
+            .help("Time to spend on quality: `fast`, a third of the refinement steps and coarser ranking; `best`, three times the steps");
+        let set = arg("set")
+            .value_name("KEY=VALUE")
+            .action(clap::ArgAction::Append)
+            .value_parser(SettingParser)
+            .hide_possible_values(true)
+            .help("Set a parameter of the recipe; may be repeated. `splatsieve recipe --preset paper` lists all with their meaning");
+        let no_refine = arg("no-refine")
+            .action(clap::ArgAction::SetTrue)
+            .help("Leave out refinement: kept Gaussians stay as they are, similar ones are merged");
+        command.args([preset, file, effort, set, no_refine])
     }
 
     fn augment_args_for_update(command: Command) -> Command {
@@ -162,24 +143,64 @@ impl FromArgMatches for RecipeFlags {
         self.preset = matches.get_one::<String>("preset").cloned();
         self.file = matches.get_one::<PathBuf>("recipe").cloned();
         self.effort = matches.get_one::<String>("effort").cloned();
-        self.set = parameters()
-            .into_iter()
-            .filter_map(|p| {
-                let value = match p.boolean {
-                    true => matches.get_one::<bool>(&p.key)?.to_string(),
-                    false => matches.get_one::<String>(&p.key)?.clone(),
-                };
-                Some((p.section, p.key, value))
-            })
-            .collect();
-        if matches.get_flag("no_refine") {
-            self.set.push(("refine".to_owned(), "refine".to_owned(), "none".to_owned()));
-        }
-        self.passes = matches.get_many::<MergePass>("merge_pass").into_iter().flatten().copied().collect();
+        self.settings = matches.get_many::<Setting>("set").into_iter().flatten().cloned().collect();
+        self.has_no_refine = matches.get_flag("no-refine");
         Ok(())
     }
 }
 
+/// Parser of `KEY=VALUE`. Shells complete the keys.
+#[derive(Clone)]
+struct SettingParser;
+
+impl TypedValueParser for SettingParser {
+    type Value = Setting;
+
+    fn parse_ref(
+        &self,
+        command: &Command,
+        arg: Option<&Arg>,
+        value: &std::ffi::OsStr,
+    ) -> std::result::Result<Setting, clap::Error> {
+        let parser = StringValueParser::new().try_map(|text| parse_setting(&text));
+        parser.parse_ref(command, arg, value)
+    }
+
+    fn possible_values(&self) -> Option<Box<dyn Iterator<Item = PossibleValue> + '_>> {
+        let keys = parameters().into_iter().map(|parameter| parameter.key).chain([PASSES.to_owned()]);
+        Some(Box::new(keys.map(|key| PossibleValue::new(format!("{key}=")))))
+    }
+}
+
+/// Parses `key=value` or `section.key=value`.
+fn parse_setting(text: &str) -> std::result::Result<Setting, String> {
+    let (name, value) =
+        text.split_once('=').ok_or_else(|| format!("expected KEY=VALUE such as mu=2, found {}", quoted(text)))?;
+    let (name, value) = (name.trim().replace('-', "_"), value.trim());
+    let key = name.rsplit('.').next().unwrap_or_default();
+    if name == PASSES || name == format!("merge.{PASSES}") {
+        return parse_pass(value).map(Setting::Pass);
+    }
+    let all = parameters();
+    let found = all
+        .iter()
+        .find(|parameter| name == parameter.key || name == format!("{}.{}", parameter.section, parameter.key));
+    match found {
+        Some(parameter) => Ok(Setting::Parameter {
+            section: parameter.section.clone(),
+            key: parameter.key.clone(),
+            value: value.to_owned(),
+        }),
+        None => {
+            let near = all.iter().map(|parameter| (strsim::jaro_winkler(key, &parameter.key), &parameter.key));
+            let near = near.filter(|(score, _)| *score > 0.7).max_by(|a, b| a.0.total_cmp(&b.0));
+            let near = near.map_or(String::new(), |(_, key)| format!("; a similar parameter exists: {key}"));
+            Err(format!("there is no parameter {}{near}; `splatsieve recipe --preset paper` lists all", quoted(&name)))
+        }
+    }
+}
+
+/// Parses a merge pass `EPSILON,D0,RHO,TAU_M`.
 fn parse_pass(text: &str) -> std::result::Result<MergePass, String> {
     let numbers: Vec<f64> = numbers(text)?;
     match numbers[..] {
@@ -204,10 +225,14 @@ mod tests {
         RecipeFlags::from_arg_matches(&matches).unwrap().recipe()
     }
 
+    fn message(args: &[&str]) -> String {
+        parse(args).unwrap_err().to_string()
+    }
+
     #[test]
-    fn flags_override_the_preset() {
-        let recipe =
-            parse(&["--preset", "paper", "--mu", "2", "--weigh-motion-by-life", "--low-priority", "rescue"]).unwrap();
+    fn set_overrides_the_preset() {
+        let settings = ["--set", "mu=2", "--set", "weigh_motion_by_life=true", "--set", "select.low_priority=rescue"];
+        let recipe = parse(&[&["--preset", "paper"], &settings[..]].concat()).unwrap();
         let mut expected = Recipe::preset("paper").unwrap();
         expected.score.mu = 2.0;
         expected.score.weigh_motion_by_life = true;
@@ -216,71 +241,63 @@ mod tests {
     }
 
     #[test]
-    fn boolean_parameters_take_an_optional_value() {
-        let paper = Recipe::preset("paper").unwrap();
-        assert!(!paper.score.clip_norm);
-        for (args, expected) in [
-            (&["--clip-norm"][..], true),
-            (&["--clip-norm", "true"], true),
-            (&["--clip-norm=yes"], true),
-            (&["--clip-norm", "false"], false),
-            (&["--clip-norm=off"], false),
-            (&["--clip-norm", "--mu", "2"], true),
-        ] {
-            let args = [&["--preset", "paper"], args].concat();
-            assert_eq!(parse(&args).unwrap().score.clip_norm, expected, "{args:?}");
+    fn every_parameter_can_be_set_and_is_completed() {
+        let keys: Vec<String> =
+            SettingParser.possible_values().unwrap().map(|value| value.get_name().to_owned()).collect();
+        for parameter in parameters() {
+            assert!(keys.contains(&format!("{}=", parameter.key)), "{}", parameter.key);
+            let setting = parse_setting(&format!("{}.{}=1", parameter.section, parameter.key)).unwrap();
+            assert!(matches!(setting, Setting::Parameter { key, .. } if key == parameter.key));
         }
-        assert!(parse(&["--clip-norm=maybe"]).unwrap_err().to_string().contains("--clip-norm"));
     }
 
     #[test]
-    fn negative_numbers_are_values_and_not_options() {
-        assert!(parse(&["--mu", "-1"]).unwrap_err().to_string().contains("score.mu: expected 0 to 1e6, found -1"));
-        assert_eq!(parse(&["--merge-pass", "1,1e9,-1,-0.5"]).unwrap().merge.passes[0].tau_m, -0.5);
-        assert!(parse(&["--merge-pass", "-1,1,0,0"]).unwrap_err().to_string().contains("merge.passes.epsilon"));
+    fn values_out_of_range_name_the_parameter_and_the_range() {
+        assert!(message(&["--set", "mu=-1"]).contains("score.mu: expected 0 to 1e6, found -1"));
+        assert!(message(&["--set", "passes=-1,1,0,0"]).contains("merge.passes.epsilon"));
+        assert!(message(&["--set", "clip_norm=maybe"]).contains("clip_norm"));
+        for setting in ["mu=many", "low_priority=maybe", "keep_fraction=1.5"] {
+            let key = setting.split('=').next().unwrap();
+            assert!(message(&["--set", setting]).contains(key), "{setting}");
+        }
     }
 
     #[test]
-    fn effort_moves_the_preset_and_single_parameters_stand_over_it() {
+    fn an_unknown_parameter_gets_the_nearest_name() {
+        let text = message(&["--set", "refine_step=5"]);
+        assert!(text.contains("refine_steps") && text.contains("splatsieve recipe"), "{text}");
+        assert!(message(&["--set", "mu"]).contains("KEY=VALUE"));
+    }
+
+    #[test]
+    fn effort_changes_the_preset_before_single_parameters() {
         let default = parse(&[]).unwrap();
         assert_eq!(parse(&["--effort", "default"]).unwrap(), default);
-        let best = parse(&["--effort", "best", "--round-pictures", "7"]).unwrap();
+        let best = parse(&["--effort", "best", "--set", "round_pictures=7"]).unwrap();
         assert_eq!(best.select.round_pictures, 7);
         assert!(best.refine.refine_steps > default.refine.refine_steps);
         assert!(parse(&["--effort", "luck"]).is_err());
     }
 
     #[test]
-    fn groups_are_named_and_none_of_them_is_said_in_two_ways() {
+    fn refined_attributes_are_named_in_one_list() {
         let refined = |args: &[&str]| parse(args).unwrap().refine.refine.0;
         assert_eq!(refined(&[]), Columns::all());
-        assert_eq!(refined(&["--refine", "colour, scale"]), Columns::SH | Columns::LOG_SCALE);
-        for none in [&["--no-refine"][..], &["--refine", "none"], &["--preset", "gentle"]] {
+        assert_eq!(refined(&["--set", "refine=color, scale"]), Columns::SH | Columns::LOG_SCALE);
+        for none in [&["--no-refine"][..], &["--set", "refine=none"], &["--preset", "gentle"]] {
             assert_eq!(refined(none), Columns::empty());
         }
-        let message = parse(&["--refine", "colour,size"]).unwrap_err().to_string();
-        assert!(
-            message.contains("--refine") && message.contains("\"size\"") && message.contains("rotation"),
-            "{message}"
-        );
-        assert!(parse(&["--refine", "scale", "--no-refine"]).is_err());
-        let text = parse(&["--refine", "position,opacity"]).unwrap().to_toml();
+        let text = message(&["--set", "refine=color,size"]);
+        assert!(text.contains("refine") && text.contains("\"size\"") && text.contains("rotation"), "{text}");
+        let text = parse(&["--set", "refine=position,opacity"]).unwrap().to_toml();
         assert!(text.contains("refine = \"opacity,position\""), "{text}");
     }
 
     #[test]
-    fn merge_passes_replace_the_recipes() {
-        let recipe = parse(&["--merge-pass", "0.1,1,0.5,0.25", "--merge-pass", "0.2,1,0.5,0.25"]).unwrap();
-        assert_eq!(recipe.merge.passes.len(), 2);
-        assert_eq!(recipe.merge.passes[1], MergePass { epsilon: 0.2, d0: 1.0, rho: 0.5, tau_m: 0.25 });
-    }
-
-    #[test]
-    fn a_value_that_does_not_fit_names_its_flag() {
-        for args in [["--mu", "many"], ["--low-priority", "maybe"], ["--keep-fraction", "1.5"]] {
-            let message = parse(&args).unwrap_err().to_string();
-            assert!(message.contains(args[0]) || message.contains("keep_fraction"), "{message}");
-        }
-        assert!(parse(&["--merge-pass", "1,2"]).unwrap_err().to_string().contains("four numbers"));
+    fn passes_on_the_command_line_replace_those_of_the_recipe() {
+        let recipe = parse(&["--set", "passes=0.1,1,0.5,0.25", "--set", "merge.passes=0.2,1,0.5,-0.25"]).unwrap();
+        let pass = |epsilon, tau_m| MergePass { epsilon, d0: 1.0, rho: 0.5, tau_m };
+        assert_eq!(recipe.merge.passes, [pass(0.1, 0.25), pass(0.2, -0.25)]);
+        assert!(message(&["--set", "passes=1,2"]).contains("four numbers"));
     }
 }

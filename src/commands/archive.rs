@@ -1,11 +1,12 @@
-//! The verb `unpack` of an archive: the model that it holds, as files that its renderer opens.
+//! Unpacking of an archive: writes the model in it as files that its renderer opens. Part of the command `convert`.
 
 use std::fs;
 use std::io::Read;
 use std::path::Path;
 
 use crate::TOOL;
-use crate::archive::{ArchiveSize, MAGIC};
+use crate::archive::MAGIC;
+use crate::commands::convert::Converted;
 use crate::error::{Error, Result};
 use crate::files::atomic::{Kind, MARKER, Replace, StagedFile, StagedFolder, check_target};
 use crate::files::names::name_of;
@@ -13,20 +14,9 @@ use crate::files::open::open_file;
 use crate::limits::ReadLimit;
 use crate::model::Columns;
 use crate::models::archive::{is_folder, read_archive, unpack};
-use crate::outputs::kind::check_folder_name;
+use crate::outputs::kind::{OutputKind, check_folder_name};
 
-/// What was unpacked.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Unpacked {
-    /// N.
-    pub gaussians: usize,
-    /// Bytes of the archive.
-    pub parts: ArchiveSize,
-    /// Bytes of the field's tensors and the cloud's attributes, as f32.
-    pub bytes: u64,
-}
-
-/// Whether the file at `path` begins as an archive does.
+/// Returns whether the file at `path` begins with the magic bytes of an archive.
 ///
 /// # Errors
 /// A file that cannot be read.
@@ -40,23 +30,34 @@ pub fn is_archive(path: &Path) -> Result<bool> {
     Ok(head == MAGIC)
 }
 
-/// Writes what the archive at `path` holds to `output`: a model folder, or a PLY where it is of one.
+/// Writes the model in the archive at `path` to `output`: a model folder, or a PLY if the archive was made of one.
 ///
 /// # Errors
-/// An archive that is damaged, or exceeds `memory`; an output that is there already, or that cannot be written.
-pub fn unpack_archive(path: &Path, output: &Path, overwrite: Replace, memory: ReadLimit) -> Result<Unpacked> {
+/// An archive that is damaged or needs more than `memory`; an output that exists already or cannot be written.
+pub fn unpack_archive(path: &Path, output: &Path, overwrite: Replace, memory: ReadLimit) -> Result<Converted> {
     let (content, parts) = read_archive(path, memory)?;
     let values: usize = content.tensors.values().map(|tensor| tensor.data.len()).sum();
     let attributes = content.cloud.len() * Columns::all().width(content.cloud.sh_degree());
-    let unpacked = Unpacked { gaussians: content.cloud.len(), parts, bytes: 4 * (values + attributes) as u64 };
+    let converted = |kind| Converted {
+        path: output.to_owned(),
+        kind,
+        gaussians: content.cloud.len(),
+        frames: None,
+        bytes: 4 * (values + attributes) as u64,
+        notes: vec![format!(
+            "{} bytes of values from an archive of {} bytes",
+            4 * (values + attributes),
+            parts.total()
+        )],
+    };
     if !is_folder(&content) {
         check_target(output, Kind::File, &[path], overwrite)?;
         let staged = StagedFile::new(output, overwrite)?;
         unpack(&content, path, staged.path())?;
         staged.commit()?;
-        return Ok(unpacked);
+        return Ok(converted(OutputKind::Ply));
     }
-    check_folder_name(output, "unpack")?;
+    check_folder_name(output, "convert")?;
     check_target(output, Kind::Folder, &[path], overwrite)?;
     let staged = StagedFolder::new(output, overwrite)?;
     unpack(&content, path, staged.path())?;
@@ -64,5 +65,5 @@ pub fn unpack_archive(path: &Path, output: &Path, overwrite: Replace, memory: Re
     let text = serde_json::json!({ "tool": TOOL, "input": { "path": name_of(path) } });
     fs::write(&marker, format!("{text:#}\n")).map_err(Error::io("write", &marker))?;
     staged.commit()?;
-    Ok(unpacked)
+    Ok(converted(OutputKind::Model))
 }

@@ -1,33 +1,34 @@
-//! The verbs around containers: pack, info, verify, unpack, recover.
+//! Containers and frame streams: packing, checking and repairing a container, writing frames, and the command `info`.
 
 use std::collections::BTreeMap;
 use std::fs;
-use std::io::{Stdin, Write};
+use std::io::{Read, Stdin, Write};
 use std::ops::Range;
 use std::path::Path;
 
 use gseq::{Compression, Reader, RecoverReport, VerifyReport};
 use serde::Serialize;
 
-use crate::TOOL;
 use crate::cache::{Completion, SpillWriter};
+use crate::commands::archive::is_archive;
+use crate::commands::convert::Converted;
 use crate::error::{Error, Result, ShowPath};
-use crate::files::atomic::{Kind, MARKER, Replace, StagedFile, StagedFolder, check_target};
+use crate::files::atomic::{Kind, Replace, StagedFile, check_target};
 use crate::files::container::Container;
 use crate::files::frame_stream::{FrameStream, StreamHeader};
+use crate::files::open::open_file;
 use crate::limits::Limits;
 use crate::memory_plan::{Budget, Plan, ResourceEstimate, Workload};
 use crate::model::Columns;
 use crate::models;
 use crate::models::stream::pack_stream;
-use crate::models::trajectories::write_sequence;
 use crate::models::{ColumnInfo, InputModel, Size, Timing};
 use crate::outputs::bounds::{Bounds, MaxError};
 use crate::outputs::container::{
     BOUNDED_FRAME_BLOCK, FRAME_BLOCK, Packing, join_container, spill_blocks, write_container,
 };
 use crate::outputs::frame_stream::StreamWriter;
-use crate::outputs::kind::{OutputKind, check_container_name, check_folder_name};
+use crate::outputs::kind::{OutputKind, check_container_name};
 use crate::passes::FrameReaders;
 use crate::pipeline::stages::write::ENCODING;
 use crate::pipeline::summary::InputSummary;
@@ -38,21 +39,6 @@ use crate::source::{BlockReader, FrameSource, Ids, ReadPlan};
 
 /// What packing is called.
 const PACK: &str = "pack";
-
-/// What `pack` wrote.
-#[derive(Debug)]
-pub struct Packed {
-    /// N.
-    pub gaussians: usize,
-    /// T.
-    pub frames: usize,
-    /// Size of the container.
-    pub bytes: u64,
-    /// Why that is more than its input has, if it is.
-    pub larger: Option<String>,
-    /// Things a person should know.
-    pub notes: Vec<String>,
-}
 
 /// How `pack` stores values.
 #[derive(Debug, Clone)]
@@ -78,12 +64,17 @@ impl Storing {
 ///
 /// # Errors
 /// What is wrong with the input; a bound of the extent of a stream, which is known at its end alone.
-pub fn pack(input: &InputOptions, output: &Path, storing: &Storing, overwrite: Replace) -> Result<Completion<Packed>> {
+pub fn pack(
+    input: &InputOptions,
+    output: &Path,
+    storing: &Storing,
+    overwrite: Replace,
+) -> Result<Completion<Converted>> {
     Completion::from_result(pack_whole(input, output, storing, overwrite))
 }
 
-fn pack_whole(input: &InputOptions, output: &Path, storing: &Storing, overwrite: Replace) -> Result<Packed> {
-    check_container_name(output, "pack")?;
+fn pack_whole(input: &InputOptions, output: &Path, storing: &Storing, overwrite: Replace) -> Result<Converted> {
+    check_container_name(output, "convert")?;
     check_target(output, Kind::File, &[&input.path], overwrite)?;
     let opened = match input.is_stream().then(|| open_stream(input)).transpose()? {
         Some(stream) if is_linked(stream.header(), input) => link_stream(stream, input, None)?,
@@ -119,8 +110,8 @@ fn pack_whole(input: &InputOptions, output: &Path, storing: &Storing, overwrite:
     staged.commit()?;
     let info = opened.input.source().info();
     let larger = Size::of_frames(bytes).why_larger_than(&opened.input.size()?);
-    let notes = opened.notes.into_iter().chain(work.take_notes()).collect();
-    Ok(Packed { gaussians: info.count, frames: info.times.len(), bytes, larger, notes })
+    let notes = opened.notes.into_iter().chain(work.take_notes()).chain(larger).collect();
+    Ok(packed(output, info.count, info.times.len(), bytes, notes))
 }
 
 /// Packs a stream of numbered Gaussians as it arrives.
@@ -130,7 +121,7 @@ fn pack_arriving(
     output: &Path,
     storing: &Storing,
     overwrite: Replace,
-) -> Result<Packed> {
+) -> Result<Converted> {
     let packing = storing.packing(|| {
         let message = "--max-error: expected scene units, as the extent of a stream is known at its end alone, found %";
         Err(Error::usage(message))
@@ -143,7 +134,12 @@ fn pack_arriving(
     let bytes = fs::metadata(staged.path()).map_err(Error::io("read", staged.path()))?.len();
     staged.commit()?;
     let larger = Size::of_frames(bytes).why_larger_than(&Size::of_frames(received));
-    Ok(Packed { gaussians, frames, bytes, larger, notes: Vec::new() })
+    Ok(packed(output, gaussians, frames, bytes, larger.into_iter().collect()))
+}
+
+/// Returns the result of packing a container.
+fn packed(output: &Path, gaussians: usize, frames: usize, bytes: u64, notes: Vec<String>) -> Converted {
+    Converted { path: output.to_owned(), kind: OutputKind::Gseq, gaussians, frames: Some(frames), bytes, notes }
 }
 
 /// Writes any input as a frame stream; gives the input.
@@ -176,36 +172,30 @@ pub fn unpack_stream(input: &InputOptions, to: impl Write) -> Result<Opened> {
     Ok(opened)
 }
 
-/// Writes every frame of an input as a PLY file into the folder `output`; gives the input.
-pub fn unpack(input: &InputOptions, output: &Path, overwrite: Replace) -> Result<Opened> {
-    check_folder_name(output, "unpack")?;
-    check_target(output, Kind::Folder, &[&input.path], overwrite)?;
-    let opened = open_input(input)?;
-    let source = opened.input.source();
-    let plan = Plan::fit(workload(&*opened.input), input.memory, &input.events, unpacking)?;
-    plan.tell_time(input.memory.tell, &input.events);
-    let held = plan.limits.frames_held;
-    let staged = StagedFolder::new(output, overwrite)?;
-    write_sequence(source, OutputKind::PlySequence, staged.path(), held, &input.events)?;
-    let marker = serde_json::json!({
-        "tool": TOOL,
-        "input": InputSummary::new(&*opened.input, &input.path, opened.input.digest()?)?.without_folders(),
-    });
-    let path = staged.path().join(MARKER);
-    fs::write(&path, format!("{marker:#}\n")).map_err(Error::io("write", &path))?;
-    staged.commit()?;
-    Ok(opened)
+/// Refuses a file that is no container and no damaged one.
+fn check_is_container(path: &Path) -> Result<()> {
+    let mut head = Vec::new();
+    open_file(path)?.take(16).read_to_end(&mut head).map_err(Error::io("read", path))?;
+    let is_named = path.extension().is_some_and(|found| found.eq_ignore_ascii_case("gseq"));
+    if is_named || head.starts_with(&gseq::MAGIC[..4.min(head.len())]) {
+        return Ok(());
+    }
+    let found = if is_archive(path)? { "an archive (.gsz)" } else { "another kind of file" };
+    Err(Error::input(path, "", "a .gseq container", found)
+        .hint(format!("`splatsieve info {}` reads it and says what it holds", path.shown())))
 }
 
 /// Reads every byte of a container and checks it, within the memory that a run takes by default.
 pub fn verify(path: &Path) -> Result<VerifyReport> {
+    check_is_container(path)?;
     let memory = Budget::default().read_limit().bytes();
     Ok(Reader::open_within(path, memory)?.verify_within(memory)?)
 }
 
 /// Saves the complete frames of a container that was cut short.
 pub fn recover(input: &Path, output: &Path, overwrite: Replace) -> Result<RecoverReport> {
-    check_container_name(output, "recover")?;
+    check_container_name(output, "info --repair")?;
+    check_is_container(input)?;
     check_target(output, Kind::File, &[input], overwrite)?;
     let staged = StagedFile::new(output, overwrite)?;
     let report = gseq::recover_within(input, staged.path(), Budget::default().read_limit().bytes())?;

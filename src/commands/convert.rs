@@ -1,4 +1,7 @@
-//! The verb `convert`: any input as any kind of result, with all of its Gaussians as they are.
+//! Command `convert`: writes any input in another format, with all its Gaussians unchanged.
+//!
+//! Containers are written by [`container::pack`](super::container::pack); archives are unpacked by
+//! [`unpack_archive`].
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -6,8 +9,9 @@ use std::path::{Path, PathBuf};
 use serde::Serialize;
 
 use crate::TOOL;
+use crate::commands::archive::{is_archive, unpack_archive};
 use crate::compressed_model::CompressedModel;
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, ShowPath};
 use crate::files::atomic::{Kind, MARKER, Replace, StagedFile, StagedFolder, check_target};
 use crate::limits::Limits;
 use crate::memory_plan::{Plan, ResourceEstimate, Workload};
@@ -22,27 +26,41 @@ use crate::scene::{InputOptions, open_input};
 /// Bytes that a Gaussian takes while formats are fitted to it and encoded, about: a few pieces of it.
 const FITTED: u64 = 4 * 600;
 
-/// What `convert` wrote.
+/// Result of `convert`.
 #[derive(Debug, Serialize)]
 pub struct Converted {
-    /// Its path.
+    /// Path of the output.
     pub path: PathBuf,
-    /// Its kind.
+    /// Format of the output.
     pub kind: OutputKind,
-    /// N of the input.
+    /// Number of Gaussians N of the input.
     pub gaussians: usize,
-    /// T of the input.
-    pub frames: usize,
-    /// Bytes of all files.
+    /// Number of frames T of the input; `None` for a model without frames of its own.
+    pub frames: Option<usize>,
+    /// Bytes of all files that were written.
     pub bytes: u64,
-    /// Things a person should know.
+    /// Notes for the user.
     pub notes: Vec<String>,
 }
 
-/// Writes `input` to `output`, as `asked` or as the name asks, else as the input's own kind of result.
+impl Converted {
+    /// Returns one line for the terminal.
+    pub fn text(&self) -> String {
+        let frames = self.frames.map_or(String::new(), |frames| format!(" x {frames} frames"));
+        format!("{}: {} Gaussians{frames}, {} bytes\n", self.path.shown(), self.gaussians, self.bytes)
+    }
+}
+
+/// Returns whether `convert` writes a container to `output`.
+pub fn is_container(output: &Path, asked: Option<OutputKind>) -> bool {
+    OutputKind::from_path(output, asked, OutputKind::Model) == OutputKind::Gseq
+}
+
+/// Writes `input` to `output` in the format `asked`; `None`: by the name of the output. The format of a folder is the input's own
+/// model format, or one PLY per frame for a sequence.
 ///
 /// # Errors
-/// What is wrong with the input; a kind that it cannot be written as; an output that is there already.
+/// Inputs that cannot be read, a format that the input cannot be written as, an output that exists already.
 pub fn convert(
     input: &InputOptions,
     output: &Path,
@@ -50,16 +68,26 @@ pub fn convert(
     overwrite: Replace,
 ) -> Result<Converted> {
     if input.is_stream() {
-        return Err(Error::usage("a frame stream is packed first: splatsieve pack - -o FILE.gseq"));
+        return Err(Error::usage(
+            "a frame stream can be converted to a container only: splatsieve convert - NAME.gseq\n  then convert that file",
+        ));
     }
     if asked.is_none() {
         OutputKind::check_name(output)?;
     }
+    let is_own = |kind| matches!(kind, OutputKind::Model | OutputKind::Ply);
+    if is_own(OutputKind::from_path(output, asked, OutputKind::Model)) && is_archive(&input.path)? {
+        return unpack_archive(&input.path, output, overwrite, input.memory.read_limit());
+    }
     let opened = open_input(input)?;
     let (family, source) = (&*opened.input, opened.input.source());
-    let kind = OutputKind::from_path(output, asked, family.own_output());
+    let own = match family.own_output() {
+        OutputKind::Gseq => OutputKind::PlySequence,
+        own => own,
+    };
+    let kind = OutputKind::from_path(output, asked, own);
     if kind == OutputKind::Archive {
-        return Err(Error::usage("an archive is what compress writes: splatsieve compress INPUT -o NAME.gsz"));
+        return Err(Error::usage("archives are written by compress: splatsieve compress INPUT -o NAME.gsz"));
     }
     let target = if kind.is_folder() { Kind::Folder } else { Kind::File };
     check_target(output, target, &[&input.path], overwrite)?;
@@ -92,7 +120,7 @@ pub fn convert(
         staged.commit()?;
         bytes
     };
-    Ok(Converted { path: output.to_owned(), kind, gaussians, frames, bytes, notes })
+    Ok(Converted { path: output.to_owned(), kind, gaussians, frames: Some(frames), bytes, notes })
 }
 
 /// All states once, and what is fitted to them.

@@ -7,7 +7,6 @@ use std::path::{Path, PathBuf};
 use rayon::prelude::*;
 
 use crate::error::{Error, Result, ShowPath};
-use crate::evaluation::open_compressed;
 use crate::files::atomic::{Kind, Replace, StagedFile, check_target};
 use crate::limits::Limits;
 use crate::memory_plan::ResourceEstimate;
@@ -16,6 +15,7 @@ use crate::outputs::film::{FilmFormat, FilmOutput};
 use crate::passes::{Batch, Subject, ViewStates, show};
 use crate::progress::Events;
 use crate::render::Image;
+use crate::scene::open_compressed;
 use crate::scene::path::along;
 use crate::scene::pictures::{self, PictureSet, background};
 use crate::scene::{InputOptions, Opened, open_input, scene_of};

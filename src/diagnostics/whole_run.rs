@@ -73,6 +73,7 @@ impl WholeRun<'_> {
             ground_truth: None,
             part: PictureSet::HeldOut,
             max_frames: self.max_frames,
+            max_views: None,
             background: self.background,
             flip: false,
             csv: None,

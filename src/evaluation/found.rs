@@ -12,6 +12,7 @@ use serde::{Deserialize, Serialize};
 use crate::error::ShowPath;
 use crate::files::csv::{known, table};
 use crate::files::names::name_of;
+use crate::journal::records::RenderTime;
 use crate::models::Size;
 use crate::models::size::compared;
 use crate::pipeline::summary::CameraSummary;
@@ -141,6 +142,9 @@ pub struct Evaluation {
     /// Both against the ground truth, where that is given.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub ground_truth: Option<TruthComparison>,
+    /// Render time of both models, where it was measured.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub render_ms: Option<RenderTime>,
     /// Things a person should know.
     pub notes: Vec<String>,
     /// The same of the work folder, which are no part of the result.
@@ -269,6 +273,10 @@ impl Evaluation {
                 );
             }
         }
+        if let Some(RenderTime { before, after }) = self.render_ms {
+            let _ =
+                writeln!(out, "  render time per view, one thread: {before:.1} ms original, {after:.1} ms compressed");
+        }
         for note in &self.notes {
             let _ = writeln!(out, "  note: {note}");
         }
@@ -342,6 +350,7 @@ mod tests {
                 compressed: of.clone(),
                 original: of,
             }),
+            render_ms: None,
             notes: Vec::new(),
             work_notes: Vec::new(),
             pictures,

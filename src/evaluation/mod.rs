@@ -22,21 +22,21 @@ use serde::de::DeserializeOwned;
 
 use crate::TOOL;
 use crate::cache::{CacheKey, Completion};
-use crate::error::{Error, Result, ShowPath};
+use crate::error::{Error, Result};
 use crate::evaluation::found::{Both, Comparison, Evaluation, ImageScore, PictureScores, TruthComparison};
 use crate::files::atomic::{Kind, Replace, StagedFile, check_target};
 use crate::limits::Limits;
 use crate::memory_plan::{Budget, Plan, ResourceEstimate, Workload};
 use crate::metrics::{self, flip, psnr, ssim, temporal_error};
 use crate::model::{Camera, Gaussians, Picture};
-use crate::models;
-use crate::models::{InputModel, OpenOptions, Timing};
+use crate::models::InputModel;
 use crate::passes::{Batch, Subject, ViewStates, show};
+use crate::pipeline::stages::quality::render_times;
 use crate::pipeline::summary::CameraSummary;
 use crate::render::Image;
 use crate::scene::photographs::Photographs;
-use crate::scene::pictures::{self, PictureSet, background, pictures, thin};
-use crate::scene::{InputOptions, Scene, open_scene};
+use crate::scene::pictures::{self, PictureSet, background, pictures, spread_views, thin};
+use crate::scene::{InputOptions, Scene, open_compressed, open_scene};
 
 /// What comparing pictures is called.
 const NAME: &str = "evaluate";
@@ -54,6 +54,8 @@ pub struct EvaluateOptions {
     pub part: PictureSet,
     /// Compare at most this many frames, evenly; none: all.
     pub max_frames: Option<usize>,
+    /// Maximum number of views, spread over frames and cameras; `None`: all.
+    pub max_views: Option<usize>,
     /// Red, green, blue in [0, 1]; none: see [`background`].
     pub background: Option<[f32; 3]>,
     /// Whether to compute FLIP too, which takes longer than all else.
@@ -82,7 +84,8 @@ pub(crate) fn evaluate_whole(options: &EvaluateOptions) -> Result<Evaluation> {
     }
     let mut side = ModelPair::open(options)?;
     side.keep_to(options.original.memory, needs)?;
-    let evaluation = side.evaluate()?;
+    let mut evaluation = side.evaluate()?;
+    evaluation.render_ms = render_times(&side.scene, side.compressed.source(), &side.pictures)?;
     if let Some(csv) = &options.csv {
         let staged = StagedFile::new(csv, options.overwrite)?;
         fs::write(staged.path(), evaluation.csv()).map_err(Error::io("write", csv))?;
@@ -139,6 +142,9 @@ impl ModelPair {
         let mut chosen = pictures(&scene.rig, times, options.part)?;
         if let Some(frames) = options.max_frames {
             chosen = thin(chosen, frames);
+        }
+        if let Some(views) = options.max_views {
+            chosen = spread_views(chosen, views);
         }
         let truth = match &options.ground_truth {
             Some(folder) => Some(Photographs::of_some(folder, &scene.rig, times, chosen.clone())?.1),
@@ -294,6 +300,7 @@ impl ModelPair {
             loss: Comparison::from_pictures(&scores, |picture| Some(picture.loss))
                 .expect("every picture has this score"),
             ground_truth,
+            render_ms: None,
             notes: scene.notes.iter().cloned().chain(size.compressed.why_larger_than(&size.original)).collect(),
             work_notes: scene.work.take_notes(),
             pictures: scores,
@@ -439,38 +446,6 @@ fn last_before(pictures: &[Picture], start: usize, these: &[Picture]) -> Vec<Pic
         pictures[..start].iter().rev().filter(|picture| views.remove(&picture.view)).copied().collect();
     last.reverse();
     last
-}
-
-/// Most that time stamps of the same frame may differ, in parts of the time span: files round them.
-const TIME_TOLERANCE: f64 = 1e-6;
-
-/// Opens the compressed model, of which holds what `options` say of the original but its iteration, at the original's
-/// frames.
-pub(crate) fn open_compressed(path: &Path, original: &Scene, options: &InputOptions) -> Result<Box<dyn InputModel>> {
-    let times = &original.source().info().times;
-    let input = models::open(path, &OpenOptions { iteration: None, ..options.opening() })?;
-    let input = match input.timing() {
-        Timing::Continuous => input.with_times(times.clone())?,
-        Timing::Numbered if input.source().info().times.len() == times.len() => input.with_times(times.clone())?,
-        Timing::Numbered | Timing::Stamped => input,
-    };
-    let found = &input.source().info().times;
-    let expected = |what: String| format!("{what}, as in {}", original.path.shown());
-    if found.len() != times.len() {
-        let expected = expected(format!("{} frames", times.len()));
-        return Err(Error::input(path, "", expected, format!("{} frames", found.len()))
-            .hint("compare models of the same scene, with the cameras both were made for"));
-    }
-    let span = times.first().zip(times.last()).map_or(0.0, |(first, last)| last - first);
-    let tolerance = TIME_TOLERANCE * if times.len() > 1 { span } else { 1.0 };
-    match (0..times.len()).find(|&frame| (found[frame] - times[frame]).abs() > tolerance) {
-        Some(frame) => {
-            let expected = expected(format!("time {}", times[frame]));
-            Err(Error::input(path, format!("frame {frame}"), expected, found[frame].to_string())
-                .hint("compare models of the same scene, with the cameras both were made for"))
-        }
-        None => Ok(input),
-    }
 }
 
 /// Of a picture: compressed against original, and each against the ground truth, where that is given.

@@ -69,7 +69,24 @@ pub fn check_target(target: &Path, kind: Kind, inputs: &[&Path], replace: Replac
         return Ok(());
     }
     tidy(target);
-    check_replace(target, kind, replace)
+    check_replace(target, kind, replace)?;
+    check_writable(target, &real_parent)
+}
+
+/// Confirms that a file can be created in `parent`, the folder that `target` is written into. The file has no name and is
+/// gone when this returns.
+///
+/// # Errors
+/// As [`Error::Usage`]: a folder without write permission, a read-only file system, no space left.
+fn check_writable(target: &Path, parent: &Path) -> Result<()> {
+    match tempfile::tempfile_in(parent) {
+        Ok(_) => Ok(()),
+        Err(error) => Err(Error::usage(format!(
+            "{}: cannot write into the folder {}: {error}\n  name an output in a folder that can be written",
+            target.shown(),
+            parent.shown()
+        ))),
+    }
 }
 
 /// Confirms with [`check_target`] that a file and its `companions` may be written.

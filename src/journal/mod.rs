@@ -108,6 +108,14 @@ impl Journal {
         })
     }
 
+    /// Returns the mean PSNR of the result against the original on validation views, dB: that of the last stage that changed
+    /// the result and measured it.
+    pub fn result_psnr(&self) -> Option<f64> {
+        let bands = self.bands.as_ref().map(|bands| bands.result);
+        let field = self.field.as_ref().and_then(|field| field.result);
+        bands.or(field).or(self.refined.map(|refined| refined.result))
+    }
+
     /// What `compute` finds, as a piece of `work` called `stage`, with all that it writes down.
     ///
     /// # Errors

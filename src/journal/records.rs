@@ -137,6 +137,48 @@ pub struct RefinedSummary {
     pub result: f64,
 }
 
+/// Split that the views of a quality figure belong to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum ViewKind {
+    /// Test views: nothing was fitted to them or chosen by them.
+    Test,
+    /// Validation views: the best state of refinement was chosen by them.
+    Validation,
+    /// Training views: Gaussians were ranked by them.
+    Training,
+    /// Views of a virtual rig, because the scene has no cameras.
+    Virtual,
+}
+
+/// Time of rendering one view on one thread, without the evaluation of the deformation field: the median of several, in
+/// milliseconds.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct RenderTime {
+    /// The original.
+    pub before: f64,
+    /// The result.
+    pub after: f64,
+}
+
+/// Quality of the result against the original.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct QualitySummary {
+    /// Split of the views.
+    pub kind: ViewKind,
+    /// Number of views.
+    pub views: usize,
+    /// Mean PSNR against the original's renders, dB.
+    #[serde(deserialize_with = "number")]
+    pub psnr: f64,
+    /// Mean SSIM; `None` where only the PSNR of validation views is known.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub ssim: Option<f64>,
+    /// Render time before and after.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub render_ms: Option<RenderTime>,
+}
+
 /// What pictures of the result say of its bands of spherical harmonics.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct BandsSummary {

@@ -11,7 +11,6 @@ use crate::source::FrameSource;
 
 /// A container.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
-    expected: "a .gseq",
     recognizes: |found| found.is_file_of(&gseq::MAGIC, "gseq"),
     open: |path, options| {
         let container = Container::open_within(path, options.memory)?;

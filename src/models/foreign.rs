@@ -15,7 +15,6 @@ const WAY: &str = "write its frames as PLY files, one per frame and all with the
 
 /// A checkpoint of another kind, or a folder of one.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
-    expected: "",
     recognizes: |found| match found.is_folder {
         true => in_folder(found.path).is_some(),
         false => found.is_checkpoint(),

@@ -317,8 +317,6 @@ pub struct ColumnInfo {
 
 /// How a family takes part.
 pub(super) struct ModelFormat {
-    /// What to give, for the message that nothing fits; empty: nothing that would be read.
-    pub(super) expected: &'static str,
     /// Whether a path is of this family, told by what is there.
     pub(super) recognizes: fn(&FoundInput) -> bool,
     /// Opens it; without frames where [`Timing::Continuous`].

@@ -24,6 +24,7 @@ mod spacetime_gaussians;
 mod static_3d_gaussians;
 pub mod stream;
 pub mod trajectories;
+mod unrecognized;
 
 use std::fs;
 use std::io::Read;
@@ -83,11 +84,8 @@ pub fn open(path: &Path, options: &OpenOptions) -> Result<Box<dyn InputModel>> {
     let found = FoundInput { path, is_folder, head, memory: options.memory };
     match MODEL_FORMATS.iter().find(|entry| (entry.recognizes)(&found)) {
         Some(entry) => (entry.open)(path, options),
-        None => {
-            let expected = MODEL_FORMATS.iter().map(|entry| entry.expected).filter(|expected| !expected.is_empty());
-            let expected: Vec<&str> = expected.collect();
-            Err(Error::input(path, "", expected.join(", "), "another kind of file"))
-        }
+        None if is_folder => Err(unrecognized::unrecognized_folder(path)),
+        None => Err(unrecognized::unrecognized_file(path)),
     }
 }
 

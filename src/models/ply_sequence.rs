@@ -3,6 +3,7 @@
 //!
 //! What is written back has the properties, comments and names that the files had.
 
+use std::fs;
 use std::path::{Path, PathBuf};
 
 use rayon::prelude::*;
@@ -30,17 +31,22 @@ use crate::tracking::{OrderDifference, identity};
 
 /// A folder with one PLY per frame.
 pub(super) const FOLDER: ModelFormat = ModelFormat {
-    expected: "a folder of PLY files",
-    recognizes: |found| found.is_folder,
+    recognizes: |found| found.is_folder && has_ply(found.path),
     open: |path, options| {
         let by = if options.allow_gaps { PlyFrames::open_with_gaps } else { PlyFrames::open };
         open_frames(by(path, &options.ply())?, path, options)
     },
 };
 
+/// Returns whether `folder` holds an entry whose name ends in `.ply`, or cannot be listed.
+fn has_ply(folder: &Path) -> bool {
+    let is_ply = |path: &Path| path.extension().is_some_and(|found| found.eq_ignore_ascii_case("ply"));
+    fs::read_dir(folder)
+        .map_or(true, |mut entries| entries.any(|entry| entry.map_or(true, |entry| is_ply(&entry.path()))))
+}
+
 /// One PLY.
 pub(super) const FILE: ModelFormat = ModelFormat {
-    expected: "a .ply",
     recognizes: |found| found.is_file_of(b"ply", "ply"),
     open: |path, options| open_frames(PlyFrames::single(path, &options.ply())?, path, options),
 };

@@ -25,7 +25,6 @@ const CLOUD: &str = "point_cloud.ply";
 
 /// A model folder with a cloud, and nothing that deforms it.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
-    expected: "a 3D Gaussian Splatting model folder",
     recognizes: |found| {
         let is_whole = |folder: &Path| folder.join(CLOUD).is_file() && !folder.join("deformation.pth").exists();
         let whole = iteration(&found.path.join(CLOUDS), None).is_ok_and(|(_, folder)| is_whole(&folder));

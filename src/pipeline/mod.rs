@@ -15,6 +15,7 @@ mod search;
 pub(crate) mod stage;
 pub mod stages;
 pub mod summary;
+mod summary_text;
 pub(crate) mod throughput;
 pub mod time_estimate;
 

@@ -44,7 +44,7 @@ impl RunPlan {
     /// # Errors
     /// A recipe out of range; a target or ids that such an input does not have; options that exclude each other.
     pub fn new(request: &Request, input: InputMeta) -> Result<RunPlan> {
-        RunPlan::with_fallback(request, input, MemoryFallback::Nothing)
+        RunPlan::with_fallback(request, input, MemoryFallback::Nothing, true)
     }
 
     /// Returns the plan of a run that measures and scores.
@@ -56,14 +56,27 @@ impl RunPlan {
 
     /// Returns the plan of a run within the memory limit of `request`. Where refinement does not fit, parameter deltas are
     /// constant in time; else SH coefficients above degree 0 are not refined either; else nothing is refined. Where not even
-    /// that fits, the plan is the whole one, which is then refused with the smallest sufficient limit.
+    /// that fits, the plan is the whole one, which is then refused with the smallest sufficient limit. The quality of the result is
+    /// measured if there is memory for this as well.
     ///
     /// # Errors
     /// Those of [`RunPlan::new`].
     pub fn within_memory(request: &Request, input: InputMeta, work: &Workload) -> Result<RunPlan> {
-        let with = |fallback| RunPlan::with_fallback(request, input, fallback);
         let fits =
             |plan: &RunPlan| Plan::fits(*work, request.input.memory, |work, limits| plan.estimates(work, limits));
+        let plan = RunPlan::refining_within_memory(request, input, work, fits)?;
+        let with_quality = RunPlan::with_fallback(request, input, plan.fallback, true)?;
+        Ok(if fits(&with_quality) { with_quality } else { plan })
+    }
+
+    /// Returns the plan of [`RunPlan::within_memory`] without the measurement of quality.
+    fn refining_within_memory(
+        request: &Request,
+        input: InputMeta,
+        work: &Workload,
+        fits: impl Fn(&RunPlan) -> bool,
+    ) -> Result<RunPlan> {
+        let with = |fallback| RunPlan::with_fallback(request, input, fallback, false);
         let least = |plan: &RunPlan| Plan::closest(*work, 1, |work, limits| plan.estimates(work, limits)).peak();
         let whole = with(MemoryFallback::Nothing)?;
         if whole.refine.is_none() || fits(&whole) {
@@ -97,7 +110,12 @@ impl RunPlan {
         }
     }
 
-    fn with_fallback(request: &Request, input: InputMeta, fallback: MemoryFallback) -> Result<RunPlan> {
+    fn with_fallback(
+        request: &Request,
+        input: InputMeta,
+        fallback: MemoryFallback,
+        measures_quality: bool,
+    ) -> Result<RunPlan> {
         let Request { recipe, only, .. } = request;
         let target = request.target.map(|target| target.count(input.gaussians)).transpose()?;
         recipe.validate().map_err(Error::usage)?;
@@ -107,8 +125,19 @@ impl RunPlan {
             UserOverrides { keep: ids(&request.keep_ids)?, drop: ids(&request.drop_ids)?, keep_box: request.keep_box };
         let prunes = *only != Only::Merge;
         let looks = Visible::from_recipe(&recipe.scan, input.has_cameras).is_some();
-        let mut planning =
-            Planning { request, input, output, target, user, looks, prunes, merges: false, refine: None, fallback };
+        let mut planning = Planning {
+            request,
+            input,
+            output,
+            target,
+            user,
+            looks,
+            prunes,
+            merges: false,
+            refine: None,
+            measures_quality,
+            fallback,
+        };
         let refine = RefineStage::from_recipe(recipe, planning.part(), planning.prunes_by_views());
         planning.refine = refine.and_then(|refine| match fallback {
             MemoryFallback::Nothing => Some(refine),

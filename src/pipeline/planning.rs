@@ -49,6 +49,8 @@ pub struct Planning<'a> {
     pub merges: bool,
     /// How what is left is refined.
     pub refine: Option<RefineStage>,
+    /// Whether the quality of the result is measured before it is written.
+    pub measures_quality: bool,
     /// What refinement goes without for lack of memory.
     pub(super) fallback: MemoryFallback,
 }

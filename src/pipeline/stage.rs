@@ -14,6 +14,7 @@ use crate::archive::Encoded;
 use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result};
 use crate::journal::Journal;
+use crate::journal::records::QualitySummary;
 use crate::journal::records::Saved;
 use crate::limits::Limits;
 use crate::memory_plan::{ResourceEstimate, Workload};
@@ -309,6 +310,8 @@ pub struct RunState<'a> {
     pub archived: Option<Archived>,
     /// How close the archive is.
     pub archive: Option<ArchiveSummary>,
+    /// Quality of the result, where it was measured.
+    pub quality: Option<QualitySummary>,
     /// The summary, and where each Gaussian of the input is in the output, once the result is written.
     pub written: Option<(Summary, Vec<Option<u32>>)>,
 }
@@ -341,6 +344,7 @@ impl<'a> RunState<'a> {
             goal: None,
             archived: None,
             archive: None,
+            quality: None,
             written: None,
         }
     }

@@ -5,23 +5,20 @@
 //! its fields mean to other programs stands in `format/SUMMARY.md`.
 
 use std::collections::BTreeMap;
-use std::fmt::Write as _;
 use std::path::Path;
 
-use bytesize::ByteSize;
 use serde::{Deserialize, Serialize};
 
 use crate::archive::ArchiveSize;
 use crate::compressed_model::Cluster;
-use crate::error::{Result, ShowPath};
+use crate::error::Result;
 use crate::files::names::name_of;
 use crate::journal::records::{
-    BandsSummary, FieldSummary, FlagSummary, Forecast, LeftOut, RefinedSummary, StageRecord, TermSummary, number, sizes,
+    BandsSummary, FieldSummary, FlagSummary, Forecast, LeftOut, QualitySummary, RefinedSummary, StageRecord,
+    TermSummary, number, sizes,
 };
 use crate::merging::PassCounts;
-use crate::metrics::{PSNR_CAP_DB, decibels_text};
 use crate::models::{InputModel, Size};
-use crate::progress::duration;
 use crate::pruning::Counts;
 use crate::recipe::ProxyOpacity;
 use crate::scene::Scene;
@@ -186,14 +183,6 @@ pub enum Detail {
     All,
 }
 
-/// Notes that are shown unless all are asked for.
-const NOTES: usize = 2;
-
-/// So many pictures, for a person.
-fn pictures(count: usize) -> String {
-    format!("{count} picture{}", if count == 1 { "" } else { "s" })
-}
-
 /// Version of the schema: grows when a field changes its meaning or goes.
 pub const SCHEMA: u32 = 3;
 
@@ -240,6 +229,9 @@ pub struct Summary {
     pub bands: Option<BandsSummary>,
     /// What refining gained; none where nothing was refined.
     pub refined: Option<RefinedSummary>,
+    /// Quality of the result on test views, else on validation or training views, and render times.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub quality: Option<QualitySummary>,
     /// What an archive is made of, if one was written.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub archive: Option<ArchiveSummary>,
@@ -263,128 +255,5 @@ impl Summary {
         let mut text = serde_json::to_string_pretty(self).expect("a summary is plain data");
         text.push('\n');
         text
-    }
-
-    /// What was done, for a person: what was kept, what that costs and where it lies; before it, if all is asked for,
-    /// how it came about.
-    pub fn text(&self, detail: Detail) -> String {
-        let mut out = String::new();
-        // Writing to a String cannot fail.
-        let _ = match detail {
-            Detail::All => self.write_course(&mut out),
-            Detail::Most => Ok(()),
-        };
-        let _ = self.write_result(&mut out, detail);
-        out
-    }
-
-    /// Input, cameras, stages and what was left out.
-    fn write_course(&self, out: &mut String) -> std::fmt::Result {
-        let input = &self.input;
-        writeln!(
-            out,
-            "{}: {}, {} Gaussians x {} frames, SH degree {}",
-            Path::new(&input.path).shown(),
-            input.kind,
-            input.gaussians,
-            input.frames.unwrap_or(0),
-            input.sh_degree
-        )?;
-        writeln!(
-            out,
-            "cameras: {} ({} cameras, {} pictures)",
-            self.cameras.origin, self.cameras.cameras, self.cameras.pairs
-        )?;
-        for stage in &self.stages {
-            let scratch = match stage.scratch_bytes {
-                0 => String::new(),
-                bytes => format!(", {:.1} MiB of scratch", bytes as f64 / f64::from(1 << 20)),
-            };
-            let processors = stage.processor_seconds.map_or(String::new(), |s| format!(" ({s:.1} of processors)"));
-            let memory = stage.peak_memory_bytes.map_or(String::new(), |b| format!(", peak {} MiB", b >> 20));
-            writeln!(
-                out,
-                "  {:<7} {:>9} -> {:>9}  {:8.2} s{processors}, {:.2} reads{scratch}{memory}",
-                stage.name, stage.gaussians_in, stage.gaussians_out, stage.seconds, stage.full_reads
-            )?;
-        }
-        if let Some(planned) = self.planned_reads {
-            writeln!(out, "full reads of the input: {:.2}, planned at most {planned:.2}", self.full_reads())?;
-        }
-        if let Some(field) = self.field.as_ref().filter(|field| field.half) {
-            writeln!(out, "field: in half precision: {}", field.why())?;
-        }
-        if let Some(bands) = self.bands.as_ref().filter(|bands| bands.sh_degree < input.sh_degree) {
-            writeln!(out, "bands: SH degree {} of {}: {}", bands.sh_degree, input.sh_degree, bands.why())?;
-        }
-        writeln!(out, "bytes: {}", self.output_size.parts_of(&input.size))?;
-        for left in &self.left_out {
-            writeln!(out, "  left out: {} ({})", left.what, left.reason())?;
-        }
-        Ok(())
-    }
-
-    /// Counts, bytes, decibels, notes, and where it lies.
-    fn write_result(&self, out: &mut String, detail: Detail) -> std::fmt::Result {
-        let input = &self.input;
-        let percent = |part: u64, whole: u64| 100.0 * part as f64 / whole.max(1) as f64;
-        let (kept, all) = (self.gaussians, input.gaussians);
-        writeln!(out, "kept    {kept} of {all} Gaussians ({:.1}%)", percent(kept as u64, all as u64))?;
-        let [after, before] = [self.output_bytes, input.bytes].map(|bytes| ByteSize(bytes).display().si().to_string());
-        writeln!(out, "size    {after} of {before} ({:.1}%)", percent(self.output_bytes, input.bytes))?;
-        writeln!(out, "cost    {}", self.cost())?;
-        if let Some(archive) = &self.archive {
-            write!(out, "        its archive's pictures are {:.2} dB from those of the result before", archive.psnr)?;
-            // Of a result that is the original, nothing can be lost that is not counted already.
-            match archive.level < PSNR_CAP_DB {
-                true => writeln!(out, ", and lose {:.2} dB against the original's", archive.loss)?,
-                false => writeln!(out)?,
-            }
-        }
-        let (seconds, peak) = self.taken();
-        let memory = peak.map_or(String::new(), |bytes| format!(", at most {} MiB of memory", bytes >> 20));
-        writeln!(out, "took    {}{memory}", duration(seconds))?;
-        if !self.output.is_empty() {
-            writeln!(out, "lies in {}", Path::new(&self.output).shown())?;
-        }
-        let shown = match detail {
-            Detail::All => self.notes.len(),
-            Detail::Most => self.notes.len().min(NOTES),
-        };
-        for note in &self.notes[..shown] {
-            writeln!(out, "note    {note}")?;
-        }
-        let more = self.notes.len() - shown;
-        if more > 0 {
-            writeln!(out, "        {more} more notes with --verbose, all in the summary")?;
-        }
-        Ok(())
-    }
-
-    /// Wall-clock seconds of all stages, and the largest memory.
-    fn taken(&self) -> (f64, Option<u64>) {
-        let seconds = self.stages.iter().filter(|stage| !stage.kept).map(|stage| stage.seconds).sum();
-        (seconds, self.stages.iter().filter_map(|stage| stage.peak_memory_bytes).max())
-    }
-
-    /// How close pictures of the result come to the original's, where that was found on the way.
-    fn cost(&self) -> String {
-        let to = |psnr: f64, by: &str| match psnr {
-            same if same >= PSNR_CAP_DB => format!("no difference in {by}"),
-            _ => format!("pictures {} from the original's ({by})", decibels_text(psnr, 1)),
-        };
-        let bands = self.bands.as_ref().map(|bands| (bands.result, bands.pictures));
-        let field = self.field.as_ref().and_then(|field| Some((field.result?, field.pictures)));
-        let refined = self.refined.map(|refined| (refined.result, refined.pictures));
-        match (&self.goal, bands.or(field).or(refined)) {
-            (Some(goal), _) if goal.name == "max_loss" => {
-                format!("{:.2} dB against photographs held back, {} asked for", goal.held, goal.asked)
-            }
-            (Some(goal), _) => {
-                to(goal.held, &format!("{} held back; {} dB asked for", pictures(goal.held_pictures.len()), goal.asked))
-            }
-            (None, Some((psnr, count))) if psnr.is_finite() => to(psnr, &pictures(count)),
-            _ => "not measured; `splatsieve evaluate` compares pictures".to_owned(),
-        }
     }
 }

@@ -5,7 +5,6 @@ use std::path::{Path, PathBuf};
 
 use crate::TOOL;
 use crate::error::{Error, Result};
-use crate::evaluation::open_compressed;
 use crate::files::atomic::{Kind, MARKER, Replace, StagedFile, StagedFolder, check_target};
 use crate::limits::Limits;
 use crate::memory_plan::{Plan, ResourceEstimate, Workload};
@@ -15,6 +14,7 @@ use crate::player::lattice::{Steps, width};
 use crate::player::page::{Chunks, INDEX, PageModel, PageScene, looks, upwards};
 use crate::player::track::{GROUP_VALUES, PageSequence, encode};
 use crate::progress::Events;
+use crate::scene::open_compressed;
 use crate::scene::pictures::background;
 use crate::scene::{InputOptions, first_box, open_scene, scratch_beside};
 

@@ -277,7 +277,7 @@ pub struct AttributeGroups(pub Columns);
 
 /// Every group and its column.
 const GROUPS: [(&str, Columns); 5] = [
-    ("colour", Columns::SH),
+    ("color", Columns::SH),
     ("opacity", Columns::OPACITY),
     ("scale", Columns::LOG_SCALE),
     ("rotation", Columns::ROTATION),

@@ -9,8 +9,6 @@ pub struct Parameter {
     pub key: String,
     /// The comment above it in `paper.toml`, on one line.
     pub doc: String,
-    /// Whether its value is true or false.
-    pub boolean: bool,
 }
 
 /// Every parameter of `paper.toml` in file order, merge passes excepted.
@@ -22,13 +20,8 @@ pub fn parameters() -> Vec<Parameter> {
         } else if let Some(name) = line.strip_prefix('[') {
             section = name.trim_matches(['[', ']']).to_owned();
             doc.clear();
-        } else if let Some((key, value)) = line.split_once('=').filter(|_| section != "merge.passes") {
-            found.push(Parameter {
-                section: section.clone(),
-                key: key.trim().to_owned(),
-                doc: doc.join(" "),
-                boolean: matches!(value.trim(), "true" | "false"),
-            });
+        } else if let Some((key, _)) = line.split_once('=').filter(|_| section != "merge.passes") {
+            found.push(Parameter { section: section.clone(), key: key.trim().to_owned(), doc: doc.join(" ") });
             doc.clear();
         }
     }

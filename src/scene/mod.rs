@@ -2,6 +2,7 @@
 
 mod absent;
 pub mod between;
+mod compressed;
 mod frames;
 mod input;
 mod open;
@@ -23,6 +24,7 @@ use crate::progress::Events;
 use crate::source::Reads;
 
 use absent::Absent;
+pub use compressed::open_compressed;
 pub use input::{InputOptions, Opened, load_cameras};
 pub use open::{first_box, open_input, open_scene, scene_of, scratch_beside};
 pub use stream::{FrameQuota, is_linked, link_stream, open_stream, receiving, room_to_pack};

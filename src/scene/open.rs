@@ -16,6 +16,7 @@ use crate::model::{Columns, Rig, opacity};
 use crate::models;
 use crate::models::{InputModel, Timing};
 use crate::passes::gather_all;
+use crate::progress::Message;
 use crate::source::FrameSource;
 
 /// Opens an input; cameras only say which frames it has.
@@ -126,7 +127,14 @@ pub fn scene_of(opened: Opened, options: &InputOptions) -> Result<Scene> {
         Some(rig) => rig,
         None => {
             let rig = if is_still { surrounding_rig(input.source())? } else { virtual_rig(input.source())? };
-            notes.push(format!("no cameras given or found: {}", rig.origin));
+            let origin = &rig.origin;
+            notes.push(match is_still {
+                true => format!("no cameras were given or found: {origin}"),
+                false => format!("{NO_CAMERAS} ({origin})"),
+            });
+            if !is_still {
+                options.events.send(Message::Warning(NO_CAMERAS));
+            }
             rig
         }
     };
@@ -139,6 +147,10 @@ pub fn scene_of(opened: Opened, options: &InputOptions) -> Result<Scene> {
     scene.keep_work(options)?;
     Ok(scene)
 }
+
+/// Warning about a scene without cameras, at the start and at the end of a run.
+const NO_CAMERAS: &str = "no cameras were given or found. Gaussians are ranked and refined for invented views, which costs \
+                          most of the quality; give the training cameras with --cameras";
 
 /// Frames of a model for which neither cameras nor the user name any.
 const DEFAULT_FRAMES: usize = 60;

@@ -35,9 +35,11 @@ impl Photographs {
         Ok(Photographs { files })
     }
 
-    /// Those of `pictures` that have a photograph, and their photographs: of each `tNNN_vNN.png`, else the file its camera
-    /// names, by as much of its path as leads to one inside `folder`, else `camNN/images/FFFF.png` as DyNeRF has them: of the
-    /// view's place among the folders called `cam…`, and the frame's number.
+    /// Finds the photographs of `pictures` in `folder` and returns the pictures that have one, with their photographs.
+    ///
+    /// File paths that the cameras name come first: the longest end of such a path that leads to a file inside `folder`. Only if
+    /// this finds no photograph of any picture, files are taken by their names: `tNNN_vNN.png` (frame, view), else
+    /// `camNN/images/FFFF.png` as in DyNeRF (position of the view among the folders `cam…`, frame).
     ///
     /// # Errors
     /// A folder that cannot be read; no photograph of any; a picture that shares its photograph with another.
@@ -49,8 +51,12 @@ impl Photographs {
     ) -> Result<(Vec<Picture>, Photographs)> {
         check_folder(folder)?;
         let rigs = camera_folders(folder)?;
-        let file = |picture: Picture| Some((picture, file_of(folder, rig.image(picture, times), picture, &rigs)?));
-        let found: Vec<(Picture, PathBuf)> = pictures.iter().copied().filter_map(file).collect();
+        let named = |picture: Picture| Some((picture, inside(folder, rig.image(picture, times)?)?));
+        let mut found: Vec<(Picture, PathBuf)> = pictures.iter().copied().filter_map(named).collect();
+        if found.is_empty() {
+            let numbered = |picture: Picture| Some((picture, numbered_file(folder, picture, &rigs)?));
+            found = pictures.iter().copied().filter_map(numbered).collect();
+        }
         if let (true, Some(&picture)) = (found.is_empty(), pictures.first()) {
             let named = rig.image(picture, times).and_then(Path::file_name);
             let named = named.map_or_else(String::new, |name| format!(", {}", name.shown()));
@@ -103,14 +109,11 @@ fn check_folder(folder: &Path) -> Result<()> {
     Ok(())
 }
 
-/// The photograph of `picture`, which its camera calls `named`; `rigs` are the folders of a rig's cameras.
-fn file_of(folder: &Path, named: Option<&Path>, picture: Picture, rigs: &[PathBuf]) -> Option<PathBuf> {
-    let numbered = folder.join(format!("{}.png", picture.name()));
-    if numbered.is_file() {
-        return Some(numbered);
-    }
-    let of_rig = || rigs.get(picture.view as usize).map(|camera| in_rig(camera, picture)).filter(|file| file.is_file());
-    named.and_then(|named| inside(folder, named)).or_else(of_rig)
+/// Returns the photograph of `picture` by its frame and view: `tNNN_vNN.png`, or in the folder of its camera among `rigs`.
+fn numbered_file(folder: &Path, picture: Picture, rigs: &[PathBuf]) -> Option<PathBuf> {
+    let in_camera = rigs.get(picture.view as usize).map(|camera| in_rig(camera, picture));
+    let files = [Some(folder.join(format!("{}.png", picture.name()))), in_camera];
+    files.into_iter().flatten().find(|file| file.is_file())
 }
 
 /// The folders of `folder` that are called `cam` and a number, by that: view after view.

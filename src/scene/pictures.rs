@@ -91,6 +91,31 @@ pub fn thin(pictures: Vec<Picture>, count: usize) -> Vec<Picture> {
     pictures.into_iter().filter(|picture| kept.binary_search(&picture.frame).is_ok()).collect()
 }
 
+/// Returns at most `most` of `pictures`, which are sorted by frame and view, spread evenly over frames and views.
+///
+/// The views of frame number `f` are rotated by the fractional part of `f` times the golden ratio, so that an even step through
+/// the list does not return to the same views.
+pub fn spread_views(pictures: Vec<Picture>, most: usize) -> Vec<Picture> {
+    let (count, most) = (pictures.len(), most.max(1));
+    if count <= most {
+        return pictures;
+    }
+    let mut rotated = Vec::with_capacity(count);
+    for (number, frame) in pictures.chunk_by(|a, b| a.frame == b.frame).enumerate() {
+        let turn = (number as f64 * GOLDEN_RATIO).fract() * frame.len() as f64;
+        let (head, tail) = frame.split_at((turn as usize).min(frame.len() - 1));
+        rotated.extend_from_slice(tail);
+        rotated.extend_from_slice(head);
+    }
+    // The middle of each of `most` equal parts of the list.
+    let mut spread: Vec<Picture> = (0..most).map(|k| rotated[(2 * k + 1) * count / (2 * most)]).collect();
+    spread.sort_by_key(|picture| (picture.frame, picture.view));
+    spread
+}
+
+/// The golden ratio, whose multiples are spread evenly modulo 1.
+const GOLDEN_RATIO: f64 = 1.618_033_988_749_895;
+
 /// Color behind a scene: the one asked for, else the scene's own.
 ///
 /// # Errors
@@ -159,6 +184,23 @@ mod tests {
 
     fn pairs(pictures: &[Picture]) -> Vec<(usize, u32)> {
         pictures.iter().map(|picture| (picture.frame, picture.view)).collect()
+    }
+
+    #[test]
+    fn spread_views_cover_frames_and_views() {
+        let picture = |k: usize| Picture { frame: k / 9, view: (k % 9) as u32, camera: 0 };
+        let all: Vec<Picture> = (0..180).map(picture).collect();
+        assert_eq!(spread_views(all.clone(), 180), all);
+        let some = spread_views(all, 60);
+        assert_eq!(some.len(), 60);
+        assert!(some.windows(2).all(|pair| (pair[0].frame, pair[0].view) < (pair[1].frame, pair[1].view)));
+        for value in 0..20 {
+            assert_eq!(some.iter().filter(|picture| picture.frame == value).count(), 3, "frame {value}");
+        }
+        for view in 0..9 {
+            let count = some.iter().filter(|picture| picture.view == view).count();
+            assert!((3..=11).contains(&count), "view {view}: {count} of 60");
+        }
     }
 
     #[test]

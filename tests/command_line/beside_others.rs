@@ -14,7 +14,7 @@ use crate::scene::{Workplace, files, lasting_files, program, tiny};
 
 /// The tiny model as a frame stream.
 fn stream(workplace: &Workplace) -> Vec<u8> {
-    let output = Command::new(program()).arg("unpack").arg(tiny()).arg("--stream").output().unwrap();
+    let output = Command::new(program()).arg("convert").arg(tiny()).arg("-").output().unwrap();
     assert!(output.status.success(), "{}", workplace.path("").display());
     output.stdout
 }
@@ -78,7 +78,7 @@ fn runs_in_different_containers_share_their_folders_and_both_succeed() {
     for (first, second) in [
         ("compress - -o a.gseq --scratch-dir scratch", "compress - -o b.gseq --scratch-dir scratch"),
         // The same name: whoever is last is refused, and takes nothing from the other meanwhile.
-        ("pack - -o c.gseq", "pack - -o c.gseq"),
+        ("convert - c.gseq", "convert - c.gseq"),
     ] {
         let command = contained(&workplace, 12, first);
         let before = files(&workplace.path("")).len();
@@ -119,7 +119,7 @@ fn a_signal_takes_away_what_the_run_has_begun_and_ends_it_with_its_own_status() 
     for (signal, code) in [("-INT", 130), ("-TERM", 143), ("-HUP", 129)] {
         for (arguments, input) in [
             ("compress - -o out --scratch-dir scratch", half),
-            ("pack - -o out.gseq", half),
+            ("convert - out.gseq", half),
             ("demo --gaussians 100000 --frames 400 -o demo", &[]),
         ] {
             fs::create_dir(workplace.path("scratch")).unwrap();
@@ -147,7 +147,7 @@ fn a_signal_that_was_ignored_at_the_start_stays_ignored() {
     let workplace = Workplace::new();
     let stream = stream(&workplace);
     let mut command = Command::new("sh");
-    command.args(["-c", &format!("trap '' HUP INT; exec {} pack - -o out.gseq", program().display())]);
+    command.args(["-c", &format!("trap '' HUP INT; exec {} convert - out.gseq", program().display())]);
     let mut child = started(&workplace, command);
     let mut pipe = child.stdin.take().unwrap();
     pipe.write_all(&stream[..stream.len() / 2]).unwrap();
@@ -173,25 +173,25 @@ fn overwriting_leaves_every_file_that_the_earlier_result_does_not_name() {
         fs::create_dir_all(workplace.path("out").join(name).parent().unwrap()).unwrap();
         fs::write(workplace.path("out").join(name), "precious").unwrap();
     }
-    workplace.done("compress {tiny} -o out --target-count 50 --overwrite");
+    workplace.done("compress {tiny} -o out --count 50 --overwrite");
     for name in foreign {
         assert_eq!(fs::read(workplace.path("out").join(name)).ok().as_deref(), Some(&b"precious"[..]), "{name}");
     }
-    workplace.done("compress {tiny} -o fresh --target-count 50");
+    workplace.done("compress {tiny} -o fresh --count 50");
     let [mut left, mut expected] = ["out", "fresh"].map(|name| lasting_files(&workplace.path(name)));
     left.retain(|name, bytes| !bytes.is_empty() && !foreign.contains(&name.to_str().unwrap()));
     expected.retain(|_, bytes| !bytes.is_empty());
     assert!(left == expected, "{:?}, not {:?}", left.keys(), expected.keys());
     // Of frames that the new result does not have nothing stays.
-    workplace.done("unpack {tiny} -o frames");
+    workplace.done("convert {tiny} frames --as ply-sequence");
     fs::write(workplace.path("frames/notes.txt"), "precious").unwrap();
     workplace.done("demo --gaussians 400 --frames 3 -o shorter");
-    workplace.done("unpack shorter/scene.gseq -o frames --overwrite");
+    workplace.done("convert shorter/scene.gseq frames --as ply-sequence --overwrite");
     let plys = fs::read_dir(workplace.path("frames")).unwrap().map(|entry| entry.unwrap().path());
     assert_eq!(plys.filter(|path| path.extension().is_some_and(|e| e == "ply")).count(), 3);
     assert_eq!(fs::read(workplace.path("frames/notes.txt")).unwrap(), b"precious");
-    workplace.done("unpack {tiny} -o frames --force");
-    assert!(!workplace.path("frames/notes.txt").exists(), "--force replaces the folder with all in it");
+    workplace.done("convert {tiny} frames --as ply-sequence --overwrite");
+    assert!(!workplace.path("frames/notes.txt").exists(), "--overwrite replaces the folder with all in it");
     let hidden = fs::read_dir(workplace.path("")).unwrap().map(|entry| entry.unwrap().file_name());
     assert_eq!(hidden.filter(|name| name.to_str().unwrap().starts_with('.')).count(), 0);
 }
@@ -201,17 +201,18 @@ fn overwriting_leaves_every_file_that_the_earlier_result_does_not_name() {
 fn whenever_a_run_is_ended_its_output_is_the_old_or_the_new_one_whole_and_no_foreign_file_is_lost() {
     let workplace = Workplace::new();
     workplace.done("demo --gaussians 400 --frames 3 -o shorter");
-    workplace.done("unpack shorter/scene.gseq -o old");
+    workplace.done("convert shorter/scene.gseq old --as ply-sequence");
     let start = Instant::now();
-    workplace.done("unpack {tiny} -o new");
+    workplace.done("convert {tiny} new --as ply-sequence");
     let whole = start.elapsed();
     let [old, new] = ["old", "new"].map(|name| lasting_files(&workplace.path(name)));
-    let reset = || workplace.done("unpack shorter/scene.gseq -o frames --overwrite");
+    let reset = || workplace.done("convert shorter/scene.gseq frames --as ply-sequence --overwrite");
     reset();
     fs::write(workplace.path("frames/notes.txt"), "precious").unwrap();
     const ENDS: u32 = 24;
     for end in 0..ENDS {
-        let mut child = waiting(&workplace, &format!("unpack {} -o frames --overwrite", tiny().display()));
+        let mut child =
+            waiting(&workplace, &format!("convert {} frames --as ply-sequence --overwrite", tiny().display()));
         std::thread::sleep(whole * end / ENDS);
         let is_told = end % 2 == 0;
         if is_told {
@@ -239,7 +240,7 @@ fn whenever_a_run_is_ended_its_output_is_the_old_or_the_new_one_whole_and_no_for
 #[test]
 fn files_that_nothing_knows_as_results_are_replaced_by_force_alone() {
     let workplace = Workplace::new();
-    workplace.done("pack {tiny} -o scene.gseq");
+    workplace.done("convert {tiny} scene.gseq");
     for (verb, name) in [
         ("pack {tiny} -o", "a.gseq"),
         ("compress {tiny} --as ply -o", "a.ply"),
@@ -250,14 +251,14 @@ fn files_that_nothing_knows_as_results_are_replaced_by_force_alone() {
         ("recover scene.gseq -o", "b.gseq"),
     ] {
         fs::write(workplace.path(name), "precious").unwrap();
-        workplace.refused(2, &format!("{verb} {name}"), &[name, "exists already", "--overwrite", "--force"]);
-        workplace.refused(2, &format!("{verb} {name} --overwrite"), &[name, "nothing says", "--force"]);
-        workplace.done(&format!("{verb} {name} --force"));
+        workplace.refused(2, &format!("{verb} {name}"), &[name, "exists already", "--overwrite", "--overwrite"]);
+        workplace.refused(2, &format!("{verb} {name} --overwrite"), &[name, "nothing says", "--overwrite"]);
+        workplace.done(&format!("{verb} {name} --overwrite"));
         assert_ne!(fs::read(workplace.path(name)).unwrap(), b"precious");
     }
     // What says itself that it is ours, or lies beside a summary that names it.
-    workplace.done("pack {tiny} -o a.gseq --overwrite");
-    workplace.done("compress {tiny} --as ply -o a.ply --overwrite --target-count 100");
+    workplace.done("convert {tiny} a.gseq --overwrite");
+    workplace.done("compress {tiny} --as ply -o a.ply --overwrite --count 100");
     fs::write(workplace.path("a.ply.mine"), "precious").unwrap();
     workplace.done("compress {tiny} --as ply -o a.ply --overwrite");
     assert_eq!(fs::read(workplace.path("a.ply.mine")).unwrap(), b"precious");

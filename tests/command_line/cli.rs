@@ -29,7 +29,7 @@ fn with_model() -> Workplace {
 /// Every way to read the model refuses it with the same words.
 fn model_refused(workplace: &Workplace, parts: &[&str]) {
     for verb in
-        ["compress model -o out", "compress model -o out.gseq", "score model -o rows.npz", "pack model -o a.gseq"]
+        ["compress model -o out", "compress model -o out.gseq", "score model -o rows.npz", "convert model a.gseq"]
     {
         workplace.refused(1, verb, parts);
     }
@@ -54,15 +54,26 @@ fn help_says_what_the_tool_is_and_then_examples_on_stdout() {
     let help = workplace.done("--help");
     assert!(help.starts_with("Shrinks trained dynamic Gaussian-splatting models"), "{help}");
     assert!(help.contains("\n\nExamples:\n  splatsieve demo"), "{help}");
-    for verb in
-        ["compress", "score", "pack", "info", "verify", "unpack", "recover", "work", "demo", "recipe", "completions"]
-    {
+    for verb in [
+        "compress",
+        "evaluate",
+        "report",
+        "view",
+        "render",
+        "convert",
+        "info",
+        "score",
+        "cache",
+        "demo",
+        "recipe",
+        "completions",
+    ] {
         assert!(help.contains(verb), "{verb} is not in the help");
         workplace.done(&format!("{verb} --help"));
     }
-    for verb in ["compress", "evaluate", "render", "pack"] {
+    for verb in ["compress", "evaluate", "render", "convert"] {
         let help = workplace.done(&format!("{verb} --help"));
-        assert!(help.contains("--work <FOLDER>") && help.contains("--part <I/N>"), "{verb}: {help}");
+        assert!(help.contains("--cache <FOLDER>") && help.contains("--shard <I/N>"), "{verb}: {help}");
     }
     let [short, long] = ["-h", "--help"].map(|flag| workplace.done(&format!("compress {flag}")));
     assert!(short.lines().count() < 90 && 2 * short.len() < long.len(), "{short}");
@@ -90,7 +101,7 @@ fn manual_pages_are_written_of_every_verb_with_its_options_and_examples() {
 #[test]
 fn the_end_of_a_run_says_what_stays_what_it_costs_and_where_it_lies_in_few_lines() {
     let workplace = Workplace::new();
-    let options = "compress {tiny} --cameras {tiny} --target-ratio 0.5";
+    let options = "compress {tiny} --cameras {tiny} --ratio 0.5";
     let most = workplace.done(&format!("{options} -o out"));
     let starts: Vec<&str> = most.lines().map(|line| line.split(' ').next().unwrap_or_default()).collect();
     assert_eq!(starts[..5], ["kept", "size", "cost", "took", "lies"], "{most}");
@@ -111,8 +122,8 @@ fn misuse_exits_with_2() {
         ("compress {tiny}", "--output"),
         ("compress {tiny} -o out --no-such-flag", "--no-such-flag"),
         ("compress {tiny} -o out --preset reckless", "reckless"),
-        ("compress {tiny} -o out --mu many", "--mu"),
-        ("compress {tiny} -o out --keep-fraction 1.5", "keep_fraction"),
+        ("compress {tiny} -o out --set mu=many", "--mu"),
+        ("compress {tiny} -o out --set keep_fraction=1.5", "keep_fraction"),
         ("compress {tiny} -o out --keep-box 0,0,0,1,1", "six numbers"),
         ("compress {tiny} -o out --keep-ids 300", "below 300"),
         ("compress {tiny} -o out --keep-ids 3 --drop-ids 3", "Gaussian 3"),
@@ -278,9 +289,9 @@ fn nan_in_a_point_cloud_is_refused_with_what_to_do() {
     odd[4..8].copy_from_slice(&f32::NAN.to_le_bytes());
     edit(&workplace.path(CLOUD), |bytes| replace(bytes, &row, &odd));
     for verb in ["compress model -o out", "score model -o rows.npz"] {
-        workplace.refused(1, verb, &["Gaussian 41", "NaN or infinity in 1 of 300", "--non-finite drop"]);
+        workplace.refused(1, verb, &["Gaussian 41", "NaN or infinity in 1 of 300", "--set non_finite=drop"]);
     }
-    workplace.done("compress model -o out --non-finite drop");
+    workplace.done("compress model -o out --set non_finite=drop");
 }
 
 #[test]
@@ -311,7 +322,7 @@ fn times_that_do_not_match_are_refused() {
     let model = tiny().display().to_string();
     // --frames 4 puts frames at 0, 1/4, 1/2, 3/4; the pictures were taken at ninths.
     workplace.refused(2, "compress {tiny} --frames 4 -o out", &["no frame of the sequence", "--frames"]);
-    workplace.done("unpack {tiny} -o frames");
+    workplace.done("convert {tiny} frames --as ply-sequence");
     fs::remove_file(workplace.path("frames/frame_00009.ply")).unwrap();
     workplace.refused(2, &format!("compress frames --cameras {model} -o out"), &["9 frames", "10 distinct times"]);
     workplace.refused(2, "compress frames --frames 9 -o out", &["--frames is for models"]);
@@ -329,9 +340,11 @@ fn existing_outputs_stay_unless_overwritten_and_foreign_ones_always() {
     }
     fs::create_dir(workplace.path("photos")).unwrap();
     fs::write(workplace.path("photos/one.jpg"), "precious").unwrap();
-    for verb in
-        ["compress model -o photos", "compress model -o photos --overwrite", "unpack model -o photos --overwrite"]
-    {
+    for verb in [
+        "compress model -o photos",
+        "compress model -o photos --overwrite",
+        "convert model photos --as ply-sequence --overwrite",
+    ] {
         workplace.refused(2, verb, &["photos"]);
     }
     // What lies beside a single file counts too.
@@ -354,11 +367,11 @@ fn outputs_onto_around_or_inside_the_input_are_refused() {
         workplace.refused(2, &format!("compress model -o {output}"), &["inside the input model"]);
     }
     workplace.refused(2, "score model -o model/rows.npz", &["inside the input model"]);
-    workplace.done("unpack model -o frames");
+    workplace.done("convert model frames --as ply-sequence");
     workplace.refused(2, "compress frames -o frames/out.ply --as ply", &["out.ply"]);
     workplace.refused(2, "compress frames -o frames/out", &["inside the input frames"]);
-    workplace.done("pack model -o scene.gseq");
-    for verb in ["compress", "pack", "recover"] {
+    workplace.done("convert model scene.gseq");
+    for verb in ["compress", "convert"] {
         workplace.refused(2, &format!("{verb} scene.gseq -o scene.gseq --overwrite"), &["the input itself"]);
     }
 }
@@ -366,7 +379,7 @@ fn outputs_onto_around_or_inside_the_input_are_refused() {
 #[test]
 fn kinds_that_do_not_fit_are_refused() {
     let workplace = Workplace::new();
-    workplace.done("pack {tiny} -o scene.gseq");
+    workplace.done("convert {tiny} scene.gseq");
     workplace.refused(2, "compress scene.gseq -o out --as model", &["only a trained model"]);
     workplace.refused(2, "compress scene.gseq -o out.ply", &["10 frames do not fit"]);
     workplace.refused(2, "compress scene.gseq -o out --iteration 3", &["--iteration"]);
@@ -375,20 +388,25 @@ fn kinds_that_do_not_fit_are_refused() {
 #[test]
 fn damaged_containers_are_refused_and_cut_ones_recovered() {
     let workplace = Workplace::new();
-    workplace.done("pack {tiny} -o scene.gseq");
+    workplace.done("convert {tiny} scene.gseq");
     let whole = fs::read(workplace.path("scene.gseq")).unwrap();
     let mut flipped = whole.clone();
     flipped[whole.len() / 2] ^= 1;
     fs::write(workplace.path("flipped.gseq"), flipped).unwrap();
     fs::write(workplace.path("cut.gseq"), &whole[..whole.len() - 20]).unwrap();
-    workplace.refused(1, "verify flipped.gseq", &["flipped.gseq"]);
+    workplace.refused(1, "info flipped.gseq --check", &["flipped.gseq"]);
     workplace.refused(1, "compress flipped.gseq -o out", &["flipped.gseq"]);
-    for verb in ["verify cut.gseq", "info cut.gseq", "compress cut.gseq -o out.gseq", "unpack cut.gseq -o out"] {
+    for verb in [
+        "info cut.gseq --check",
+        "info cut.gseq",
+        "compress cut.gseq -o out.gseq",
+        "convert cut.gseq out --as ply-sequence",
+    ] {
         workplace.refused(1, verb, &["cut.gseq"]);
     }
-    let report = workplace.done("recover cut.gseq -o saved.gseq");
+    let report = workplace.done("info cut.gseq --repair saved.gseq");
     assert!(report.contains("10 complete frames"), "{report}");
-    workplace.done("verify saved.gseq");
+    workplace.done("info saved.gseq --check");
     let [saved, scene] = ["saved.gseq", "scene.gseq"].map(|name| Container::open(&workplace.path(name)).unwrap());
     assert!((0..10).all(|frame| state(&saved, frame) == state(&scene, frame)));
 }
@@ -398,11 +416,11 @@ fn every_verb_answers_on_stdout_and_keeps_quiet_elsewhere_when_asked_to() {
     let workplace = Workplace::new();
     for (arguments, part) in [
         ("compress {tiny} -o out", "of 300 Gaussians"),
-        ("pack {tiny} -o scene.gseq", "300 Gaussians x 10 frames"),
+        ("convert {tiny} scene.gseq", "300 Gaussians x 10 frames"),
         ("info scene.gseq", "300"),
         ("info {tiny}", "300"),
-        ("verify scene.gseq", "sound; 10 frames"),
-        ("unpack scene.gseq -o frames", "10 PLY files"),
+        ("info scene.gseq --check", "sound; 10 frames"),
+        ("convert scene.gseq frames --as ply-sequence", "10 PLY files"),
         ("score scene.gseq -o rows.csv --cameras {tiny}", "300 Gaussians"),
         ("recipe", "[merge]"),
         ("recipe --preset paper", "[merge]"),
@@ -422,7 +440,7 @@ fn every_verb_answers_on_stdout_and_keeps_quiet_elsewhere_when_asked_to() {
     for (arguments, frames) in [
         ("info scene.gseq --json", serde_json::json!(10)),
         ("info {tiny} --json", serde_json::Value::Null),
-        ("verify scene.gseq --json", serde_json::json!(10)),
+        ("info scene.gseq --check --json", serde_json::json!(10)),
     ] {
         let document: serde_json::Value = serde_json::from_str(&workplace.done(arguments)).unwrap();
         assert_eq!(document["frames"], frames, "{arguments}: {document}");
@@ -506,13 +524,14 @@ fn no_stage_is_told_of_twice_and_what_is_undone_as_left_out() {
     workplace.done("demo -o demo");
     let compress = |rest: &str| {
         let run = workplace.run(&format!(
-            "compress demo/scene.gseq --cameras demo/cameras.json --target-ratio {rest} -o out.gseq --overwrite"
+            "compress demo/scene.gseq --cameras demo/cameras.json --ratio {rest} -o out.gseq --overwrite"
         ));
         assert_eq!(run.code, 0, "{}", run.stderr);
         let told: Vec<&str> = run.stderr.lines().filter_map(|line| line.strip_prefix('[')?.split(']').next()).collect();
         assert!(told.len() > 5 && told.is_sorted_by(|a, b| a < b), "{}", run.stderr);
         run.stderr.lines().any(|line| line.starts_with("merging  left out: at the same "))
     };
-    let undone = ["0.2 --no-refine", "0.6 --no-refine", "0.4 --refine-steps 20 --refine-cut-steps 5"].map(compress);
+    let undone =
+        ["0.2 --no-refine", "0.6 --no-refine", "0.4 --set refine_steps=20 --set refine_cut_steps=5"].map(compress);
     assert_eq!(undone, [false, true, false]);
 }

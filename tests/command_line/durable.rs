@@ -80,7 +80,7 @@ fn what_gets_a_name_is_on_the_disk_before_and_its_name_after() {
     let compiled = Command::new(compiler).args(["-shared", "-fPIC", "-o"]).args([&shim, &source]).status().unwrap();
     assert!(compiled.success(), "a C compiler is needed to build this program and to test it");
     for (arguments, results) in [
-        ("pack {tiny} -o packed.gseq", &["packed.gseq"][..]),
+        ("convert {tiny} packed.gseq", &["packed.gseq"][..]),
         ("compress {tiny} -o out --no-refine", &["out"]),
         ("compress {tiny} -o out --no-refine --overwrite", &["out"]),
         (

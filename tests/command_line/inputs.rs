@@ -9,13 +9,13 @@ use crate::scene::{Workplace, tiny};
 #[test]
 fn recovering_nothing_is_no_success_and_writes_nothing() {
     let workplace = Workplace::new();
-    workplace.done("pack {tiny} -o scene.gseq");
+    workplace.done("convert {tiny} scene.gseq");
     let whole = fs::read(workplace.path("scene.gseq")).unwrap();
     // The header is whole, and no tile is.
     fs::write(workplace.path("cut.gseq"), &whole[..4096]).unwrap();
     workplace.refused(
         1,
-        "recover cut.gseq -o saved.gseq",
+        "info cut.gseq --repair saved.gseq",
         &["cut.gseq", "at least one complete frame", "nothing was written"],
     );
 }
@@ -34,9 +34,9 @@ fn a_name_that_no_output_has_is_refused_at_once_with_what_can_be_written() {
     let workplace = Workplace::new();
     let parts = ["x.txt", "NAME.gsz", "NAME.gseq", "NAME.ply", "a folder", "--as"];
     workplace.refused(2, "compress {tiny} -o x.txt", &parts);
-    workplace.refused(2, "pack {tiny} -o x.txt", &["x.txt", "NAME.gseq"]);
-    workplace.refused(2, "recover nowhere.gseq -o x.txt", &["x.txt", "NAME.gseq"]);
-    workplace.refused(2, "unpack {tiny} -o x.txt", &["x.txt", "a folder"]);
+    workplace.refused(2, "convert {tiny} x.txt", &["x.txt", "NAME.gseq"]);
+    workplace.refused(2, "info nowhere.gseq --repair x.txt", &["x.txt", "NAME.gseq"]);
+    workplace.refused(2, "convert {tiny} x.txt --as ply-sequence", &["x.txt", "a folder"]);
     workplace.refused(2, "report {tiny} {tiny} -o x.html", &["x.html", "a folder"]);
     workplace.refused(2, "render {tiny} --all -o x.zip", &["x.zip", "a folder"]);
     // Said outright, or no ending of a file.
@@ -50,7 +50,7 @@ fn an_empty_folder_is_no_obstacle_and_one_with_anything_in_it_is() {
     let workplace = Workplace::new();
     for (verb, made) in [
         ("compress {tiny} --prune-only --no-refine --quiet -o out", "cfg_args"),
-        ("unpack {tiny} -o out", "frame_00000.ply"),
+        ("convert {tiny} out --as ply-sequence", "frame_00000.ply"),
         ("render {tiny} --all --quiet -o out", "t000_v00.png"),
     ] {
         fs::create_dir(workplace.path("out")).unwrap();
@@ -179,8 +179,8 @@ fn a_full_disk_is_blamed_on_what_was_being_written() {
     let (program, tiny) = (env!("CARGO_BIN_EXE_splatsieve"), tiny());
     let tiny = tiny.display();
     for (run, named) in [
-        (format!("pack {tiny} -o disk/x.gseq"), "disk/x.gseq: No space"),
-        (format!("unpack {tiny} -o disk/x"), "disk/x/frame_0000"),
+        (format!("convert {tiny} disk/x.gseq"), "disk/x.gseq: No space"),
+        (format!("convert {tiny} disk/x --as ply-sequence"), "disk/x/frame_0000"),
         (format!("score {tiny} -o disk/x.npz"), "disk/x.npz: No space"),
         (format!("render {tiny} --all -o disk/x"), "disk/x/t00"),
         (format!("compress {tiny} --prune-only --no-refine -o disk/x"), "disk/x/"),
@@ -276,7 +276,7 @@ fn photographs_of_a_rig_lie_in_a_folder_per_camera() {
 #[test]
 fn a_gap_among_frames_is_named_and_refused_unless_allowed() {
     let workplace = Workplace::new();
-    workplace.done("unpack {tiny} -o frames");
+    workplace.done("convert {tiny} frames --as ply-sequence");
     fs::remove_file(workplace.path("frames/summary.json")).ok();
     workplace.done("info frames");
     fs::rename(workplace.path("frames/frame_00004.ply"), workplace.path("four.ply")).unwrap();
@@ -332,7 +332,7 @@ fn cameras_that_see_nothing_of_the_scene_are_refused_and_its_own_pass_without_a_
     let workplace = Workplace::new();
     let mut cameras: serde_json::Value =
         serde_json::from_slice(&fs::read(tiny().join("transforms_train.json")).unwrap()).unwrap();
-    let line = "compress {tiny} --cameras far.json -o out --force --prune-only --no-refine --quiet";
+    let line = "compress {tiny} --cameras far.json -o out --overwrite --prune-only --no-refine --quiet";
     let write = |cameras: &serde_json::Value| fs::write(workplace.path("far.json"), cameras.to_string()).unwrap();
     write(&cameras);
     assert!(!workplace.done(line).contains("warning"));
@@ -349,7 +349,7 @@ fn cameras_that_see_nothing_of_the_scene_are_refused_and_its_own_pass_without_a_
 #[test]
 fn a_still_scene_takes_cameras_of_every_kind_and_is_surrounded_where_there_are_none() {
     let workplace = Workplace::new();
-    workplace.done("compress {tiny} --cameras {tiny} -o still.ply --target-ratio 0.9 --no-refine --quiet");
+    workplace.done("compress {tiny} --cameras {tiny} -o still.ply --ratio 0.9 --no-refine --quiet");
     // The project's own kind, one camera per picture.
     let camera = |k: u32| {
         let (sin, cos) = f64::from(k).sin_cos();
@@ -360,7 +360,7 @@ fn a_still_scene_takes_cameras_of_every_kind_and_is_surrounded_where_there_are_n
     };
     let cameras = serde_json::json!({ "background": [0, 0, 0], "frames": (0..4).map(camera).collect::<Vec<_>>() });
     fs::write(workplace.path("orbit.json"), cameras.to_string()).unwrap();
-    let line = "compress still.ply -o small.ply --force --target-ratio 0.5 --no-refine --json";
+    let line = "compress still.ply -o small.ply --overwrite --ratio 0.5 --no-refine --json";
     let summary =
         |more: &str| -> serde_json::Value { serde_json::from_str(&workplace.done(&format!("{line} {more}"))).unwrap() };
     let given = summary("--cameras orbit.json");
@@ -394,7 +394,7 @@ fn everything_converts_to_what_others_open_and_what_does_not_fit_is_refused() {
         assert!(!workplace.path(name).exists(), "{name}");
     }
     workplace.done("convert cloud.ply still.spz");
-    workplace.done("compress {tiny} --cameras {tiny} -o small.4dgs --target-ratio 0.5 --no-refine --quiet");
+    workplace.done("compress {tiny} --cameras {tiny} -o small.4dgs --ratio 0.5 --no-refine --quiet");
     assert!(
         fs::metadata(workplace.path("small.4dgs")).unwrap().len()
             < fs::metadata(workplace.path("a.4dgs")).unwrap().len()

@@ -14,8 +14,8 @@ use splatsieve::model::{Columns, Gaussians};
 use splatsieve::outputs::frame_stream::StreamWriter;
 
 /// Scores and prunes by formula: what looks at pictures takes time, not memory that grows with frames.
-const REQUEST: &str = "--coverage projected --prune-only --no-refine --choose-by-views=false --target-ratio 0.5 \
-     --bands all";
+const REQUEST: &str = "--set coverage=projected --prune-only --no-refine --set choose_by_views=false --ratio 0.5 \
+     --set bands=all";
 
 /// A sequence of which positions alone move, to and fro: the first component of Gaussian 0 at frame t is sin(t / 50).
 #[derive(Clone, Copy)]
@@ -89,7 +89,7 @@ fn keeps_to(output: &Output, what: &str, budget: f64) {
 fn both_ways(walk: Walk, budget: u64) {
     let workplace = Workplace::new();
     let limits = format!("--memory {budget}MiB --explain");
-    let output = piped(&workplace, &format!("pack - -o walk.gseq {limits}"), walk);
+    let output = piped(&workplace, &format!("convert - walk.gseq {limits}"), walk);
     keeps_to(&output, "pack", budget as f64);
     let output = ran(&workplace, &format!("compress walk.gseq -o file.gseq {REQUEST} {limits}"));
     keeps_to(&output, "container", budget as f64);
@@ -129,7 +129,7 @@ fn slow_ten_million_gaussians_in_two_frames_fit() {
 #[test]
 fn a_stream_longer_than_there_is_room_for_is_refused_and_the_memory_that_is_named_is_enough() {
     let walk = Walk { gaussians: 10, frames: 60_000 };
-    for (verb, rest) in [("compress", REQUEST), ("pack", "")] {
+    for (verb, rest) in [("compress", REQUEST), ("convert", "")] {
         let workplace = Workplace::new();
         let request = |memory: u64| format!("{verb} - -o out.gseq {rest} --memory {memory}MiB --explain");
         let output = piped(&workplace, &request(1), walk);

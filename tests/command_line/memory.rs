@@ -15,7 +15,7 @@ use splatsieve::source::{BlockReader, FrameSource, Ids};
 const GAUSSIANS: usize = 30_000;
 const FRAMES: usize = 48;
 /// Every picture of a camera that sees all, for cheap.
-const REQUEST: &str = "--cameras cameras.json --split all --frame-stride 6";
+const REQUEST: &str = "--cameras cameras.json --split all --set frame_stride=6";
 
 fn random(k: usize) -> f32 {
     (hash_id(k as u64) >> 40) as f32 / (1 << 24) as f32
@@ -106,11 +106,11 @@ fn peak(result: &Path) -> Option<u64> {
 fn the_least_that_is_named_works_holds_and_changes_no_byte() {
     let workplace = prepared();
     for (input, rest) in [
-        ("packed.gseq", "--target-ratio 0.4 --refine-steps 30 --refine-cut-steps 5 --as archive"),
+        ("packed.gseq", "--ratio 0.4 --set refine_steps=30 --set refine_cut_steps=5 --as archive"),
         ("packed.gseq", "--no-refine"),
         ("raw.gseq", "--no-refine"),
-        ("packed.gseq", "--target-ratio 0.4 --no-refine"),
-        ("packed.gseq", "--target-ratio 0.3 --refine-steps 30 --refine-cut-steps 5"),
+        ("packed.gseq", "--ratio 0.4 --no-refine"),
+        ("packed.gseq", "--ratio 0.3 --set refine_steps=30 --set refine_cut_steps=5"),
         ("packed.gseq", "--preset paper"),
     ] {
         let request = |output: &str| format!("compress {input} {REQUEST} {rest} -o {output}/small.gseq --overwrite");
@@ -133,17 +133,17 @@ fn the_least_that_is_named_works_holds_and_changes_no_byte() {
 #[ignore = "needs time"]
 fn every_verb_that_touches_frames_keeps_to_a_budget() {
     let workplace = prepared();
-    workplace.done(&format!("compress packed.gseq {REQUEST} --prune-only --target-ratio 0.5 -o small.gseq"));
+    workplace.done(&format!("compress packed.gseq {REQUEST} --prune-only --ratio 0.5 -o small.gseq"));
     for arguments in [
         format!("score packed.gseq {REQUEST} -o rows.npz"),
         "render packed.gseq --cameras cameras.json --frame 3 --view 0 -o x.png".to_owned(),
         "render packed.gseq --cameras cameras.json --beside small.gseq --video film.gif".to_owned(),
         "evaluate packed.gseq small.gseq --cameras cameras.json --max-frames 2".to_owned(),
         "report packed.gseq small.gseq --cameras cameras.json --max-frames 2 -o page".to_owned(),
-        "pack packed.gseq -o again.gseq".to_owned(),
-        "pack packed.gseq -o small_again.gseq --level 19".to_owned(),
-        "pack packed.gseq -o within.gseq --max-error position=0.1%,rotation=1e-2,log_scale=1e-2,sh=1e-2".to_owned(),
-        "unpack packed.gseq -o plys".to_owned(),
+        "convert packed.gseq again.gseq".to_owned(),
+        "convert packed.gseq small_again.gseq --level 19".to_owned(),
+        "convert packed.gseq within.gseq --max-error position=0.1%,rotation=1e-2,log_scale=1e-2,sh=1e-2".to_owned(),
+        "convert packed.gseq plys --as ply-sequence".to_owned(),
     ] {
         let least = least(&workplace, &arguments);
         let run = workplace.run(&format!("{arguments} --memory {least}MiB --explain"));
@@ -176,7 +176,7 @@ fn a_plan_is_explained_before_it_is_refused_and_nonsense_is_no_size() {
 #[ignore = "needs time"]
 fn a_run_killed_at_any_moment_leaves_nothing_that_the_next_one_does_not_clean_up() {
     let workplace = prepared();
-    let request = "--cameras cameras.json --split all --frame-stride 24 --target-ratio 0.5 -o small.gseq";
+    let request = "--cameras cameras.json --split all --set frame_stride=24 --ratio 0.5 -o small.gseq";
     let least = least(&workplace, &format!("compress packed.gseq {request}"));
     let arguments = format!("compress packed.gseq {request} --memory {least}MiB");
     let start = Instant::now();

@@ -50,7 +50,7 @@ fn run_parts(workplace: &Workplace, line: &str, of: usize) -> Vec<String> {
         let round: Vec<String> = (1..=of)
             .rev()
             .chain([1])
-            .map(|index| workplace.done(&format!("--quiet {line} --work work --part {index}/{of}")))
+            .map(|index| workplace.done(&format!("--quiet {line} --cache work --shard {index}/{of}")))
             .collect();
         let is_done = round.iter().all(|said| said.contains("nothing to do"));
         said.extend(round);
@@ -76,7 +76,7 @@ fn joins_to_the_same(workplace: &Workplace, line: &str, output: &str, numbers: &
         run_parts(workplace, line, of);
         assert!(!workplace.path(output).exists(), "{line}: a part of {of} wrote the output");
         for what in ["joined", "found again"] {
-            let (said_now, written_now) = run("--work work");
+            let (said_now, written_now) = run("--cache work");
             assert_eq!(said, said_now, "{line}: {what} of {of} parts");
             assert!(written == written_now, "{line}: {what} of {of} parts, other bytes");
         }
@@ -100,15 +100,16 @@ fn an_evaluation_in_parts_is_that_of_one_run() {
 #[test]
 fn a_report_in_parts_is_that_of_one_run_and_shares_the_parts_of_evaluate() {
     let workplace = workplace(300);
-    workplace.done("--quiet compress scene.gseq --cameras cameras.json --no-refine -o small.gseq --target-ratio 0.6");
+    workplace.done("--quiet compress scene.gseq --cameras cameras.json --no-refine -o small.gseq --ratio 0.6");
     let models = "scene.gseq small.gseq --cameras cameras.json";
     let rest = "--max-frames 9 --split all --flip";
     joins_to_the_same(&workplace, &format!("report {models} {rest} -o page"), "page", &[1, 2, 7]);
 
     _ = fs::remove_dir_all(workplace.path("work"));
     run_parts(&workplace, &format!("evaluate {models} {rest}"), 3);
-    let part =
-        |index: usize| workplace.done(&format!("--quiet report {models} {rest} -o page --work work --part {index}/3"));
+    let part = |index: usize| {
+        workplace.done(&format!("--quiet report {models} {rest} -o page --cache work --shard {index}/3"))
+    };
     let said = part(2);
     assert!(said.contains("scan: part 2/3 is done"), "the comparison is there: {said}");
     // Until the pictures are looked at again; of these two parts are made, and the run that joins names and makes the third.
@@ -120,7 +121,7 @@ fn a_report_in_parts_is_that_of_one_run_and_shares_the_parts_of_evaluate() {
         assert!(others < 9);
     }
     part(2);
-    let joined = workplace.run(&format!("--quiet report {models} {rest} -o page --work work"));
+    let joined = workplace.run(&format!("--quiet report {models} {rest} -o page --cache work"));
     let missing = "failure: missing of 3 parts, and computed here: 3";
     assert!(joined.code == 0 && joined.stderr.contains(missing), "{}", joined.stderr);
     workplace.done(&format!("--quiet report {models} {rest} -o other"));
@@ -131,9 +132,9 @@ fn a_report_in_parts_is_that_of_one_run_and_shares_the_parts_of_evaluate() {
 fn a_container_packed_in_parts_is_that_of_one_run() {
     let workplace = workplace(1500);
     for how in ["", "--raw", "--max-error position=0.1%,sh=1e-2"] {
-        joins_to_the_same(&workplace, &format!("pack scene.gseq -o packed.gseq {how}"), "packed.gseq", &NUMBERS);
+        joins_to_the_same(&workplace, &format!("convert scene.gseq packed.gseq {how}"), "packed.gseq", &NUMBERS);
     }
-    joins_to_the_same(&workplace, "pack {tiny} -o packed.gseq", "packed.gseq", &[2]);
+    joins_to_the_same(&workplace, "convert {tiny} packed.gseq", "packed.gseq", &[2]);
 }
 
 #[test]
@@ -147,12 +148,12 @@ fn pictures_rendered_in_parts_are_those_of_one_run() {
 #[test]
 fn a_missing_part_is_named_and_made_by_the_run_that_joins() {
     let workplace = workplace(300);
-    let line = "render scene.gseq --cameras cameras.json --all -o pictures --work work";
+    let line = "render scene.gseq --cameras cameras.json --all -o pictures --cache work";
     for index in [1, 3, 4] {
-        workplace.done(&format!("--quiet {line} --part {index}/5"));
+        workplace.done(&format!("--quiet {line} --shard {index}/5"));
     }
     assert_eq!(
-        workplace.done(&format!("--quiet {line} --part 3/5")),
+        workplace.done(&format!("--quiet {line} --shard 3/5")),
         "render: part 3/5 is there already; missing: 2, 5\n"
     );
     let run = workplace.run(&format!("--quiet {line}"));
@@ -178,7 +179,7 @@ fn parts_of_other_inputs_and_options_are_not_taken() {
     workplace.done("--quiet render scene.gseq --cameras cameras.json --all --split all -o photographs");
     fs::copy(workplace.path("scene.gseq"), workplace.path("same.gseq")).unwrap();
     let evaluate =
-        |line: &str| workplace.done(&format!("--quiet evaluate {line} --max-frames 3 --work work --part 1/2"));
+        |line: &str| workplace.done(&format!("--quiet evaluate {line} --max-frames 3 --cache work --shard 1/2"));
     let models = "scene.gseq smaller.gseq --cameras cameras.json";
     let photographs = format!("{models} --ground-truth photographs");
     let lines = [
@@ -200,7 +201,7 @@ fn parts_of_other_inputs_and_options_are_not_taken() {
     fs::copy(workplace.path("photographs/t000_v00.png"), workplace.path("photographs/t007_v00.png")).unwrap();
     assert!(evaluate(&photographs).contains("part 1/2 is done"));
     assert!(evaluate("same.gseq smaller.gseq --cameras cameras.json").contains("part 1/2 is there already"));
-    let pack = |line: &str| workplace.done(&format!("--quiet pack {line} -o packed.gseq --work work --part 1/2"));
+    let pack = |line: &str| workplace.done(&format!("--quiet convert {line} packed.gseq --cache work --shard 1/2"));
     for (done, line) in
         ["scene.gseq", "smaller.gseq", "scene.gseq --raw", "scene.gseq --level 3", "scene.gseq --max-error sh=1e-2"]
             .iter()
@@ -210,7 +211,7 @@ fn parts_of_other_inputs_and_options_are_not_taken() {
         assert_eq!(listed(&workplace, "pack").len(), done + 1, "{line}");
     }
     let render = |line: &str| {
-        workplace.done(&format!("--quiet render {line} --cameras cameras.json --all -o x --work work --part 1/2"))
+        workplace.done(&format!("--quiet render {line} --cameras cameras.json --all -o x --cache work --shard 1/2"))
     };
     for (done, line) in
         ["scene.gseq", "smaller.gseq", "scene.gseq --as npy", "scene.gseq --background 0,0,1", "scene.gseq --split all"]
@@ -239,7 +240,7 @@ fn damaged_parts_are_made_again() {
     let workplace = workplace(300);
     for (line, output) in [
         ("evaluate scene.gseq smaller.gseq --cameras cameras.json --csv out", "out"),
-        ("pack scene.gseq -o out", "out"),
+        ("convert scene.gseq out", "out"),
         ("render scene.gseq --cameras cameras.json --all -o out", "out"),
         ("compress scene.gseq --cameras cameras.json -o out.gseq --preset paper", "out.gseq"),
     ] {
@@ -247,14 +248,14 @@ fn damaged_parts_are_made_again() {
         let content = || if path.is_dir() { files(&path) } else { [("".into(), fs::read(&path).unwrap())].into() };
         workplace.done(&format!("--quiet {line}"));
         let whole = content();
-        run_parts(&workplace, &format!("{line} --force"), 3);
+        run_parts(&workplace, &format!("{line} --overwrite"), 3);
         assert!(damage(&workplace) >= 4, "{line}");
-        let run = workplace.run(&format!("--quiet {line} --work work --force"));
+        let run = workplace.run(&format!("--quiet {line} --cache work --overwrite"));
         assert!(run.code == 0 && (run.stderr.contains("is damaged") || output == "out.gseq"), "{line}: {}", run.stderr);
         assert!(content() == whole, "{line}: other bytes");
         // What a run has joined may be damaged, too.
         damage(&workplace);
-        assert_eq!(workplace.run(&format!("--quiet {line} --work work --force")).code, 0, "{line}");
+        assert_eq!(workplace.run(&format!("--quiet {line} --cache work --overwrite")).code, 0, "{line}");
         assert!(content() == whole, "{line}: other bytes");
         workplace.done("work work --clean");
         if path.is_dir() { fs::remove_dir_all(&path) } else { fs::remove_file(&path) }.unwrap();
@@ -266,16 +267,16 @@ fn compresses_to_the_same(workplace: &Workplace, line: &str, numbers: &[usize]) 
     let compress = format!("compress scene.gseq --cameras cameras.json -o out.gseq {line}");
     let outputs = ["out.gseq", "out.gseq.index_map.npy", "out.gseq.recipe.toml"];
     let written = || outputs.map(|name| fs::read(workplace.path(name)).unwrap());
-    workplace.done(&format!("--quiet {compress} --force"));
+    workplace.done(&format!("--quiet {compress} --overwrite"));
     let whole = written();
     let mut stages = BTreeSet::new();
     for &of in numbers {
         fs::remove_file(workplace.path("out.gseq")).unwrap();
         _ = fs::remove_dir_all(workplace.path("work"));
-        let said = run_parts(workplace, &format!("{compress} --force"), of);
+        let said = run_parts(workplace, &format!("{compress} --overwrite"), of);
         assert!(!workplace.path("out.gseq").exists());
         stages.extend(said.iter().filter_map(|said| Some(said.split_once(": part ")?.0.to_owned())));
-        workplace.done(&format!("--quiet {compress} --force --work work"));
+        workplace.done(&format!("--quiet {compress} --overwrite --cache work"));
         assert!(written() == whole, "{line}: other bytes of {of} parts");
     }
     stages
@@ -284,9 +285,9 @@ fn compresses_to_the_same(workplace: &Workplace, line: &str, numbers: &[usize]) 
 #[test]
 fn compressing_in_parts_gives_what_one_run_gives() {
     let workplace = workplace(600);
-    let stages = compresses_to_the_same(&workplace, "--no-refine --target-ratio 0.7", &[2, 7]);
+    let stages = compresses_to_the_same(&workplace, "--no-refine --ratio 0.7", &[2, 7]);
     assert!(["scan", "visible", "rounds-01", "rounds-02"].iter().all(|stage| stages.contains(*stage)), "{stages:?}");
-    let stages = compresses_to_the_same(&workplace, "--no-refine --target-ratio 0.85", &[64]);
+    let stages = compresses_to_the_same(&workplace, "--no-refine --ratio 0.85", &[64]);
     assert!(stages.contains("rounds-01"), "{stages:?}");
 }
 
@@ -298,7 +299,7 @@ fn pairs_measured_in_parts_merge_as_in_one_run() {
     for name in ["scene.gseq", "cameras.json"] {
         fs::rename(workplace.path("demo").join(name), workplace.path(name)).unwrap();
     }
-    let stages = compresses_to_the_same(&workplace, "--preset paper --target-ratio 0.6", &[2, 7]);
+    let stages = compresses_to_the_same(&workplace, "--preset paper --ratio 0.6", &[2, 7]);
     assert_eq!(stages.iter().collect::<Vec<_>>(), ["pairs", "scan"]);
 }
 
@@ -308,20 +309,20 @@ fn divided_stages_are_listed_with_their_units() {
     let list = |line: &str| {
         workplace.done(&format!("--quiet compress scene.gseq --cameras cameras.json -o out.gseq --list-stages {line}"))
     };
-    let listed = list("--no-refine --target-ratio 0.7");
+    let listed = list("--no-refine --ratio 0.7");
     let lines: Vec<&str> = listed.lines().collect();
     assert_eq!(lines[0], "scan: 2 blocks of Gaussians");
     assert!(lines[1].starts_with("visible: ") && lines[1].ends_with(" pictures"), "{listed}");
     assert!(lines[2].starts_with("rounds-01: ") && lines.contains(&"pairs: pairs of neighbours"), "{listed}");
     assert_eq!(list("--preset paper"), "scan: 2 blocks of Gaussians\npairs: pairs of neighbours\n");
     assert!(list("").contains("targets: pictures"));
-    workplace.refused(2, "compress scene.gseq -o out.gseq --list-stages --work work --part 1/2", &["--part"]);
+    workplace.refused(2, "compress scene.gseq -o out.gseq --list-stages --cache work --shard 1/2", &["--shard"]);
 }
 
 #[test]
 fn a_work_folder_is_listed_and_cleaned() {
     let workplace = workplace(300);
-    workplace.done("--quiet pack scene.gseq -o packed.gseq --work work --part 2/3");
+    workplace.done("--quiet convert scene.gseq packed.gseq --cache work --shard 2/3");
     let text = workplace.done("work work");
     assert!(text.starts_with("scene.gseq (splatsieve ") && text.contains("3 parts, missing: 1, 3"), "{text}");
     let listed: Value = serde_json::from_str(&workplace.done("work work --json")).unwrap();
@@ -343,15 +344,15 @@ fn a_work_folder_is_listed_and_cleaned() {
 fn what_cannot_be_divided_is_refused() {
     let workplace = workplace(300);
     for (line, part) in [
-        ("pack - -o x.gseq --work work", "splatsieve pack - -o NAME.gseq"),
-        ("render - --all -o x --work work", "splatsieve pack - -o NAME.gseq"),
-        ("evaluate - scene.gseq --work work", "splatsieve pack - -o NAME.gseq"),
-        ("compress - -o x.gseq --work work", "splatsieve pack - -o NAME.gseq"),
-        ("render scene.gseq --frame 0 --view 0 -o x.png --work work", "expected --all"),
-        ("render scene.gseq --all -o x --part 1/2", "--work"),
-        ("evaluate scene.gseq smaller.gseq --work work --part 3/2", "i/n"),
-        ("pack scene.gseq -o x.gseq --work work --part 0/2", "i/n"),
-        ("pack scene.gseq -o x.gseq --work scene.gseq", "is no folder"),
+        ("convert - x.gseq --cache work", "splatsieve convert - NAME.gseq"),
+        ("render - --all -o x --cache work", "splatsieve convert - NAME.gseq"),
+        ("evaluate - scene.gseq --cache work", "splatsieve convert - NAME.gseq"),
+        ("compress - -o x.gseq --cache work", "splatsieve convert - NAME.gseq"),
+        ("render scene.gseq --frame 0 --view 0 -o x.png --cache work", "expected --all"),
+        ("render scene.gseq --all -o x --shard 1/2", "--cache"),
+        ("evaluate scene.gseq smaller.gseq --cache work --shard 3/2", "i/n"),
+        ("convert scene.gseq x.gseq --cache work --shard 0/2", "i/n"),
+        ("convert scene.gseq x.gseq --cache scene.gseq", "is no folder"),
     ] {
         workplace.refused(2, line, &[part]);
     }

@@ -13,8 +13,7 @@ use std::time::{Duration, Instant, SystemTime};
 use crate::scene::{Workplace, program};
 
 /// A scene of many Gaussians for its size on the disk, and a run of all that can be kept.
-const RUN: &str =
-    "compress scene/scene.gseq --cameras scene/cameras.json --quiet --target-ratio 0.2 --refine-steps 150";
+const RUN: &str = "compress scene/scene.gseq --cameras scene/cameras.json --quiet --ratio 0.2 --set refine_steps=150";
 
 fn command(workplace: &Workplace, arguments: &str) -> Command {
     let mut command = Command::new(program());
@@ -69,7 +68,7 @@ fn killed(gaussians: usize, kills: usize) {
     while done < kills {
         runs += 1;
         let (work, target) = (workplace.path(&format!("work{runs}")), format!("killed{runs}.gseq"));
-        let arguments = format!("{RUN} -o {target} --work work{runs}");
+        let arguments = format!("{RUN} -o {target} --cache work{runs}");
         let mut kept = BTreeMap::new();
         let ended = loop {
             let mut child = command(&workplace, &arguments).spawn().unwrap();
@@ -117,7 +116,7 @@ fn slow_a_run_killed_at_50_moments_goes_on_and_writes_the_same_bytes() {
 #[test]
 fn a_run_told_to_end_leaves_a_valid_folder_and_exits_with_143() {
     let workplace = made(700);
-    let arguments = format!("{RUN} -o told.gseq --work work");
+    let arguments = format!("{RUN} -o told.gseq --cache work");
     let child = command(&workplace, &arguments).spawn().unwrap();
     while pieces(&workplace.path("work")).len() < 4 {
         sleep(Duration::from_millis(5));
@@ -138,7 +137,7 @@ fn a_run_told_to_end_leaves_a_valid_folder_and_exits_with_143() {
 fn two_runs_in_one_work_folder_write_the_same_bytes() {
     let workplace = made(700);
     let runs = ["one", "two", "three"]
-        .map(|name| (name, command(&workplace, &format!("{RUN} -o {name}.gseq --work work")).spawn().unwrap()));
+        .map(|name| (name, command(&workplace, &format!("{RUN} -o {name}.gseq --cache work")).spawn().unwrap()));
     for (name, child) in runs {
         let output = child.wait_with_output().unwrap();
         assert!(output.status.success(), "{name}: {}", told(&output));
@@ -154,8 +153,9 @@ fn a_changed_recipe_computes_only_what_depends_on_it() {
     let workplace = made(700);
     let run = |name: &str, options: &str| {
         let before = pieces(&workplace.path("work"));
-        let run = RUN.replace("--refine-steps 150", if options.contains("steps") { "" } else { "--refine-steps 150" });
-        let output = ran(&workplace, &format!("{run} -o {name}.gseq --work work {options}"));
+        let run = RUN
+            .replace("--set refine_steps=150", if options.contains("steps") { "" } else { "--set refine_steps=150" });
+        let output = ran(&workplace, &format!("{run} -o {name}.gseq --cache work {options}"));
         assert!(output.status.success(), "{}", told(&output));
         let after = pieces(&workplace.path("work"));
         assert!(before.iter().all(|(name, written)| after.get(name) == Some(written)), "a piece was written again");
@@ -173,9 +173,9 @@ fn a_changed_recipe_computes_only_what_depends_on_it() {
     assert_eq!(run("again", ""), [""; 0]);
     let no_steps =
         |new: Vec<String>| new.into_iter().filter(|name| name != "refine-cut" && name != "bands").collect::<Vec<_>>();
-    assert_eq!(no_steps(run("steps", "--refine-steps 160")), ["refine"]);
+    assert_eq!(no_steps(run("steps", "--set refine_steps=160")), ["refine"]);
     // Frames and targets are not read again; what was ranked by fewer pictures is, and what follows only if it differs.
-    let look = run("look", "--look-pictures 12");
+    let look = run("look", "--set look_pictures=12");
     let is_new = |stage: &str| look.iter().any(|name| name == stage);
     assert!(is_new("visible") && is_new("score") && is_new("rounds"), "{look:?}");
     assert!(!is_new("scan") && !is_new("input") && !is_new("targets"), "{look:?}");
@@ -186,12 +186,12 @@ fn a_changed_recipe_computes_only_what_depends_on_it() {
 #[test]
 fn a_stream_cannot_be_gone_on_with_and_a_part_needs_a_folder() {
     let workplace = Workplace::new();
-    let output = ran(&workplace, "compress - -o out.gseq --work work");
+    let output = ran(&workplace, "compress - -o out.gseq --cache work");
     assert_eq!(output.status.code(), Some(2));
     assert!(told(&output).contains("splatsieve pack -"), "{}", told(&output));
     for (arguments, part) in [
-        ("compress in.gseq -o out.gseq --part 1/2", "--work"),
-        ("compress in.gseq -o out.gseq --work work --part 3/2", "3/8"),
+        ("compress in.gseq -o out.gseq --shard 1/2", "--cache"),
+        ("compress in.gseq -o out.gseq --cache work --shard 3/2", "3/8"),
         ("work nowhere", "nowhere"),
     ] {
         let output = ran(&workplace, arguments);
@@ -205,7 +205,7 @@ fn a_stream_cannot_be_gone_on_with_and_a_part_needs_a_folder() {
 fn a_full_disk_under_the_work_folder_is_named_and_more_room_goes_on() {
     let workplace = made(700);
     fs::create_dir(workplace.path("disk")).unwrap();
-    let run = format!("{RUN} -o full.gseq --work disk/work");
+    let run = format!("{RUN} -o full.gseq --cache disk/work");
     let script = format!(
         "mount -t tmpfs -o size=300k none disk && ({0} {run}; echo \"code $?\" >&2; mount -o remount,size=300m disk && {0} {run})",
         program().display()

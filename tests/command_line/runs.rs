@@ -28,9 +28,9 @@ fn repeats(workplace: &Workplace, name: &str, arguments: &str) -> Run {
 fn the_recipe_beside_a_result_repeats_its_run() {
     let workplace = Workplace::new();
     for (k, options) in [
-        "--cameras {tiny} --target-ratio 0.4",
-        "--cameras {tiny} --target-count 77 --split test --preset paper",
-        "--cameras {tiny} --prune-only --mu 2",
+        "--cameras {tiny} --ratio 0.4",
+        "--cameras {tiny} --count 77 --split test --preset paper",
+        "--cameras {tiny} --prune-only --set mu=2",
         "--cameras {tiny} --merge-only --preset strong --split all",
         "--cameras {tiny} --keep-ids 3,10-20 --drop-ids 200-210",
         "--cameras {tiny} --keep-box -1,-1,-1,0,0,0.5",
@@ -47,14 +47,14 @@ fn the_recipe_beside_a_result_repeats_its_run() {
 #[test]
 fn a_recipe_of_another_input_is_noted_and_flags_go_before_it() {
     let workplace = Workplace::new();
-    workplace.done("compress {tiny} --cameras {tiny} --target-ratio 0.5 -o half");
+    workplace.done("compress {tiny} --cameras {tiny} --ratio 0.5 -o half");
     workplace.done("demo --gaussians 600 --frames 4 -o demo");
     let demo = "demo/scene.gseq --cameras demo/cameras.json --recipe half/recipe.toml";
     let summary = workplace.summary(&format!("{demo} -o other.gseq"));
     assert_eq!(summary["gaussians"], 300);
     let notes = summary["notes"].to_string();
     assert!(notes.contains("another input"), "{notes}");
-    let summary = workplace.summary(&format!("{demo} --target-count 123 -o third.gseq"));
+    let summary = workplace.summary(&format!("{demo} --count 123 -o third.gseq"));
     assert_eq!(summary["gaussians"], 123);
 }
 
@@ -96,7 +96,7 @@ fn every_field_of_a_summary_is_described() {
 #[test]
 fn a_dry_run_says_what_the_run_would_say() {
     let workplace = Workplace::new();
-    let options = "{tiny} --cameras {tiny} --target-ratio 0.5 -o out";
+    let options = "{tiny} --cameras {tiny} --ratio 0.5 -o out";
     let dry = workplace.summary(&format!("{options} --dry-run"));
     assert!(lasting_files(&workplace.path("")).is_empty(), "a dry run makes nothing");
     let wet = workplace.summary(options);
@@ -141,16 +141,15 @@ fn no_preset_reads_more_than_its_plan_named_however_little_memory_there_is() {
     let workplace = Workplace::new();
     workplace.done("demo --gaussians 3000 --frames 64 -o demo");
     for preset in ["default", "paper", "gentle", "strong"] {
-        for (k, options) in ["", "--memory 48MiB", "--merge-only --memory 48MiB", "--target-ratio 0.2 --memory 48MiB"]
-            .iter()
-            .enumerate()
+        for (k, options) in
+            ["", "--memory 48MiB", "--merge-only --memory 48MiB", "--ratio 0.2 --memory 48MiB"].iter().enumerate()
         {
             if preset == "gentle" && options.contains("merge-only") {
                 continue;
             }
             let output = format!("{preset}{k}.gseq");
             let arguments = format!(
-                "demo/scene.gseq --cameras demo/cameras.json --preset {preset} {options} --refine-steps 60 --refine-cut-steps 10 -o {output}"
+                "demo/scene.gseq --cameras demo/cameras.json --preset {preset} {options} --set refine_steps=60 --set refine_cut_steps=10 -o {output}"
             );
             let read = reads_as_planned(&workplace, &arguments);
             // What fits into memory is read once; two threads may begin the same tile at once.
@@ -165,7 +164,7 @@ fn a_default_run_reads_the_container_of_a_trained_model_at_most_two_and_a_half_t
     let model = shared("deform2");
     let workplace = Workplace::new();
     let model = model.display();
-    workplace.done(&format!("pack {model} --cameras {model} -o packed.gseq"));
+    workplace.done(&format!("convert {model} packed.gseq --cameras {model}"));
     let read = reads_as_planned(&workplace, &format!("packed.gseq --cameras {model} -o small.gseq"));
     assert!(read <= 2.5, "{read}");
 }

@@ -33,7 +33,7 @@ fn packed(workplace: &Workplace, exporter: &mut Command, name: &str) -> Containe
     let stream = run(exporter, workplace);
     fs::write(workplace.path("stream"), stream).unwrap();
     let status = Command::new(assert_cmd::cargo::cargo_bin("splatsieve"))
-        .args(["pack", "-", "-o", name])
+        .args(["convert", "-", name])
         .current_dir(workplace.path(""))
         .stdin(fs::File::open(workplace.path("stream")).unwrap())
         .output()
@@ -59,8 +59,8 @@ fn write_columns(workplace: &Workplace, scene: &Container, frame: usize) {
 fn lives_that_a_script_cuts_are_linked_and_it_says_how_well() {
     let python = python("numpy, zstandard");
     let workplace = Workplace::new();
-    workplace.done("pack {tiny} --frames 9 -o tiny.gseq");
-    workplace.done("unpack tiny.gseq -o frames");
+    workplace.done("convert {tiny} tiny.gseq --frames 9");
+    workplace.done("convert tiny.gseq frames --as ply-sequence");
     let cut = script("cut_lives.py");
     let mut command = Command::new(&python);
     let said = run(
@@ -69,7 +69,7 @@ fn lives_that_a_script_cuts_are_linked_and_it_says_how_well() {
     );
     let said = String::from_utf8(said).unwrap();
     assert!(said.contains("in 9 frames"), "{said}");
-    workplace.done("pack cut -o linked.gseq --link apart");
+    workplace.done("convert cut linked.gseq --link apart");
     let score = run(Command::new(&python).arg(&cut).args(["--score", "cut", "linked.gseq"]), &workplace);
     let score = String::from_utf8(score).unwrap();
     assert!(score.contains("by gaussian: ") && score.contains(" tracks, "), "{score}");
@@ -80,7 +80,7 @@ fn lives_that_a_script_cuts_are_linked_and_it_says_how_well() {
 fn arrays_exported_as_a_stream_arrive_bit_for_bit() {
     let python = python("numpy");
     let workplace = Workplace::new();
-    workplace.done("pack {tiny} -o scene.gseq");
+    workplace.done("convert {tiny} scene.gseq");
     let scene = Container::open(&workplace.path("scene.gseq")).unwrap();
     (0..10).for_each(|frame| write_columns(&workplace, &scene, frame));
     let times: Vec<String> = scene.info().times.iter().map(|time| format!("{time:?}")).collect();
@@ -122,7 +122,7 @@ fn an_exporter_that_fails_writes_no_end_mark() {
     let output = Command::new(python).args(["-c", code]).arg(script("")).output().unwrap();
     fs::write(workplace.path("stream"), output.stdout).unwrap();
     let output = Command::new(assert_cmd::cargo::cargo_bin("splatsieve"))
-        .args(["pack", "-", "-o", "a.gseq"])
+        .args(["convert", "-", "a.gseq"])
         .current_dir(workplace.path(""))
         .stdin(fs::File::open(workplace.path("stream")).unwrap())
         .output()
@@ -154,11 +154,11 @@ fn a_stream_of_no_gaussians_is_written_and_read() {
 fn the_container_reader_gives_every_bit_of_every_column() {
     let python = python("numpy, zstandard");
     let workplace = Workplace::new();
-    workplace.done("pack {tiny} -o zstd.gseq");
-    workplace.done("pack {tiny} -o raw.gseq --raw");
+    workplace.done("convert {tiny} zstd.gseq");
+    workplace.done("convert {tiny} raw.gseq --raw");
     workplace.done("demo --gaussians 2500 --frames 70 -o demo");
-    workplace.done("pack {tiny} -o tiny.gseq --max-error position=1e-2,rotation=1e-2,log_scale=1e-2,sh=1e-2");
-    workplace.done("pack demo/scene.gseq -o demo.gseq --max-error position=0.05%,rotation=1e-3,opacity_logit=0.1");
+    workplace.done("convert {tiny} tiny.gseq --max-error position=1e-2,rotation=1e-2,log_scale=1e-2,sh=1e-2");
+    workplace.done("convert demo/scene.gseq demo.gseq --max-error position=0.05%,rotation=1e-3,opacity_logit=0.1");
     for (path, frames) in [
         ("zstd.gseq", vec![0, 9]),
         ("raw.gseq", vec![3]),

@@ -84,7 +84,7 @@ fn defective_rows_are_counted_and_left_out_or_kept() {
         "8 of 200 rows (4.00%) repaired: infinite temporal width",
     ];
     assert_said(&notes(&json(&workplace, "info odd.splatv --json")), &parts);
-    let options = "--frames 4 --prune-only --no-refine --target-count 150";
+    let options = "--frames 4 --prune-only --no-refine --count 150";
     let summary = workplace.summary(&format!("odd.splatv -o small.splatv {options}"));
     assert_eq!((&summary["input"]["gaussians"], &summary["gaussians"]), (&192.into(), &150.into()));
     assert_said(&notes(&summary), &parts);
@@ -110,7 +110,7 @@ fn infinite_windows_show_at_every_time_and_results_are_sound() {
         assert!((visible - 204.0 / 255.0).abs() < 1e-6, "{visible} at frame {frame}");
         assert!(state.position.planes().iter().all(|x| x.is_finite()));
     }
-    workplace.done("compress odd.splatv -o all.splatv --frames 4 --prune-only --no-refine --target-ratio 1");
+    workplace.done("compress odd.splatv -o all.splatv --frames 4 --prune-only --no-refine --ratio 1");
     let all = rows_of(&workplace.path("all.splatv"));
     assert_eq!(all.iter().filter(|row| row.width == 65504.0).count(), 8);
     assert!(all.iter().all(|row| row.width > 0.0 && row.width.is_finite() && row.rotation != [0.0; 4]));
@@ -127,7 +127,7 @@ fn zero_quaternions_are_kept_where_asked() {
     write(&workplace.path("odd.splatv"), &rows());
     let said = workplace.done("info odd.splatv --zero-rotation identity");
     assert!(said.contains("6 of 200 rows (3.00%) repaired: zero quaternion"), "{said}");
-    let options = "--frames 4 --prune-only --no-refine --target-ratio 1 --zero-rotation identity";
+    let options = "--frames 4 --prune-only --no-refine --ratio 1 --zero-rotation identity";
     let summary = workplace.summary(&format!("odd.splatv -o all.splatv {options}"));
     assert_eq!(summary["gaussians"], 197);
     let turned =
@@ -161,7 +161,7 @@ fn captured(name: &str) -> Vec<String> {
         [folder.join(name), folder.join("spinach_4_test.json")].map(|path| path.display().to_string());
     workplace.done(&format!("info {model}"));
     let looks = format!("--cameras {cameras} --frames 3");
-    let options = "-o small.splatv --target-ratio 0.1 --no-refine --prune-only";
+    let options = "-o small.splatv --ratio 0.1 --no-refine --prune-only";
     let summary = workplace.summary(&format!("{model} {looks} {options}"));
     let found = json(&workplace, &format!("evaluate {model} small.splatv {looks} --json"));
     assert!(found["psnr"].as_f64().is_some_and(f64::is_finite), "{found}");

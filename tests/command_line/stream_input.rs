@@ -25,7 +25,7 @@ fn done(output: Output) -> Vec<u8> {
 
 /// The tiny model as a stream.
 fn streamed(workplace: &Workplace) -> Vec<u8> {
-    done(workplace.piped("unpack {tiny} --stream", b""))
+    done(workplace.piped("convert {tiny} -", b""))
 }
 
 /// Names of everything in a folder that is no result: hidden ones, and those of scratch files.
@@ -38,17 +38,17 @@ fn left_over(folder: &Path) -> Vec<PathBuf> {
 fn a_stream_gives_the_bytes_of_packing_first_whatever_the_threads() {
     let workplace = Workplace::new();
     let stream = streamed(&workplace);
-    done(workplace.piped("pack - -o packed.gseq", &stream));
+    done(workplace.piped("convert - packed.gseq", &stream));
     // The frames are scanned once, as they arrive, and all pictures are looked at then; only the end tells which a
     // hundred are spread evenly.
     let (as_it_arrives, at_the_end): (&[&str], &[&str]) = (&["receive", "score"], &["receive", "visible", "score"]);
     for (name, rest, first) in [
         ("default", "--cameras {tiny}", at_the_end),
-        ("all", "--cameras {tiny} --look-pictures 0", as_it_arrives),
+        ("all", "--cameras {tiny} --set look_pictures=0", as_it_arrives),
         ("paper", "--cameras {tiny} --preset paper", as_it_arrives),
         (
             "merged",
-            "--cameras {tiny} --target-ratio 0.3 --frame-stride 3 --view-stride 2 --look-pictures 0",
+            "--cameras {tiny} --ratio 0.3 --set frame_stride=3 --set view_stride=2 --set look_pictures=0",
             as_it_arrives,
         ),
         ("rig", "", as_it_arrives),
@@ -79,8 +79,8 @@ fn a_stream_is_packed_within_bounds_like_a_file_and_told_of_where_that_is_larger
     let workplace = Workplace::new();
     let stream = streamed(&workplace);
     let bounds = "--max-error position=2e-3,sh=1e-2";
-    done(workplace.piped(&format!("pack - -o stream.gseq {bounds}"), &stream));
-    workplace.done(&format!("pack {{tiny}} -o file.gseq {bounds}"));
+    done(workplace.piped(&format!("convert - stream.gseq {bounds}"), &stream));
+    workplace.done(&format!("convert {{tiny}} file.gseq {bounds}"));
     let [stream_of, file] =
         ["stream", "file"].map(|name| Reader::open(workplace.path(&format!("{name}.gseq"))).unwrap());
     for column in 0..5 {
@@ -88,9 +88,9 @@ fn a_stream_is_packed_within_bounds_like_a_file_and_told_of_where_that_is_larger
         assert_eq!(stream_of.tile_info(at).unwrap().checksum, file.tile_info(at).unwrap().checksum, "{at:?}");
     }
     // Raw tiles and what says where they lie.
-    let larger = String::from_utf8(done(workplace.piped("pack - -o raw.gseq --raw", &stream))).unwrap();
+    let larger = String::from_utf8(done(workplace.piped("convert - raw.gseq --raw", &stream))).unwrap();
     assert!(larger.contains(&format!("bytes of {}: the input holds its values in fewer", stream.len())), "{larger}");
-    let refused = workplace.piped("pack - -o x.gseq --max-error position=1%", &stream);
+    let refused = workplace.piped("convert - x.gseq --max-error position=1%", &stream);
     let message = String::from_utf8_lossy(&refused.stderr);
     assert!(refused.status.code() == Some(2) && message.contains("expected scene units"), "{message}");
     assert!(!workplace.path("x.gseq").exists());
@@ -100,7 +100,7 @@ fn a_stream_is_packed_within_bounds_like_a_file_and_told_of_where_that_is_larger
 fn rows_of_a_stream_are_those_of_the_packed_frames() {
     let workplace = Workplace::new();
     let stream = streamed(&workplace);
-    done(workplace.piped("pack - -o packed.gseq", &stream));
+    done(workplace.piped("convert - packed.gseq", &stream));
     workplace.done("score packed.gseq --cameras {tiny} -o expected.npz");
     done(workplace.piped("score - --cameras {tiny} -o found.npz", &stream));
     assert!(fs::read(workplace.path("expected.npz")).unwrap() == fs::read(workplace.path("found.npz")).unwrap());
@@ -127,7 +127,7 @@ fn retimed(stream: &[u8], time: impl Fn(usize) -> f64) -> Vec<u8> {
 fn uneven_frames_are_measured_from_the_packed_ones_with_the_same_result() {
     let workplace = Workplace::new();
     let stream = retimed(&streamed(&workplace), |frame| (frame * frame) as f64);
-    done(workplace.piped("pack - -o packed.gseq", &stream));
+    done(workplace.piped("convert - packed.gseq", &stream));
     workplace.done("compress packed.gseq -o expected");
     let output = done(workplace.piped("compress - -o found", &stream));
     assert!(String::from_utf8_lossy(&output).contains("not evenly spaced"), "{}", String::from_utf8_lossy(&output));
@@ -137,18 +137,18 @@ fn uneven_frames_are_measured_from_the_packed_ones_with_the_same_result() {
 #[test]
 fn what_is_unpacked_as_a_stream_packs_to_the_same_frames_and_chains() {
     let workplace = Workplace::new();
-    workplace.done("pack {tiny} -o a.gseq");
-    let stream = done(workplace.piped("unpack a.gseq --stream", b""));
-    done(workplace.piped("pack - -o b.gseq", &stream));
+    workplace.done("convert {tiny} a.gseq");
+    let stream = done(workplace.piped("convert a.gseq -", b""));
+    done(workplace.piped("convert - b.gseq", &stream));
     let [a, b] = ["a.gseq", "b.gseq"].map(|name| Container::open(&workplace.path(name)).unwrap());
     assert_eq!(a.info(), b.info());
     assert!((0..10).all(|frame| state(&a, frame) == state(&b, frame)));
-    assert!(done(workplace.piped("unpack - --stream", &stream)) == stream, "a stream of a stream is that stream");
-    done(workplace.piped("unpack - -o frames", &stream));
-    workplace.done("unpack a.gseq -o expected");
+    assert!(done(workplace.piped("convert - -", &stream)) == stream, "a stream of a stream is that stream");
+    done(workplace.piped("convert - frames --as ply-sequence", &stream));
+    workplace.done("convert a.gseq expected --as ply-sequence");
     assert!(lasting_files(&workplace.path("frames")) == lasting_files(&workplace.path("expected")));
 
-    let mut unpack = splatsieve(&workplace, "unpack a.gseq --stream").spawn().unwrap();
+    let mut unpack = splatsieve(&workplace, "convert a.gseq -").spawn().unwrap();
     let output = splatsieve(&workplace, "compress - -o c.gseq --cameras {tiny}")
         .stdin(unpack.stdout.take().unwrap())
         .output()
@@ -174,7 +174,7 @@ fn broken_streams_end_in_an_error_and_leave_nothing() {
         assert!(message.contains(part), "{arguments}: {part:?} is not in {message:?}");
         assert!(files(&workplace.path("")) == before, "{arguments}: something was left behind");
     };
-    for arguments in ["compress - -o out", "compress - -o out.gseq", "score - -o rows.npz", "pack - -o a.gseq"] {
+    for arguments in ["compress - -o out", "compress - -o out.gseq", "score - -o rows.npz", "convert - a.gseq"] {
         refused(arguments, &stream[..stream.len() - 24], 1, "after 10 complete frames, without its end mark");
         refused(arguments, b"Loading model\n", 1, "standard input");
         refused(arguments, b"", 1, "before its first frame");
@@ -191,7 +191,7 @@ fn broken_streams_end_in_an_error_and_leave_nothing() {
 #[test]
 fn a_reader_that_has_seen_enough_of_a_stream_is_no_failure() {
     let workplace = Workplace::new();
-    let mut child = splatsieve(&workplace, "unpack {tiny} --stream --quiet").spawn().unwrap();
+    let mut child = splatsieve(&workplace, "convert {tiny} - --quiet").spawn().unwrap();
     drop(child.stdout.take());
     let output = child.wait_with_output().unwrap();
     assert!(output.status.success() && output.stderr.is_empty(), "{}", String::from_utf8_lossy(&output.stderr));
@@ -212,7 +212,7 @@ fn wait_for_scratch(folder: &Path, child: &mut Child) {
 fn what_a_killed_run_leaves_is_gone_after_the_next_one() {
     let workplace = Workplace::new();
     let stream = streamed(&workplace);
-    for (scratch, next) in [("", "pack {tiny} -o other.gseq --overwrite"), ("scratch", "compress - -o out --overwrite")]
+    for (scratch, next) in [("", "convert {tiny} other.gseq --overwrite"), ("scratch", "compress - -o out --overwrite")]
     {
         let flag = if scratch.is_empty() { String::new() } else { format!(" --scratch-dir {scratch}") };
         let folder = workplace.path(scratch);

@@ -9,7 +9,7 @@ use splatsieve::models::{InputModel, ModelFolder};
 use splatsieve::outputs::container::write_container;
 
 /// How to have the tiny model archived without refining anything.
-const TINY: &str = "{tiny} --cameras {tiny} --target-ratio 0.5 --no-refine --prune-only --archive-psnr 50";
+const TINY: &str = "{tiny} --cameras {tiny} --ratio 0.5 --no-refine --prune-only --archive-psnr 50";
 
 /// A workplace with `small.gsz` of the tiny model, and its summary.
 fn with_archive() -> (Workplace, serde_json::Value) {
@@ -36,7 +36,7 @@ fn an_archive_unpacks_to_a_model_folder_whose_pictures_are_as_close_as_was_asked
     let parts = ["cloud", "field", "rest"].map(|part| archive["parts"][part].as_u64().unwrap());
     assert_eq!((parts.iter().sum::<u64>(), summary["output_bytes"].as_u64()), (bytes, Some(bytes)));
 
-    workplace.done("unpack small.gsz -o small");
+    workplace.done("convert small.gsz small");
     let names =
         |folder: &Path| -> Vec<_> { files(folder).into_keys().filter(|name| name.extension().is_some()).collect() };
     let unpacked = workplace.path("small");
@@ -69,7 +69,7 @@ fn an_archive_unpacks_to_a_model_folder_whose_pictures_are_as_close_as_was_asked
 #[test]
 fn an_archive_is_read_like_the_folder_that_it_unpacks_to() {
     let (workplace, _) = with_archive();
-    workplace.done("unpack small.gsz -o small");
+    workplace.done("convert small.gsz small");
     let folder = model(&workplace.path("small"));
     let archive = splatsieve::models::open(&workplace.path("small.gsz"), &Default::default()).unwrap();
     assert_eq!(archive.kind(), "gsz archive");
@@ -85,7 +85,7 @@ fn an_archive_is_read_like_the_folder_that_it_unpacks_to() {
     assert_eq!(evaluated("small.gsz")["psnr"], evaluated("small")["psnr"]);
     workplace.done("render small.gsz --cameras {tiny} --all -o pictures");
     workplace.done("info small.gsz");
-    workplace.done("compress small.gsz --cameras {tiny} --target-ratio 0.5 --no-refine --prune-only -o smaller");
+    workplace.done("compress small.gsz --cameras {tiny} --ratio 0.5 --no-refine --prune-only -o smaller");
     assert_eq!(cloud(&workplace.path("smaller")).rows.len(), cloud(&workplace.path("small")).rows.len().div_ceil(2));
     // What it was decoded to is gone.
     let left = files(&workplace.path(""));
@@ -107,7 +107,7 @@ fn frames_become_a_container_within_bounds_whose_pictures_are_as_close_as_was_as
     let made = splatsieve::diagnostics::demo_scene::Scene::new(1500, 20);
     let raw = gseq::Compression::Raw;
     write_container(&made, &workplace.path("frames.gseq"), raw, Default::default(), |_| ()).unwrap();
-    let how = "--target-ratio 0.5 --no-refine --prune-only";
+    let how = "--ratio 0.5 --no-refine --prune-only";
     let exact = workplace.summary(&format!("frames.gseq {how} -o exact.gseq"));
     let summary = workplace.summary(&format!("frames.gseq {how} -o small.gsz --archive-psnr 45"));
     let [exact_bytes, bytes] = [&exact, &summary].map(|summary| summary["output_bytes"].as_u64().unwrap());
@@ -135,24 +135,24 @@ fn frames_become_a_container_within_bounds_whose_pictures_are_as_close_as_was_as
     }
     // Threads change no byte, nor does the way that frames come.
     workplace.done(&format!("--threads 3 compress frames.gseq {how} -o three.gsz --archive-psnr 45"));
-    let stream = workplace.piped("unpack frames.gseq --stream --quiet", b"").stdout;
+    let stream = workplace.piped("convert frames.gseq - --quiet", b"").stdout;
     let output = workplace.piped(&format!("compress - {how} -o piped.gsz --archive-psnr 45"), &stream);
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let read = |name: &str| fs::read(workplace.path(name)).unwrap();
     assert!(read("three.gsz") == read("small.gsz") && read("piped.gsz") == read("small.gsz"));
     // A size, and one that is too small.
     let most = bytes / 2;
-    let sized = workplace.summary(&format!("frames.gseq --no-refine --prune-only -o sized.gsz --target-size {most}"));
+    let sized = workplace.summary(&format!("frames.gseq --no-refine --prune-only -o sized.gsz --size {most}"));
     assert!((most / 2..=most).contains(&sized["output_bytes"].as_u64().unwrap()), "{sized}");
-    workplace.refused(2, "compress frames.gseq -o none.gsz --target-size 100", &["--target-size", "expected at least"]);
+    workplace.refused(2, "compress frames.gseq -o none.gsz --size 100", &["--size", "expected at least"]);
     // Of what shines without end no picture tells a bound.
     let mut broken = state(before.source(), 0);
     broken.sh.planes_mut().fill(f32::INFINITY);
     workplace.ply("broken/0.ply", &broken);
     workplace.ply("broken/1.ply", &broken);
-    let refused = ["--non-finite drop", ".gseq"];
-    workplace.refused(2, "compress broken -o broken.gsz --non-finite keep --no-refine --link never", &refused);
-    workplace.done("unpack small.gsz -o back");
+    let refused = ["--set non_finite=drop", ".gseq"];
+    workplace.refused(2, "compress broken -o broken.gsz --set non_finite=keep --no-refine --link never", &refused);
+    workplace.done("convert small.gsz back");
     let plys = files(&workplace.path("back")).into_keys().filter(|name| name.extension().is_some_and(|e| e == "ply"));
     assert_eq!(plys.count(), 20);
 }
@@ -171,10 +171,9 @@ fn a_single_ply_comes_back_with_its_header_and_close_to_its_values() {
     gaussians.log_scale.planes_mut().iter_mut().for_each(|value| *value -= 3.0);
     gaussians.rotation.plane_mut(0).fill(1.0);
     let path = workplace.ply("cloud.ply", &gaussians);
-    let summary =
-        workplace.summary("cloud.ply --no-refine --prune-only --target-ratio 1 --archive-psnr 45 -o cloud.gsz");
+    let summary = workplace.summary("cloud.ply --no-refine --prune-only --ratio 1 --archive-psnr 45 -o cloud.gsz");
     assert!(summary["archive"]["psnr"].as_f64().unwrap() >= 45.0, "{}", summary["archive"]);
-    workplace.done("unpack cloud.gsz -o back.ply");
+    workplace.done("convert cloud.gsz back.ply");
     let (before, after) = (PlyRows::read(&path), PlyRows::read(&workplace.path("back.ply")));
     assert_eq!((&before.names, before.rows.len()), (&after.names, after.rows.len()));
     let stored = fs::metadata(workplace.path("cloud.gsz")).unwrap().len();
@@ -198,16 +197,16 @@ fn damaged_archives_and_what_no_archive_holds_are_refused_in_words() {
     fs::write(workplace.path("flipped.gsz"), flipped).unwrap();
     fs::write(workplace.path("other.gsz"), b"something else").unwrap();
     workplace.refused(2, "compress {tiny} --cameras {tiny} --archive-psnr 40 -o a", &["--archive-psnr", ".gsz"]);
-    workplace.refused(1, "unpack cut.gsz -o out", &["cut.gsz", "section blobs", "bytes", "copy it again"]);
-    workplace.refused(1, "unpack flipped.gsz -o out", &["flipped.gsz", "checksum"]);
+    workplace.refused(1, "convert cut.gsz out", &["cut.gsz", "section blobs", "bytes", "copy it again"]);
+    workplace.refused(1, "convert flipped.gsz out", &["flipped.gsz", "checksum"]);
     workplace.refused(1, "info other.gsz", &["other.gsz", "archive"]);
     workplace.done("demo --gaussians 200 --frames 3 -o demo");
     workplace.done("convert demo/scene.gseq curves.splatv");
     workplace.refused(2, "compress curves.splatv --cameras demo/cameras.json -o a.gsz", &["archive", ".gseq"]);
     workplace.refused(
         2,
-        "compress {tiny} --cameras {tiny} --target-size 1MB --archive-psnr 45 -o a.gsz",
-        &["--target-size", "--archive-psnr", "one of them"],
+        "compress {tiny} --cameras {tiny} --size 1MB --archive-psnr 45 -o a.gsz",
+        &["--size", "--archive-psnr", "one of them"],
     );
 }
 
@@ -216,7 +215,7 @@ fn a_quality_that_is_asked_for_counts_what_the_archive_loses() {
     let workplace = Workplace::new();
     let least = 30.0;
     let summary = workplace.summary(&format!(
-        "{{tiny}} --cameras {{tiny}} --min-psnr {least}dB --refine-steps 40 --refine-cut-steps 10 -o small.gsz"
+        "{{tiny}} --cameras {{tiny}} --min-psnr {least}dB --set refine_steps=40 --set refine_cut_steps=10 -o small.gsz"
     ));
     let number = |name: &str| summary["goal"][name].as_f64().unwrap();
     assert_eq!(number("asked"), least);
@@ -227,7 +226,7 @@ fn a_quality_that_is_asked_for_counts_what_the_archive_loses() {
 #[test]
 fn bytes_asked_for_are_filled_by_count_and_bits_together() {
     let workplace = Workplace::new();
-    let how = "{tiny} --cameras {tiny} --no-refine --overwrite -o small.gsz --target-size";
+    let how = "{tiny} --cameras {tiny} --no-refine --overwrite -o small.gsz --size";
     let mut before = (0, 0.0);
     for most in [5_000, 8_000] {
         let summary = workplace.summary(&format!("{how} {most}"));
@@ -239,5 +238,5 @@ fn bytes_asked_for_are_filled_by_count_and_bits_together() {
         assert!(count > before.0 && psnr > before.1 + 1.0, "{most}: {count} Gaussians at {psnr} dB, {before:?} before");
         before = (count, psnr);
     }
-    workplace.refused(2, &format!("compress {how} 1000"), &["--target-size", "expected at least"]);
+    workplace.refused(2, &format!("compress {how} 1000"), &["--size", "expected at least"]);
 }

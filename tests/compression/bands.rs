@@ -43,14 +43,14 @@ fn faint_above(workplace: &Workplace, degree: usize) -> PathBuf {
     model
 }
 
-const QUICKLY: &str = "model --cameras {tiny} --no-refine --prune-only --field exact --overwrite";
+const QUICKLY: &str = "model --cameras {tiny} --no-refine --prune-only --set field=exact --overwrite";
 
 #[test]
 fn bands_that_nobody_sees_go_with_the_degree_that_the_configuration_names() {
     for degree in [0, 1, 2] {
         let workplace = Workplace::new();
         let model = faint_above(&workplace, degree);
-        let summary = workplace.summary(&format!("{QUICKLY} --target-ratio 0.5 --bands-margin 90 -o small"));
+        let summary = workplace.summary(&format!("{QUICKLY} --ratio 0.5 --set bands_margin=90 -o small"));
         let bands = &summary["bands"];
         assert_eq!((&bands["sh_degree"], why_left(&summary)), (&Value::from(degree), None), "{bands}");
         let of_degree = |tried: &Value| tried[0] == degree && tried[1].as_f64() >= bands["least"].as_f64();
@@ -85,7 +85,7 @@ fn bands_that_nobody_sees_go_with_the_degree_that_the_configuration_names() {
 fn bands_that_matter_stay_and_are_said_to() {
     let workplace = Workplace::new();
     let model = faint_above(&workplace, 3);
-    let summary = workplace.summary(&format!("{QUICKLY} --target-ratio 0.5 --bands-margin 90 -o small"));
+    let summary = workplace.summary(&format!("{QUICKLY} --ratio 0.5 --set bands_margin=90 -o small"));
     let why = why_left(&summary).unwrap();
     assert!(why.contains("dB at degree 2") && why.contains("at least 60.0 dB were asked for"), "{why}");
     assert_eq!(summary["bands"]["sh_degree"], 3);
@@ -95,7 +95,7 @@ fn bands_that_matter_stay_and_are_said_to() {
     assert_eq!(after, before);
 
     // Without being asked to, nothing is looked for and nothing said.
-    let all = workplace.summary(&format!("{QUICKLY} --target-ratio 0.5 --bands all -o small"));
+    let all = workplace.summary(&format!("{QUICKLY} --ratio 0.5 --set bands=all -o small"));
     assert!(all["bands"].is_null() && why_left(&all).is_none());
 }
 
@@ -103,14 +103,14 @@ fn bands_that_matter_stay_and_are_said_to() {
 fn bands_that_an_sh_head_adds_to_stay_and_so_does_color_without_any() {
     let workplace = Workplace::new();
     let quickly = QUICKLY.replacen("model", "{tiny}", 1);
-    let summary = workplace.summary(&format!("{quickly} --target-ratio 0.5 --bands-margin 0 -o small"));
+    let summary = workplace.summary(&format!("{quickly} --ratio 0.5 --set bands_margin=0 -o small"));
     assert!(why_left(&summary).unwrap().contains("SH head") && summary["bands"].is_null());
     assert_eq!(PlyRows::read(&cloud_of(&workplace.path("small"))).names.len(), 62);
 
     faint_above(&workplace, 0);
     workplace.done(&format!("compress {QUICKLY} -o plain"));
     let again = QUICKLY.replacen("model", "plain", 1);
-    let summary = workplace.summary(&format!("{again} --target-ratio 0.5 -o small"));
+    let summary = workplace.summary(&format!("{again} --ratio 0.5 -o small"));
     assert!(why_left(&summary).unwrap().contains("degree 0") && summary["bands"].is_null());
 }
 
@@ -118,7 +118,7 @@ fn bands_that_an_sh_head_adds_to_stay_and_so_does_color_without_any() {
 fn any_threads_write_the_same_bytes_of_fewer_bands() {
     let workplace = Workplace::new();
     faint_above(&workplace, 1);
-    let how = "--target-ratio 0.3 --refine-steps 40 --refine-cut-steps 10";
+    let how = "--ratio 0.3 --set refine_steps=40 --set refine_cut_steps=10";
     for threads in [1, 3] {
         workplace.done(&format!("compress model --cameras {{tiny}} {how} --threads {threads} -o small{threads}"));
     }
@@ -141,7 +141,7 @@ fn a_search_finds_its_size_with_the_bands_that_it_leaves() {
 fn frames_and_single_files_lose_bands_too() {
     let workplace = Workplace::new();
     faint_above(&workplace, 1);
-    let cameras = "--cameras {tiny} --no-refine --prune-only --target-ratio 0.5";
+    let cameras = "--cameras {tiny} --no-refine --prune-only --ratio 0.5";
     workplace.done(&format!("compress model {cameras} -o one.ply"));
     assert_eq!(PlyRows::read(&workplace.path("one.ply")).names.len(), 17 + 9);
     for (output, again) in [("frames", "--as ply-sequence"), ("small.gseq", "")] {
@@ -158,7 +158,7 @@ fn the_original_loader_can_open_fewer_bands_and_the_check_refuses_a_degree_that_
     let workplace = Workplace::new();
     let model = faint_above(&workplace, 1);
     let small = workplace.path("small");
-    workplace.done(&format!("compress {QUICKLY} --target-ratio 0.4 -o small"));
+    workplace.done(&format!("compress {QUICKLY} --ratio 0.4 -o small"));
     let (accepted, text) = check_model_folder(&model, &small);
     assert!(accepted && text.contains("SH degree 1 of 3") && text.contains("can open it"), "{text}");
 
@@ -193,8 +193,8 @@ fn the_original_loader_can_open_fewer_bands_and_the_check_refuses_a_degree_that_
 fn a_degree_that_is_asked_for_is_refined_to_its_best() {
     let workplace = Workplace::new();
     let model = faint_above(&workplace, 3);
-    let how = "--target-ratio 0.3 --refine-steps 100 --refine-cut-steps 20 --field exact";
-    let summary = workplace.summary(&format!("model --cameras {{tiny}} {how} --bands 0 -o small"));
+    let how = "--ratio 0.3 --set refine_steps=100 --set refine_cut_steps=20 --set field=exact";
+    let summary = workplace.summary(&format!("model --cameras {{tiny}} {how} --set bands=0 -o small"));
     assert!(
         summary["notes"]
             .as_array()
@@ -208,9 +208,9 @@ fn a_degree_that_is_asked_for_is_refined_to_its_best() {
     assert_eq!(PlyRows::read(&cloud_of(&workplace.path("small"))).names.len(), 17);
 
     // As many whose bands went after they were refined are further away.
-    workplace.done(&format!("compress model --cameras {{tiny}} {how} --bands all -o whole"));
+    workplace.done(&format!("compress model --cameras {{tiny}} {how} --set bands=all -o whole"));
     workplace.done(
-        "compress whole --cameras {tiny} --no-refine --prune-only --target-ratio 1 --field exact --bands 0 -o late",
+        "compress whole --cameras {tiny} --no-refine --prune-only --ratio 1 --set field=exact --set bands=0 -o late",
     );
     assert_eq!(PlyRows::read(&cloud_of(&workplace.path("late"))).names.len(), 17);
     let psnr = |result: &str| {
@@ -225,9 +225,9 @@ fn a_degree_that_is_asked_for_is_refined_to_its_best() {
 fn a_degree_that_is_asked_for_holds_in_every_output_and_search() {
     let workplace = Workplace::new();
     faint_above(&workplace, 3);
-    let cameras = "model --cameras {tiny} --no-refine --prune-only --bands 0";
+    let cameras = "model --cameras {tiny} --no-refine --prune-only --set bands=0";
     for output in ["small.gsz", "small.gseq", "frames --as ply-sequence"] {
-        workplace.done(&format!("compress {cameras} --target-ratio 0.5 -o {output}"));
+        workplace.done(&format!("compress {cameras} --ratio 0.5 -o {output}"));
         let path = output.split(' ').next().unwrap();
         let shown: Value = serde_json::from_str(&workplace.done(&format!("info {path} --json"))).unwrap();
         assert_eq!(shown["sh_degree"], 0, "{shown}");
@@ -238,7 +238,7 @@ fn a_degree_that_is_asked_for_holds_in_every_output_and_search() {
 
     // What goes makes room.
     let of_size = |bands: &str| {
-        let how = format!("--no-refine --target-size 80kB --field exact --bands {bands}");
+        let how = format!("--no-refine --size 80kB --set field=exact --set bands={bands}");
         let summary = workplace.summary(&format!("model --cameras {{tiny}} {how} -o fits{bands}"));
         summary["gaussians"].as_u64().unwrap()
     };
@@ -249,11 +249,11 @@ fn a_degree_that_is_asked_for_holds_in_every_output_and_search() {
 #[test]
 fn a_degree_that_cannot_be_had_is_named() {
     let workplace = Workplace::new();
-    let summary = workplace.summary("{tiny} --cameras {tiny} --no-refine --target-ratio 0.5 --bands 1 -o small");
+    let summary = workplace.summary("{tiny} --cameras {tiny} --no-refine --ratio 0.5 --set bands=1 -o small");
     assert!(why_left(&summary).unwrap().contains("SH head"));
     assert_eq!(PlyRows::read(&cloud_of(&workplace.path("small"))).names.len(), 62);
     for wrong in ["4", "-1", "some"] {
-        let arguments = format!("compress {{tiny}} --bands {wrong} -o none");
+        let arguments = format!("compress {{tiny}} --set bands={wrong} -o none");
         workplace.refused(2, &arguments, &["--bands", wrong, "expected all, needed, or a degree from 0 to 3"]);
     }
 }
@@ -262,9 +262,9 @@ fn a_degree_that_cannot_be_had_is_named() {
 fn so_many_bytes_go_to_the_degree_at_which_they_show_most() {
     let workplace = Workplace::new();
     faint_above(&workplace, 0);
-    let how = "model --cameras {tiny} --target-size 85kB --field exact --refine-steps 100 --refine-cut-steps 20";
+    let how = "model --cameras {tiny} --size 85kB --set field=exact --set refine_steps=100 --set refine_cut_steps=20";
     let chosen = workplace.summary(&format!("{how} -o chosen"));
-    let all = workplace.summary(&format!("{how} --bands all -o all"));
+    let all = workplace.summary(&format!("{how} --set bands=all -o all"));
     let names = |result: &str| PlyRows::read(&cloud_of(&workplace.path(result))).names.len();
     assert_eq!([names("chosen"), names("all")], [17, 62]);
     let stage = |summary: &Value| summary["stages"].as_array().unwrap().iter().any(|stage| stage["name"] == "degree");

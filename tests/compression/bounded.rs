@@ -33,9 +33,9 @@ fn furthest(workplace: &Workplace, column: Columns) -> (f64, bool) {
 fn every_column_keeps_its_bound_and_the_file_says_it() {
     let workplace = Workplace::new();
     workplace.done("demo --gaussians 3000 --frames 48 -o demo");
-    workplace.done("pack demo/scene.gseq -o exact.gseq");
-    workplace.done(&format!("pack demo/scene.gseq -o within.gseq --max-error {BOUNDS}"));
-    workplace.done("verify within.gseq");
+    workplace.done("convert demo/scene.gseq exact.gseq");
+    workplace.done(&format!("convert demo/scene.gseq within.gseq --max-error {BOUNDS}"));
+    workplace.done("info within.gseq --check");
     let info: Value = serde_json::from_str(&workplace.done("info within.gseq --json")).unwrap();
     for bound in BOUNDS.split(',') {
         let (name, bound) = bound.split_once('=').unwrap();
@@ -61,8 +61,8 @@ fn every_column_keeps_its_bound_and_the_file_says_it() {
 #[test]
 fn columns_without_a_bound_keep_every_bit_and_a_percentage_is_of_the_extent() {
     let workplace = Workplace::new();
-    workplace.done("pack {tiny} -o exact.gseq");
-    workplace.done("pack {tiny} -o within.gseq --max-error position=0.1%");
+    workplace.done("convert {tiny} exact.gseq");
+    workplace.done("convert {tiny} within.gseq --max-error position=0.1%");
     for column in Columns::all().difference(Columns::POSITION).iter() {
         assert_eq!(furthest(&workplace, column), (0.0, true), "{}", column.name());
     }
@@ -78,7 +78,7 @@ fn threads_change_no_byte() {
     let workplace = Workplace::new();
     for (name, threads) in [("a", 1), ("b", 3)] {
         fs::create_dir(workplace.path(name)).unwrap();
-        workplace.done(&format!("--threads {threads} pack {{tiny}} -o {name}/x.gseq --max-error {BOUNDS}"));
+        workplace.done(&format!("--threads {threads} convert {{tiny}} {name}/x.gseq --max-error {BOUNDS}"));
     }
     assert!(files(&workplace.path("a")) == files(&workplace.path("b")));
 }
@@ -93,8 +93,8 @@ fn bounds_that_make_no_sense_are_refused_by_name() {
         ("sh=1%", "only of positions"),
         ("sh=1e-3,sh=1e-2", "sh is named twice"),
     ] {
-        workplace.refused(2, &format!("pack {{tiny}} -o x.gseq --max-error {bound}"), &["--max-error", expected]);
+        workplace.refused(2, &format!("convert {{tiny}} x.gseq --max-error {bound}"), &["--max-error", expected]);
     }
-    workplace.refused(2, "pack {tiny} -o x.gseq --raw --max-error sh=1", &["--raw", "--max-error"]);
+    workplace.refused(2, "convert {tiny} x.gseq --raw --max-error sh=1", &["--raw", "--max-error"]);
     assert!(!workplace.path("x.gseq").exists());
 }

@@ -33,8 +33,8 @@ fn kept_gaussians_are_untouched(workplace: &Workplace, model: &Path, preset: &st
     let name = format!("out_{preset}");
     let (input, output) = (model.display().to_string(), workplace.path(&name));
     let summary = workplace.summary(&format!(
-        "{input} --cameras {input} --split test -o {name} --preset {preset} --choose-by-views=false --no-refine \
-         --field exact"
+        "{input} --cameras {input} --split test -o {name} --preset {preset} --set choose_by_views=false --no-refine \
+         --set field=exact"
     ));
     let map = index_map(&output.join("index_map.npy"));
     let members = members(&map);
@@ -90,20 +90,20 @@ fn target_counts_are_met_exactly() {
         ("--preset paper", &[1, 2, 17, 150, 299, 300][..]),
         ("--preset default", &[1, 100, 231, 232, 233, 300]),
         ("--preset paper --prune-only", &[1, 50, 240, 241, 300]),
-        ("--preset default --prune-only --low-priority drop", &[1, 299]),
+        ("--preset default --prune-only --set low_priority=drop", &[1, 299]),
         ("--preset paper --merge-only", &[200, 299, 300]),
     ] {
         for &count in counts {
             let name = format!("{}_{count}.ply", arguments.replace([' ', '-'], ""));
-            workplace.done(&format!("compress {{tiny}} {arguments} --target-count {count} -o {name}"));
+            workplace.done(&format!("compress {{tiny}} {arguments} --count {count} -o {name}"));
             let rows = PlyRows::read(&workplace.path(&name)).rows.len();
-            assert_eq!(rows, count, "{arguments} --target-count {count}");
+            assert_eq!(rows, count, "{arguments} --count {count}");
             assert_eq!(members(&index_map(&workplace.path(&format!("{name}.index_map.npy")))).len(), count);
         }
     }
     for (ratio, count) in [("1", 300), ("0.5", 150), ("0.333", 100), ("0.001", 1)] {
-        let summary = workplace.summary(&format!("{{tiny}} --target-ratio {ratio} -o x --dry-run"));
-        assert_eq!(summary["gaussians"], count, "--target-ratio {ratio}");
+        let summary = workplace.summary(&format!("{{tiny}} --ratio {ratio} -o x --dry-run"));
+        assert_eq!(summary["gaussians"], count, "--ratio {ratio}");
     }
 }
 
@@ -113,15 +113,15 @@ fn targets_out_of_reach_are_refused() {
     let refused = |arguments: &str, parts: &[&str]| {
         workplace.refused(2, &format!("compress {{tiny}} -o out {arguments}"), parts);
     };
-    refused("--merge-only --target-count 3", &["a target of 3", "merging alone leaves"]);
-    refused("--target-count 0", &["1 to 300", "found 0"]);
-    refused("--target-count 301", &["1 to 300", "found 301"]);
-    refused("--target-ratio 0", &["--target-ratio"]);
-    refused("--target-ratio 1.5", &["--target-ratio"]);
-    refused("--target-ratio nan", &["--target-ratio"]);
-    refused("--target-count 5 --keep-ids 0-9", &["a target of 5", "10 are to be kept"]);
-    refused("--target-count 295 --drop-ids 0-9", &["a target of 295", "290 are left"]);
-    refused("--target-count 5 --target-ratio 0.5", &["cannot be used with"]);
+    refused("--merge-only --count 3", &["a target of 3", "merging alone leaves"]);
+    refused("--count 0", &["1 to 300", "found 0"]);
+    refused("--count 301", &["1 to 300", "found 301"]);
+    refused("--ratio 0", &["--ratio"]);
+    refused("--ratio 1.5", &["--ratio"]);
+    refused("--ratio nan", &["--ratio"]);
+    refused("--count 5 --keep-ids 0-9", &["a target of 5", "10 are to be kept"]);
+    refused("--count 295 --drop-ids 0-9", &["a target of 295", "290 are left"]);
+    refused("--count 5 --ratio 0.5", &["cannot be used with"]);
     refused("--prune-only --merge-only", &["cannot be used with"]);
 }
 
@@ -145,7 +145,7 @@ fn ablations_leave_out_a_stage() {
 fn what_the_user_keeps_stays_alone_and_what_the_user_drops_goes() {
     let workplace = Workplace::new();
     fs::write(workplace.path("drop.txt"), "# seen in a viewer\n20-29\n250\n").unwrap();
-    workplace.done("compress {tiny} -o out --preset paper --keep-ids 0-9,299 --drop-ids drop.txt --target-count 40");
+    workplace.done("compress {tiny} -o out --preset paper --keep-ids 0-9,299 --drop-ids drop.txt --count 40");
     let map = index_map(&workplace.path("out/index_map.npy"));
     let (before, after) = (PlyRows::read(&cloud(&tiny())), PlyRows::read(&cloud(&workplace.path("out"))));
     assert_eq!(after.rows.len(), 40);
@@ -159,8 +159,9 @@ fn what_the_user_keeps_stays_alone_and_what_the_user_drops_goes() {
 #[test]
 fn box_keeps_who_is_inside_at_the_reference_frame() {
     let workplace = Workplace::new();
-    let summary = workplace
-        .summary("{tiny} -o out --preset paper --keep-box -0.4,-0.4,-0.4,0.4,0.4,0.4 --keep-fraction 0.1 --drop-ids 0");
+    let summary = workplace.summary(
+        "{tiny} -o out --preset paper --keep-box -0.4,-0.4,-0.4,0.4,0.4,0.4 --set keep_fraction=0.1 --drop-ids 0",
+    );
     let frame = summary["merge"]["reference_frame"].as_u64().unwrap() as usize;
     let scene = crate::scene::scene(&tiny());
     let state = state(scene.source(), frame);
@@ -177,9 +178,9 @@ fn box_keeps_who_is_inside_at_the_reference_frame() {
 #[test]
 fn dry_run_writes_nothing_and_tells_the_count() {
     let workplace = Workplace::new();
-    let planned = workplace.summary("{tiny} -o out --target-ratio 0.37 --dry-run");
+    let planned = workplace.summary("{tiny} -o out --ratio 0.37 --dry-run");
     assert!(files(&workplace.path("")).is_empty());
-    let done = workplace.summary("{tiny} -o out --target-ratio 0.37");
+    let done = workplace.summary("{tiny} -o out --ratio 0.37");
     assert_eq!(planned["gaussians"], done["gaussians"]);
     assert!(planned["output_bytes"].is_null());
     // The model as a whole, without what lies beside it.
@@ -194,7 +195,7 @@ fn all_kinds_of_output_hold_the_same_gaussians() {
     let workplace = Workplace::new();
     for preset in ["paper", "default"] {
         for output in ["folder", "one.gseq", "one.ply", "frames --as ply-sequence"] {
-            workplace.done(&format!("compress {{tiny}} --preset {preset} --field exact --overwrite -o {output}"));
+            workplace.done(&format!("compress {{tiny}} --preset {preset} --set field=exact --overwrite -o {output}"));
         }
         let folder = workplace.path("folder");
         assert_eq!(fs::read(workplace.path("one.ply")).unwrap(), fs::read(cloud(&folder)).unwrap());
@@ -223,8 +224,8 @@ fn all_kinds_of_output_hold_the_same_gaussians() {
 #[test]
 fn explicit_trajectories_keep_the_bits_of_whoever_stays() {
     let workplace = Workplace::new();
-    workplace.done("pack {tiny} -o scene.gseq");
-    workplace.done("unpack scene.gseq -o frames");
+    workplace.done("convert {tiny} scene.gseq");
+    workplace.done("convert scene.gseq frames --as ply-sequence");
     let cameras = tiny().display().to_string();
     workplace.done(&format!("compress scene.gseq --cameras {cameras} --preset paper -o a.gseq"));
     workplace.done(&format!("compress frames --cameras {cameras} --preset paper -o b"));
@@ -256,10 +257,10 @@ fn threads_change_no_byte() {
     for request in [
         "{tiny} --preset paper -o out",
         "{tiny} --preset default -o out",
-        "{tiny} --preset default --target-count 77 -o out.gseq",
+        "{tiny} --preset default --count 77 -o out.gseq",
         "demo/scene.gseq --cameras demo/cameras.json --preset paper -o out",
         "demo/scene.gseq --cameras demo/cameras.json --preset default -o out.gseq",
-        "demo/scene.gseq --cameras demo/cameras.json --preset default --target-ratio 0.4 -o out",
+        "demo/scene.gseq --cameras demo/cameras.json --preset default --ratio 0.4 -o out",
     ] {
         let [one, two, three] = ["1", "2", "3"].map(|threads| {
             workplace.done(&format!("compress {request} --threads {threads} --overwrite"));
@@ -285,7 +286,7 @@ fn threads_change_no_byte_of_deform2() {
     let input = model.display();
     let [one, two] = ["1", "2"].map(|threads| {
         workplace.done(&format!(
-            "compress {input} --cameras {input} --split test --target-ratio 0.3 --no-refine \
+            "compress {input} --cameras {input} --split test --ratio 0.3 --no-refine \
              --threads {threads} --overwrite -o out"
         ));
         lasting_files(&workplace.path("out"))
@@ -297,7 +298,7 @@ fn threads_change_no_byte_of_deform2() {
 fn recipe_beside_a_result_repeats_it() {
     let workplace = Workplace::new();
     workplace.done(
-        "compress {tiny} -o first --preset paper --mu 2 --tau-static 0.2 --clip-norm --merge-pass 0.05,3,0.8,0.7",
+        "compress {tiny} -o first --preset paper --set mu=2 --set tau_static=0.2 --set clip_norm=true --set passes=0.05,3,0.8,0.7",
     );
     workplace.done("compress {tiny} -o second --recipe first/recipe.toml");
     assert!(lasting_files(&workplace.path("first")) == lasting_files(&workplace.path("second")));
@@ -309,8 +310,8 @@ fn recipe_beside_a_result_repeats_it() {
 fn results_of_results_are_results() {
     let workplace = Workplace::new();
     let cameras = tiny().display().to_string();
-    workplace.done(&format!("compress {{tiny}} --cameras {cameras} -o first --target-count 120"));
-    workplace.done(&format!("compress first --cameras {cameras} -o second --target-count 60"));
+    workplace.done(&format!("compress {{tiny}} --cameras {cameras} -o first --count 120"));
+    workplace.done(&format!("compress first --cameras {cameras} -o second --count 60"));
     assert_eq!(PlyRows::read(&cloud(&workplace.path("second"))).rows.len(), 60);
 }
 

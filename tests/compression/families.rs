@@ -74,7 +74,7 @@ fn both(
 fn frames_of_a_reduction_are_those_of_what_is_written_whatever_column_was_changed() {
     let workplace = Workplace::new();
     workplace.done("demo --gaussians 300 --frames 3 -o demo");
-    workplace.done("unpack demo/scene.gseq -o frames");
+    workplace.done("convert demo/scene.gseq frames --as ply-sequence");
     without_sh_head(&tiny(), &workplace.path("free"));
     for (path, kinds) in [
         (tiny(), [OutputKind::Model, OutputKind::Gseq]),
@@ -121,7 +121,7 @@ fn frames_of_a_reduction_are_those_of_what_is_written_whatever_column_was_change
 fn frames_of_a_model_are_asked_for_at_even_times_that_leave_out_the_end() {
     let workplace = Workplace::new();
     for (frames, expected) in [(1, &[0.0][..]), (4, &[0.0, 0.25, 0.5, 0.75])] {
-        workplace.done(&format!("pack {{tiny}} --frames {frames} -o {frames}.gseq"));
+        workplace.done(&format!("convert {{tiny}} {frames}.gseq --frames {frames}"));
         assert_eq!(open(&workplace.path(&format!("{frames}.gseq"))).source().info().times, expected);
     }
 }

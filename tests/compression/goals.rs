@@ -14,7 +14,7 @@ fn with_demo() -> Workplace {
 }
 
 /// How to have it refined quickly.
-const QUICKLY: &str = "demo/scene.gseq --cameras demo/cameras.json --refine-steps 120 --refine-cut-steps 20";
+const QUICKLY: &str = "demo/scene.gseq --cameras demo/cameras.json --set refine_steps=120 --set refine_cut_steps=20";
 
 /// Bytes of everything below `folder`, or of `folder` and what lies beside it under its name.
 fn bytes_written(workplace: &Workplace, output: &str) -> u64 {
@@ -83,17 +83,17 @@ fn a_loss_is_that_of_what_photographs_show() {
 #[ignore = "needs time"]
 fn everything_that_is_written_has_at_most_the_bytes_asked_for_and_hardly_less() {
     let workplace = with_demo();
-    let model = "{tiny} --cameras {tiny} --refine-steps 40 --refine-cut-steps 10";
+    let model = "{tiny} --cameras {tiny} --set refine_steps=40 --set refine_cut_steps=10";
     for (how, output, most) in
         [(QUICKLY, "small.gseq", 90_000u64), (QUICKLY, "frames", 400_000), (model, "model", 110_000)]
     {
         let kind = if output == "frames" { "--as ply-sequence" } else { "" };
-        let summary = workplace.summary(&format!("{how} --target-size {most}B {kind} -o {output}"));
+        let summary = workplace.summary(&format!("{how} --size {most}B {kind} -o {output}"));
         let written = bytes_written(&workplace, output);
         assert!(written <= most && written > most * 9 / 10 - 24_576, "{output}: {written} of {most}, {summary}");
         assert!(summary["gaussians"].as_u64().unwrap() > 30, "{summary}");
     }
-    workplace.refused(2, &format!("compress {QUICKLY} --target-size 20KB -o none.gseq"), &["one Gaussian", "20000"]);
+    workplace.refused(2, &format!("compress {QUICKLY} --size 20KB -o none.gseq"), &["one Gaussian", "20000"]);
 }
 
 #[test]
@@ -102,8 +102,8 @@ fn goals_that_contradict_each_other_are_refused() {
     for (arguments, part) in [
         ("--max-loss 0.5", "--ground-truth"),
         ("--ground-truth {tiny}", "--max-loss"),
-        ("--min-psnr 35 --target-ratio 0.5", "--target-ratio"),
-        ("--min-psnr 35 --target-size 5MB", "--target-size"),
+        ("--min-psnr 35 --ratio 0.5", "--ratio"),
+        ("--min-psnr 35 --size 5MB", "--size"),
         ("--min-psnr many", "decibels"),
         ("--min-psnr 0", "above 0"),
         ("--min-psnr 35 --merge-only", "--merge-only"),
@@ -118,6 +118,6 @@ fn goals_that_contradict_each_other_are_refused() {
 #[ignore = "needs time"]
 fn more_bytes_than_everything_takes_leave_out_what_is_to_be_dropped_alone() {
     let workplace = with_demo();
-    let summary = workplace.summary(&format!("{QUICKLY} --no-refine --target-size 10MB --drop-ids 5-14 -o small.gseq"));
+    let summary = workplace.summary(&format!("{QUICKLY} --no-refine --size 10MB --drop-ids 5-14 -o small.gseq"));
     assert_eq!(summary["gaussians"], 790);
 }

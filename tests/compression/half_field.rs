@@ -28,19 +28,19 @@ const QUICKLY: &str = "{tiny} --cameras {tiny} --no-refine --prune-only --overwr
 fn half_precision_is_taken_where_its_bound_holds_and_said_to_be_left_out_where_not() {
     let workplace = Workplace::new();
     let own = field_of(&tiny());
-    let exact = workplace.summary(&format!("{QUICKLY} -o exact --field exact"));
+    let exact = workplace.summary(&format!("{QUICKLY} -o exact --set field=exact"));
     assert_eq!(fs::read(field_of(&workplace.path("exact"))).unwrap(), fs::read(&own).unwrap());
     assert!(exact["field"].is_null() && why_left(&exact).is_none());
 
     // A margin of nothing is held by any rounding that is smaller than what pruning did.
-    let half = workplace.summary(&format!("{QUICKLY} -o half --target-ratio 0.3 --field-margin 0"));
+    let half = workplace.summary(&format!("{QUICKLY} -o half --ratio 0.3 --set field_margin=0"));
     let found = &half["field"];
     assert_eq!((&found["half"], why_left(&half)), (&Value::Bool(true), None));
     assert!(found["rounding"].as_f64().unwrap() >= found["least"].as_f64().unwrap(), "{found}");
     assert!(len(&field_of(&workplace.path("half"))) < len(&own) * 9 / 10);
 
     // Nothing is closer than 100 dB: rounding that far apart from what hardly lost anything is refused.
-    let refused = workplace.summary(&format!("{QUICKLY} -o refused --target-ratio 0.3 --field-margin 90"));
+    let refused = workplace.summary(&format!("{QUICKLY} -o refused --ratio 0.3 --set field_margin=90"));
     match refused["field"]["half"].as_bool().unwrap() {
         // 60 dB are always enough.
         true => assert!(refused["field"]["rounding"].as_f64().unwrap() >= 60.0, "{}", refused["field"]),
@@ -56,15 +56,14 @@ fn half_precision_is_taken_where_its_bound_holds_and_said_to_be_left_out_where_n
 #[test]
 fn a_result_opens_like_its_input_and_compresses_again_to_the_same_bytes_by_any_threads() {
     let workplace = Workplace::new();
-    let how = "--no-refine --prune-only --field-margin 0";
-    workplace.done(&format!("compress {{tiny}} --cameras {{tiny}} {how} --target-ratio 0.5 -o once"));
+    let how = "--no-refine --prune-only --set field_margin=0";
+    workplace.done(&format!("compress {{tiny}} --cameras {{tiny}} {how} --ratio 0.5 -o once"));
     let evaluated = workplace.done("evaluate {tiny} once --cameras {tiny} --json");
     let evaluated: Value = serde_json::from_str(&evaluated).unwrap();
     assert!(evaluated["psnr"].as_f64().unwrap() > 15.0, "{evaluated}");
     for threads in [1, 3] {
         let name = format!("twice{threads}");
-        workplace
-            .done(&format!("compress once --cameras {{tiny}} {how} --target-ratio 0.5 --threads {threads} -o {name}"));
+        workplace.done(&format!("compress once --cameras {{tiny}} {how} --ratio 0.5 --threads {threads} -o {name}"));
     }
     assert!(lasting_files(&workplace.path("twice1")) == lasting_files(&workplace.path("twice3")));
     // What is rounded stays where it is.
@@ -77,7 +76,7 @@ fn bytes_asked_for_count_the_field_as_it_is_written() {
     let workplace = Workplace::new();
     let most = 90_000;
     let counts = ["half", "exact"].map(|field| {
-        let how = format!("--no-refine --target-size {most}B --field {field} --field-margin 0");
+        let how = format!("--no-refine --size {most}B --set field={field} --set field_margin=0");
         let summary = workplace.summary(&format!("{{tiny}} --cameras {{tiny}} {how} -o {field}"));
         let written: u64 = lasting_files(&workplace.path(field)).values().map(|bytes| bytes.len() as u64).sum();
         assert!(written <= most, "{written} of {most}");
@@ -92,7 +91,7 @@ fn bytes_asked_for_count_the_field_as_it_is_written() {
 #[ignore = "needs Python"]
 fn the_original_loader_can_open_what_is_written() {
     let workplace = Workplace::new();
-    workplace.done(&format!("compress {QUICKLY} --target-ratio 0.4 --field-margin 0 -o small"));
+    workplace.done(&format!("compress {QUICKLY} --ratio 0.4 --set field_margin=0 -o small"));
     let (accepted, text) = check_model_folder(&tiny(), &workplace.path("small"));
     assert!(accepted && text.contains("tensors in half precision") && text.contains("can open it"), "{text}");
 }
@@ -101,7 +100,7 @@ fn the_original_loader_can_open_what_is_written() {
 fn is_small(name: &str) {
     let model = shared(name);
     let workplace = Workplace::new();
-    let words = "--no-refine --prune-only --target-ratio 0.1 --preset paper --field half --json -o small";
+    let words = "--no-refine --prune-only --ratio 0.1 --preset paper --set field=half --json -o small";
     let model_text = model.to_str().unwrap();
     let words = ["compress", model_text, "--cameras", model_text].into_iter().chain(words.split_whitespace());
     let run = workplace.run_words(words);

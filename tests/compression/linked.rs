@@ -116,13 +116,13 @@ fn frames_are_linked_where_their_order_does_not_tell_or_where_asked() {
     // By their first order, the same tracks are the same Gaussians.
     let (kept, linked) = (open(&workplace, "kept", Link::Never), open(&workplace, "kept", Link::Always));
     assert_eq!(state(kept.source(), 8), state(linked.source(), 8));
-    let said = workplace.done("compress mixed -o out --target-ratio 0.5 --no-refine --verbose --link always");
+    let said = workplace.done("compress mixed -o out --ratio 0.5 --no-refine --verbose --link always");
     assert!(said.contains("frames were linked: as asked"), "{said}");
     assert!(fs::read_to_string(workplace.path("out/recipe.toml")).unwrap().contains("link = \"always\""));
-    let said = workplace.done("compress kept -o in_order --target-ratio 0.5 --no-refine --verbose");
+    let said = workplace.done("compress kept -o in_order --ratio 0.5 --no-refine --verbose");
     assert!(said.contains("frames are in one order: those of the same place are nearer than strangers"), "{said}");
     // What a work folder keeps of one opening is not taken for the other's.
-    let small = "compress mixed --target-ratio 0.5 --no-refine --work work --link";
+    let small = "compress mixed --ratio 0.5 --no-refine --cache work --link";
     workplace.done(&format!("{small} never -o never"));
     workplace.done(&format!("{small} always -o again"));
     let files = |name: &str| lasting_files(&workplace.path(name));
@@ -133,7 +133,7 @@ fn frames_are_linked_where_their_order_does_not_tell_or_where_asked() {
 fn what_is_kept_is_written_as_frames_of_what_lives_in_them() {
     let workplace = Workplace::new();
     write_frames(&workplace, "frames", 900);
-    workplace.done("compress frames -o all --target-ratio 1 --no-refine --prune-only --bands all --link apart");
+    workplace.done("compress frames -o all --ratio 1 --no-refine --prune-only --set bands=all --link apart");
     let rows = |folder: &str, t: usize| PlyRows::read(&workplace.path(&format!("{folder}/f_{t}.ply"))).rows;
     for t in 0..FRAMES {
         let (mut given, mut left) = (rows("frames", t), rows("all", t));
@@ -142,7 +142,7 @@ fn what_is_kept_is_written_as_frames_of_what_lives_in_them() {
         assert!(given == left, "frame {t}: all rows, in another order");
     }
     // Half of the tracks, merged too: every frame has fewer rows, none that nobody sees.
-    workplace.done("compress frames -o half --target-ratio 0.5");
+    workplace.done("compress frames -o half --ratio 0.5");
     for t in 0..FRAMES {
         let (given, left) = (rows("frames", t).len(), rows("half", t).len());
         assert!(left > 0 && left < given, "frame {t}: {left} of {given}");
@@ -185,7 +185,7 @@ fn lives_that_fade_into_one_another_are_one_track_and_one_row() {
     assert!(notes.contains(&format!("{apart_count} lives of ")) && notes.contains("pictures stay within"), "{notes}");
     assert!(!apart.input.notes().join("\n").contains("were joined"));
     // As opaque as both were, in one row.
-    workplace.done("compress frames -o all --target-ratio 1 --no-refine --prune-only --bands all");
+    workplace.done("compress frames -o all --ratio 1 --no-refine --prune-only --set bands=all");
     let mut one_row = 0;
     for t in 0..frames {
         let (mut whole, ply) = (Gaussians::zeros(count, 1), PlyRows::read(&workplace.path(&format!("all/{t}.ply"))));
@@ -205,7 +205,7 @@ fn lives_that_fade_into_one_another_are_one_track_and_one_row() {
     }
     assert!(one_row * 100 >= 97 * count * frames, "{one_row} of {} are in one row", count * frames);
     // Held apart where that is asked for, and so recorded.
-    workplace.done("compress frames -o apart --target-ratio 1 --no-refine --prune-only --bands all --link apart");
+    workplace.done("compress frames -o apart --ratio 1 --no-refine --prune-only --set bands=all --link apart");
     let rows = |folder: &str| PlyRows::read(&workplace.path(&format!("{folder}/8.ply"))).rows.len();
     assert!(rows("apart") == rows("frames") && rows("all") < rows("apart"), "{} {}", rows("all"), rows("apart"));
     assert!(fs::read_to_string(workplace.path("apart/recipe.toml")).unwrap().contains("link = \"apart\""));
@@ -329,7 +329,7 @@ fn what_hardly_changes_along_a_track_is_held_at_its_mean() {
     let notes = held.input.notes().join("\n");
     assert!(notes.contains("% of the colours (within 0.04)") && notes.contains("pictures stay within"), "{notes}");
     // Files say the same, to the bit.
-    workplace.done("compress frames -o all --target-ratio 1 --no-refine --prune-only --bands all");
+    workplace.done("compress frames -o all --ratio 1 --no-refine --prune-only --set bands=all");
     for (t, found) in found.iter().enumerate() {
         let ply = PlyRows::read(&workplace.path(&format!("all/{t}.ply")));
         let rows: BTreeMap<u32, usize> = (0..ply.rows.len()).map(|i| (ply.value(i, "x").to_bits(), i)).collect();
@@ -353,7 +353,7 @@ fn threads_and_memory_change_nothing() {
         workplace.ply(&format!("frames/{t}.ply"), &fading(1500, t));
     }
     let run = |name: &str, more: &str| {
-        workplace.done(&format!("compress frames -o {name} --target-ratio 0.4 --refine-steps 20 {more}"));
+        workplace.done(&format!("compress frames -o {name} --ratio 0.4 --set refine_steps=20 {more}"));
         lasting_files(&workplace.path(name))
     };
     let one = run("one", "--threads 1");
@@ -368,7 +368,7 @@ fn a_run_killed_at_any_moment_leaves_nothing_under_the_final_name() {
     for t in 0..12 {
         workplace.ply(&format!("frames/{t}.ply"), &fading(800, t));
     }
-    let arguments = "compress frames -o small --target-ratio 0.4 --refine-steps 20";
+    let arguments = "compress frames -o small --ratio 0.4 --set refine_steps=20";
     let start = Instant::now();
     workplace.done(arguments);
     let whole = start.elapsed();
@@ -441,7 +441,7 @@ fn frames_that_cannot_be_linked_are_refused_by_name_and_leave_nothing() {
     assert!(gaps.contains("3 frames") || gaps.contains('3'), "{gaps}");
     // A frame of no Gaussians is one.
     put("2.ply", &Gaussians::zeros(0, 1));
-    workplace.done("compress frames -o out --target-ratio 1 --no-refine");
+    workplace.done("compress frames -o out --ratio 1 --no-refine");
     assert_eq!(PlyRows::read(&workplace.path("out/2.ply")).rows.len(), 0);
     // What has as many Gaussians in every frame, and is not to be linked, is as before.
     workplace.refused(1, "compress frames -o other --link never", &["element vertex", "--link"]);
@@ -540,15 +540,15 @@ fn a_stream_of_any_number_of_gaussians_gives_the_bytes_of_files() {
         String::from_utf8(output.stdout).unwrap()
     };
     let same = |a: &str, b: &str| fs::read(workplace.path(a)).unwrap() == fs::read(workplace.path(b)).unwrap();
-    workplace.done("pack frames -o files.gseq");
-    run("pack - -o stream.gseq");
+    workplace.done("convert frames files.gseq");
+    run("convert - stream.gseq");
     assert!(same("files.gseq", "stream.gseq"));
-    workplace.done("compress frames -o small_files.gseq --target-ratio 0.4 --no-refine");
-    let said = run("compress - -o small_stream.gseq --target-ratio 0.4 --no-refine --verbose");
+    workplace.done("compress frames -o small_files.gseq --ratio 0.4 --no-refine");
+    let said = run("compress - -o small_stream.gseq --ratio 0.4 --no-refine --verbose");
     assert!(said.contains("linked frame stream") && said.contains("does not say which"), "{said}");
     assert!(same("small_files.gseq", "small_stream.gseq"));
     // And as frames of what lives in them.
-    run("compress - -o half --as ply-sequence --target-ratio 0.5 --no-refine");
+    run("compress - -o half --as ply-sequence --ratio 0.5 --no-refine");
     let rows = |t: usize| PlyRows::read(&workplace.path(&format!("half/frame_{t:05}.ply"))).rows.len();
     assert!((0..FRAMES).all(|t| (1..frames[t].len()).contains(&rows(t))));
 }
@@ -560,7 +560,7 @@ fn lives_of_a_container_and_of_its_stream_are_joined_where_asked() {
     for t in 0..frames {
         workplace.ply(&format!("frames/{t}.ply"), &fading(count, t));
     }
-    workplace.done("pack frames -o lives.gseq --link apart");
+    workplace.done("convert frames lives.gseq --link apart");
     // It says itself who is who, and is believed; that lives are short is told.
     let [auto, apart, joined] =
         [Link::Auto, Link::Apart, Link::Always].map(|link| open(&workplace, "lives.gseq", link));
@@ -571,7 +571,7 @@ fn lives_of_a_container_and_of_its_stream_are_joined_where_asked() {
     assert_eq!(joined.source().info().times, auto.source().info().times);
     assert_eq!(joined.input.bytes().unwrap(), auto.input.bytes().unwrap());
     let compress = |to: &str, link: &str| {
-        workplace.done(&format!("compress lives.gseq -o {to} --target-count 200 --no-refine --verbose --link {link}"))
+        workplace.done(&format!("compress lives.gseq -o {to} --count 200 --no-refine --verbose --link {link}"))
     };
     let said = compress("apart.gseq", "auto");
     assert!(said.contains(" of 40 frames in the median: --link always makes one of lives that are one"), "{said}");
@@ -593,13 +593,12 @@ fn lives_of_a_container_and_of_its_stream_are_joined_where_asked() {
         assert!(one_row * 100 >= 97 * count, "frame {t}: {one_row}");
     }
     // The stream of it is linked like it.
-    let stream = workplace.piped("unpack lives.gseq --stream --quiet", b"").stdout;
-    assert!(workplace.piped("pack - -o of_stream.gseq --link always", &stream).status.success());
-    workplace.done("pack lives.gseq -o of_container.gseq --link always");
+    let stream = workplace.piped("convert lives.gseq - --quiet", b"").stdout;
+    assert!(workplace.piped("convert - of_stream.gseq --link always", &stream).status.success());
+    workplace.done("convert lives.gseq of_container.gseq --link always");
     let bytes = |name: &str| fs::read(workplace.path(name)).unwrap();
     assert!(bytes("of_stream.gseq") == bytes("of_container.gseq"));
-    let output =
-        workplace.piped("compress - -o of_stream_joined.gseq --target-count 200 --no-refine --link always", &stream);
+    let output = workplace.piped("compress - -o of_stream_joined.gseq --count 200 --no-refine --link always", &stream);
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     assert!(bytes("of_stream_joined.gseq") == bytes("joined.gseq"));
 }
@@ -617,8 +616,7 @@ fn a_stream_that_breaks_off_or_has_no_frame_leaves_nothing() {
         (&stream(&[])[..], "at least one frame"),
         (&odd[..], "frame 0, byte 48"),
     ] {
-        for verb in ["pack - -o out.gseq --scratch-dir .", "compress - -o out.gseq --scratch-dir . --target-ratio 0.5"]
-        {
+        for verb in ["convert - out.gseq --scratch-dir .", "compress - -o out.gseq --scratch-dir . --ratio 0.5"] {
             let output = workplace.piped(verb, bytes);
             let said = String::from_utf8_lossy(&output.stderr).into_owned();
             assert!(output.status.code() == Some(1) && said.contains(part), "{part}: {said}");

@@ -176,7 +176,7 @@ fn dynamic_3d_gaussians_go_through_every_verb() {
         let [pruned, default, refined] =
             [("pruned", "--prune-only --no-refine"), ("merged", "--no-refine"), ("refined", "")].map(
                 |(name, options)| {
-                    let options = format!("-o {name} --target-ratio {ratio} {options} --force");
+                    let options = format!("-o {name} --ratio {ratio} {options} --overwrite");
                     let summary = place.summary(&format!("{model} --cameras {model} {options}"));
                     assert_eq!(summary["gaussians"], 2000.0 * ratio, "{summary}");
                     psnr(&place, &model, name)
@@ -186,7 +186,7 @@ fn dynamic_3d_gaussians_go_through_every_verb() {
         assert!(default >= pruned && refined > pruned + 1.0, "{pruned} {default} {refined}");
     }
     place.done(&format!("compress {model} --cameras {model} -o merged.gseq --merge-only --preset strong --no-refine"));
-    place.done(&format!("pack {model} -o packed.gseq"));
+    place.done(&format!("convert {model} packed.gseq"));
     place.done(&format!("score {model} --cameras {model} -o rows.csv"));
     place.done(&format!("render {model} --cameras {model} --frame 3 --view 1 -o picture.png"));
 }
@@ -262,8 +262,7 @@ fn a_splatv_of_the_lite_model_has_the_texture_that_its_viewers_converter_makes_r
     let place = Workplace::new();
     let lite = family("stg_lite");
     let [model, cameras] = [lite.clone(), lite.clone()].map(|path| path.display().to_string());
-    place
-        .done(&format!("compress {model} --cameras {cameras} -o all.splatv --target-ratio 1 --prune-only --no-refine"));
+    place.done(&format!("compress {model} --cameras {cameras} -o all.splatv --ratio 1 --prune-only --no-refine"));
     let texture = |path: &Path| {
         let bytes = fs::read(path).unwrap();
         let words: Vec<u32> = bytes[..8].chunks(4).map(|word| u32::from_le_bytes(word.try_into().unwrap())).collect();
@@ -300,7 +299,7 @@ fn spacetime_gaussians_go_through_every_verb() {
         let model = family(name).display().to_string();
         for ratio in [0.4, 0.2] {
             let [pruned, default] = [("pruned", "--prune-only"), ("merged", "")].map(|(name, options)| {
-                let options = format!("-o {name} --target-ratio {ratio} {options} --force");
+                let options = format!("-o {name} --ratio {ratio} {options} --overwrite");
                 place.summary(&format!("{model} --cameras {model} {options}"));
                 psnr(&place, &model, name)
             });
@@ -308,13 +307,13 @@ fn spacetime_gaussians_go_through_every_verb() {
             assert!(default >= pruned && default > least, "{name} {ratio}: {pruned} {default}");
         }
         place.done(&format!(
-            "compress {model} --cameras {model} -o merged --merge-only --preset strong --no-refine --force"
+            "compress {model} --cameras {model} -o merged --merge-only --preset strong --no-refine --overwrite"
         ));
         assert!(psnr(&place, &model, "merged") > least);
-        place.done(&format!("pack {model} --cameras {model} -o packed.gseq --force"));
-        place.done(&format!("score {model} --cameras {model} -o rows.csv --force"));
-        place.done(&format!("render {model} --cameras {model} --frame 3 --view 1 -o picture.png --force"));
-        place.done(&format!("report {model} merged --cameras {model} -o report --force"));
+        place.done(&format!("convert {model} packed.gseq --cameras {model} --overwrite"));
+        place.done(&format!("score {model} --cameras {model} -o rows.csv --overwrite"));
+        place.done(&format!("render {model} --cameras {model} --frame 3 --view 1 -o picture.png --overwrite"));
+        place.done(&format!("report {model} merged --cameras {model} -o report --overwrite"));
     }
 }
 
@@ -395,7 +394,7 @@ fn checkpoints_go_through_every_verb() {
     for ([model, cameras], said) in [(yang4d, " --time-duration 0,2"), (ftgs, "")] {
         for ratio in [0.4, 0.2] {
             let [pruned, default] = [("pruned", "--prune-only"), ("merged", "")].map(|(name, options)| {
-                let options = format!("-o {name} --target-ratio {ratio} {options} --force{said}");
+                let options = format!("-o {name} --ratio {ratio} {options} --overwrite{said}");
                 place.summary(&format!("{model} --cameras {cameras} {options}"));
                 let found = place.done(&format!("evaluate {model} {name} --cameras {cameras} --json{said}"));
                 let found: serde_json::Value = serde_json::from_str(&found).unwrap();
@@ -404,9 +403,9 @@ fn checkpoints_go_through_every_verb() {
             println!("{model} {ratio}: {pruned} dB pruned, {default} default");
             assert!(default >= pruned, "{model} {ratio}: {pruned} {default}");
         }
-        let done = |line: &str| place.done(&format!("{line} --cameras {cameras} --force{said}"));
+        let done = |line: &str| place.done(&format!("{line} --cameras {cameras} --overwrite{said}"));
         done(&format!("compress {model} -o merged --merge-only --preset strong --no-refine"));
-        done(&format!("pack {model} -o packed.gseq"));
+        done(&format!("convert {model} packed.gseq"));
         done(&format!("score {model} -o rows.csv"));
         done(&format!("render {model} --frame 3 --view 1 -o picture.png"));
         done(&format!("report {model} merged -o page"));
@@ -443,7 +442,7 @@ fn through_every_verb(models: &[(&str, &str, &str, f64)]) {
         for ratio in [0.4, 0.2] {
             let [pruned, default] =
                 [("pruned", "--prune-only --no-refine"), ("merged", "--no-refine")].map(|(result, options)| {
-                    let options = format!("-o {result} --target-ratio {ratio} {options} --force");
+                    let options = format!("-o {result} --ratio {ratio} {options} --overwrite");
                     let summary = place.summary(&format!("{model} --cameras {cameras} {options}"));
                     assert_eq!(summary["gaussians"], count * ratio, "{summary}");
                     psnr(result)
@@ -452,15 +451,15 @@ fn through_every_verb(models: &[(&str, &str, &str, f64)]) {
             assert!(default >= pruned, "{name}: {pruned} {default}");
         }
         if name == "scgs" {
-            place.done(&format!("compress {model} --cameras {cameras} -o refined --target-ratio 0.2"));
+            place.done(&format!("compress {model} --cameras {cameras} -o refined --ratio 0.2"));
             let [pruned, refined] = ["pruned", "refined"].map(psnr);
             assert!(refined > pruned + 1.0, "{pruned} {refined}");
         }
         place.done(&format!(
-            "compress {model} --cameras {cameras} -o m.gseq --merge-only --preset strong --no-refine --force"
+            "compress {model} --cameras {cameras} -o m.gseq --merge-only --preset strong --no-refine --overwrite"
         ));
-        place.done(&format!("pack {model} --cameras {cameras} -o p.gseq --force"));
-        place.done(&format!("score {model} --cameras {cameras} -o rows.csv --force"));
-        place.done(&format!("render {model} --cameras {cameras} --frame 3 --view 1 -o picture.png --force"));
+        place.done(&format!("convert {model} p.gseq --cameras {cameras} --overwrite"));
+        place.done(&format!("score {model} --cameras {cameras} -o rows.csv --overwrite"));
+        place.done(&format!("render {model} --cameras {cameras} --frame 3 --view 1 -o picture.png --overwrite"));
     }
 }

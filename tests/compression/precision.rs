@@ -124,7 +124,7 @@ fn threads_and_memory_change_no_byte_and_runs_are_those_of_compress() {
     let place = Workplace::new();
     place.done("demo -o d --gaussians 1500 --frames 4");
     let found = read(&place.done(
-        "precision d/scene.gseq --cameras d/cameras.json -o diagrams --knobs machine,merging --target-ratio 0.4 --repeat 1 --json",
+        "precision d/scene.gseq --cameras d/cameras.json -o diagrams --knobs machine,merging --ratio 0.4 --repeat 1 --json",
     ));
     for curve in curves(&found, "machine") {
         let of = errors(curve, "bytes");
@@ -133,7 +133,7 @@ fn threads_and_memory_change_no_byte_and_runs_are_those_of_compress() {
     let marks = curves(&found, "merging")[0]["marks"].as_array().unwrap();
     let ran = |options: &str| {
         place.done(&format!(
-            "compress d/scene.gseq --cameras d/cameras.json -o small.gseq --overwrite --target-ratio 0.4 --no-refine {options}"
+            "compress d/scene.gseq --cameras d/cameras.json -o small.gseq --overwrite --ratio 0.4 --no-refine {options}"
         ));
         let evaluated =
             read(&place.done("evaluate d/scene.gseq small.gseq --cameras d/cameras.json --max-frames 12 --json"));
@@ -142,7 +142,9 @@ fn threads_and_memory_change_no_byte_and_runs_are_those_of_compress() {
     // Radius 0: pruning alone. The largest: four times the recipe's own, whatever pictures say of it.
     let [alone, widest] = [&marks[0], &marks[4]];
     assert_eq!((&alone["value"], &widest["value"]), (&0.0.into(), &0.02.into()));
-    for (mark, options) in [(alone, "--prune-only"), (widest, "--choose-by-views=false --merge-pass 0.02,1,0.95,0.9")] {
+    for (mark, options) in
+        [(alone, "--prune-only"), (widest, "--set choose_by_views=false --set passes=0.02,1,0.95,0.9")]
+    {
         let (got, expected) = (mark["psnr"].as_f64().unwrap(), ran(options));
         assert!((got - expected).abs() < 1e-9, "{options}: {got} {expected}");
     }
@@ -156,7 +158,7 @@ fn what_cannot_be_turned_is_refused_before_anything_is_written() {
     let before = files(&place.path(""));
     for (words, expected) in [
         ("precision d/scene.gseq -o diagrams", "give --cameras"),
-        ("precision d/scene.gseq --cameras d/cameras.json -o diagrams --target-ratio 0", "--target-ratio"),
+        ("precision d/scene.gseq --cameras d/cameras.json -o diagrams --ratio 0", "--ratio"),
         ("precision d/scene.gseq --cameras d/cameras.json -o diagrams --knobs luck", "luck"),
         ("precision - --cameras d/cameras.json -o diagrams", "pack the stream first"),
     ] {

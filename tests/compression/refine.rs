@@ -15,7 +15,7 @@ fn quality(workplace: &Workplace, original: &str, result: &str, cameras: &str) -
 fn every_kind_of_input_comes_closer_to_the_original_at_the_same_count() {
     let workplace = Workplace::new();
     workplace.done("demo --gaussians 1500 --frames 6 -o demo");
-    workplace.done("unpack demo/scene.gseq -o frames");
+    workplace.done("convert demo/scene.gseq frames --as ply-sequence");
     let tiny = tiny().display().to_string();
     let first = files(&workplace.path("frames")).into_keys().min().unwrap();
     let first = format!("frames/{}", first.display());
@@ -28,7 +28,7 @@ fn every_kind_of_input_comes_closer_to_the_original_at_the_same_count() {
     ] {
         let found = ["--no-refine --prune-only", ""].map(|how| {
             workplace.done(&format!(
-                "compress {input} --cameras {cameras} --target-ratio 0.2 --refine-steps 600 --overwrite -o {output} {how}"
+                "compress {input} --cameras {cameras} --ratio 0.2 --set refine_steps=600 --overwrite -o {output} {how}"
             ));
             quality(&workplace, input, output, cameras)
         });
@@ -40,12 +40,12 @@ fn every_kind_of_input_comes_closer_to_the_original_at_the_same_count() {
 fn a_static_model_without_cameras_is_refined_by_virtual_ones() {
     let workplace = Workplace::new();
     workplace.done("demo --gaussians 1200 --frames 2 -o demo");
-    workplace.done("unpack demo/scene.gseq -o frames");
+    workplace.done("convert demo/scene.gseq frames --as ply-sequence");
     let first = files(&workplace.path("frames")).into_keys().min().unwrap();
     let first = format!("frames/{}", first.display());
     let found = ["--no-refine --prune-only", ""].map(|how| {
         let summary =
-            workplace.summary(&format!("{first} --target-ratio 0.3 --refine-steps 150 --overwrite -o small.ply {how}"));
+            workplace.summary(&format!("{first} --ratio 0.3 --set refine_steps=150 --overwrite -o small.ply {how}"));
         assert_eq!(summary["gaussians"], 360);
         quality(&workplace, &first, "small.ply", "demo/cameras.json")
     });
@@ -59,8 +59,8 @@ fn who_asks_for_similarity_gets_it_for_decibels() {
     workplace.done("demo --gaussians 1500 --frames 6 -o demo");
     let found = ["0", "0.5"].map(|part| {
         workplace.done(&format!(
-            "compress demo/scene.gseq --cameras demo/cameras.json --target-ratio 0.1 --refine-steps 600 \
-             --refine-ssim {part} --overwrite -o small.gseq"
+            "compress demo/scene.gseq --cameras demo/cameras.json --ratio 0.1 --set refine_steps=600 \
+             --set refine_ssim={part} --overwrite -o small.gseq"
         ));
         let told = workplace.done("evaluate demo/scene.gseq small.gseq --cameras demo/cameras.json --json");
         let told: serde_json::Value = serde_json::from_str(&told).unwrap();
@@ -84,8 +84,8 @@ fn only_what_is_named_moves_and_nothing_of_what_is_protected() {
         ("colour,position", vec!["f_dc_0", "f_rest_3", "x"]),
     ] {
         workplace.done(&format!(
-            "compress {{tiny}} --cameras {{tiny}} --target-ratio 0.3 --refine {groups} --keep-ids 3,200-209 \
-             --refine-steps 200 --refine-cut-steps 20 --overwrite -o out"
+            "compress {{tiny}} --cameras {{tiny}} --ratio 0.3 --set refine={groups} --keep-ids 3,200-209 \
+             --set refine_steps=200 --set refine_cut_steps=20 --overwrite -o out"
         ));
         let after = cloud(&workplace.path("out"));
         let map = index_map(&workplace.path("out/index_map.npy"));

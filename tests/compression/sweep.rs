@@ -72,7 +72,7 @@ fn a_point_is_what_compress_and_evaluate_give() {
     for (method, flags) in
         [("default", ""), ("no-refine", "--no-refine"), ("paper-prune", "--preset paper --prune-only")]
     {
-        place.done(&format!("compress {{tiny}} --cameras {{tiny}} -o {method} --target-ratio 0.4 {flags}"));
+        place.done(&format!("compress {{tiny}} --cameras {{tiny}} -o {method} --ratio 0.4 {flags}"));
         let evaluated =
             json(&place.done(&format!("evaluate {{tiny}} {method} --cameras {{tiny}} --max-frames 3 --json")));
         let points = swept["points"].as_array().unwrap();
@@ -96,7 +96,7 @@ fn a_setting_of_steps_is_what_compress_gives_with_them_and_none_is_no_refining()
     let settings = knob["settings"].as_array().unwrap();
     assert_eq!(settings.iter().map(|setting| setting["value"].as_u64().unwrap()).collect::<Vec<_>>(), [0, 25]);
     // Cuts take 8% of the steps each, as in the preset.
-    place.done("compress {tiny} --cameras {tiny} -o small --target-ratio 0.3 --refine-steps 25 --refine-cut-steps 2");
+    place.done("compress {tiny} --cameras {tiny} -o small --ratio 0.3 --set refine_steps=25 --set refine_cut_steps=2");
     let evaluated = json(&place.done("evaluate {tiny} small --cameras {tiny} --max-frames 2 --json"));
     let unrefined = swept["points"].as_array().unwrap().iter().find(|point| point["asked"] == 0.3).unwrap();
     for name in ["psnr", "ssim"] {

@@ -499,8 +499,8 @@ def make_frames(program, ply):
         def run(*arguments):
             subprocess.run([program, "--quiet", *arguments], check=True, cwd=folder, input=stream(8))
 
-        run("pack", "-", "-o", "a.gseq")
-        run("pack", "-", "-o", "b.gseq", "--max-error", "position=0.001,log_scale=0.01")
+        run("convert", "-", "a.gseq")
+        run("convert", "-", "b.gseq", "--max-error", "position=0.001,log_scale=0.01")
         whole = (folder / "a.gseq").read_bytes()
         bounded = (folder / "b.gseq").read_bytes()
         (folder / "a.ply").write_bytes(ply)
@@ -510,7 +510,7 @@ def make_frames(program, ply):
         (model / "cfg_args").write_bytes((HERE / "cfg_args" / "whole").read_bytes())
         (iteration / "point_cloud.ply").write_bytes(ply)
         (iteration / "deformation.pth").write_bytes((HERE / "pickle" / "whole").read_bytes())
-        keep = ["--target-count", str(COUNT - 1), "--no-refine", "--prune-only"]
+        keep = ["--count", str(COUNT - 1), "--no-refine", "--prune-only"]
         run("compress", "a.ply", "-o", "ply.gsz", *keep)
         run("compress", "model", "--frames", "3", "-o", "model.gsz", *keep)
         archives = [(folder / name).read_bytes() for name in ("model.gsz", "ply.gsz")]

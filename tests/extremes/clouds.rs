@@ -24,8 +24,8 @@ fn no_gaussians_give_a_valid_empty_output() {
         assert_eq!(fs::read(workplace.path("out.ply")).unwrap(), fs::read(&path).unwrap());
         assert!(index_map(&workplace.path("out.ply.index_map.npy")).is_empty());
         workplace.done(&format!("compress empty.ply --overwrite -o out.gseq --preset {preset}"));
-        workplace.done("verify out.gseq");
-        workplace.done("score empty.ply --force -o rows.npz");
+        workplace.done("info out.gseq --check");
+        workplace.done("score empty.ply --overwrite -o rows.npz");
     }
 }
 
@@ -34,7 +34,7 @@ fn no_gaussians_give_a_valid_empty_output() {
 fn one_gaussian_is_kept_byte_for_byte() {
     let workplace = Workplace::new();
     let path = workplace.ply("one.ply", &balls(1));
-    for request in ["--preset paper", "--preset default", "--target-count 1", "--target-ratio 0.01", "--merge-only"] {
+    for request in ["--preset paper", "--preset default", "--count 1", "--ratio 0.01", "--merge-only"] {
         workplace.done(&format!("compress one.ply --overwrite -o out.ply {request}"));
         assert_eq!(fs::read(workplace.path("out.ply")).unwrap(), fs::read(&path).unwrap(), "{request}");
     }
@@ -64,8 +64,9 @@ fn identical_gaussians_are_pruned_to_the_exact_count_by_hash() {
     workplace.ply("same.ply", &one);
     for preset in ["paper", "default"] {
         // What pictures show of them is told apart by who is drawn first.
-        let request = format!("same.ply --overwrite -o out.ply --prune-only --preset {preset} --coverage projected");
-        let summary = workplace.summary(&format!("{request} --target-count 37"));
+        let request =
+            format!("same.ply --overwrite -o out.ply --prune-only --preset {preset} --set coverage=projected");
+        let summary = workplace.summary(&format!("{request} --count 37"));
         assert_eq!(summary["gaussians"], 37);
         assert!(says(&summary, "left_out", "grading by coverage"), "{}", summary["left_out"]);
         let map = index_map(&workplace.path("out.ply.index_map.npy"));
@@ -114,8 +115,8 @@ fn movers_around_one_percent_are_kept_whatever_their_number() {
             }
             workplace.ply(&format!("frames/frame_{frame}.ply"), &cloud);
         }
-        let default = "--preset default --tau-static 0.99 --tau-dynamic 1 --no-refine";
-        for request in ["--preset paper --target-count 20", default] {
+        let default = "--preset default --set tau_static=0.99 --set tau_dynamic=1 --no-refine";
+        for request in ["--preset paper --count 20", default] {
             workplace.done(&format!("compress frames -o out --overwrite --prune-only {request}"));
             let map = index_map(&workplace.path("out/index_map.npy"));
             assert!((0..movers).all(|i| map[50 * i] >= 0), "{request}, {movers} movers of 200: one was pruned");
@@ -134,7 +135,7 @@ fn invisible_gaussians_are_all_prunable_without_nan() {
         workplace.ply("dark.ply", &cloud);
         for preset in ["paper", "default"] {
             let request = format!("dark.ply --overwrite --preset {preset} -o out.ply");
-            let summary = workplace.summary(&format!("{request} --target-count 1"));
+            let summary = workplace.summary(&format!("{request} --count 1"));
             assert_eq!(summary["gaussians"], 1, "{preset}");
             assert_eq!(summary["flags"]["never_alive"], 60);
             assert!(numbers(&summary, "p99").iter().all(|x| x.is_finite()));
@@ -157,8 +158,8 @@ fn what_looks_like_its_background_counts_by_the_contrast_floor() {
     workplace.ply("two.ply", &two);
     fs::write(workplace.path("cameras.json"), CAMERA).unwrap();
     let request = "two.ply --cameras cameras.json --overwrite -o out.ply --prune-only --no-refine";
-    for (floor, expected) in [("", [0, -1]), ("--contrast-floor 0", [-1, 0])] {
-        workplace.done(&format!("compress {request} --choose-by-views=false --target-count 1 {floor}"));
+    for (floor, expected) in [("", [0, -1]), ("--set contrast_floor=0", [-1, 0])] {
+        workplace.done(&format!("compress {request} --set choose_by_views=false --count 1 {floor}"));
         assert_eq!(index_map(&workplace.path("out.ply.index_map.npy")), expected, "{floor:?}");
     }
 }
@@ -176,7 +177,7 @@ fn solid_gaussians_have_no_variance_and_finite_logits() {
     assert!(scene::arrays(&workplace.path("rows.npz"))["V"].iter().all(|&v| v == 0.0));
     for preset in ["paper", "default"] {
         let summary = workplace
-            .summary(&format!("frames --preset {preset} --trajectory alignment --no-refine --overwrite -o out"));
+            .summary(&format!("frames --preset {preset} --set trajectory=alignment --no-refine --overwrite -o out"));
         assert!(summary["merge"]["proxies"].as_u64().unwrap() > 0);
         let rows = PlyRows::read(&workplace.path("out/frame_0.ply"));
         assert!((0..rows.rows.len()).all(|i| rows.value(i, "opacity").is_finite() && rows.value(i, "opacity") > 10.0));
@@ -204,11 +205,11 @@ fn not_finite_gaussians_are_refused_dropped_or_kept_as_asked() {
             &["odd.ply", "Gaussian 7", "NaN or infinity", "--non-finite"],
         );
 
-        let summary = workplace.summary("odd.ply -o dropped.ply --non-finite drop --merge-only --no-refine");
+        let summary = workplace.summary("odd.ply -o dropped.ply --set non_finite=drop --merge-only --no-refine");
         assert_eq!((&summary["gaussians"], &summary["flags"]["non_finite"]), (&99.into(), &1.into()), "{what}");
         assert_eq!(index_map(&workplace.path("dropped.ply.index_map.npy"))[7], -1, "{what}");
 
-        workplace.done("compress odd.ply -o kept.ply --non-finite keep --refine-steps 40");
+        workplace.done("compress odd.ply -o kept.ply --set non_finite=keep --set refine_steps=40");
         let place = index_map(&workplace.path("kept.ply.index_map.npy"))[7];
         let (before, after) = (PlyRows::read(&odd), PlyRows::read(&workplace.path("kept.ply")));
         assert!(place >= 0 && after.rows[place as usize] == before.rows[7], "{what}");
@@ -218,8 +219,9 @@ fn not_finite_gaussians_are_refused_dropped_or_kept_as_asked() {
         fs::write(workplace.path("cameras.json"), CAMERA).unwrap();
         let others: Vec<u32> = (0..100).filter(|&i| i != 7).collect();
         workplace.ply("others.ply", &odd_cloud.pick(&others));
-        let [found, expected] = ["odd.ply --non-finite keep", "others.ply"].map(|request| {
-            workplace.summary(&format!("{request} --coverage projected --cameras cameras.json --overwrite -o x.ply"))
+        let [found, expected] = ["odd.ply --set non_finite=keep", "others.ply"].map(|request| {
+            workplace
+                .summary(&format!("{request} --set coverage=projected --cameras cameras.json --overwrite -o x.ply"))
         });
         assert_eq!(found["terms"], expected["terms"], "{what}");
     }
@@ -251,7 +253,7 @@ fn without_cameras_what_stays_does_not_depend_on_the_unit_of_length() {
             cloud.opacity_logit.set_row(i, [6.0 * value(0.569_84) - 3.0]);
         }
         workplace.ply("cloud.ply", &cloud);
-        workplace.done("compress cloud.ply -o out.ply --prune-only --no-refine --target-count 1000");
+        workplace.done("compress cloud.ply -o out.ply --prune-only --no-refine --count 1000");
         index_map(&workplace.path("out.ply.index_map.npy"))
     };
     let expected = kept(1);
@@ -271,7 +273,7 @@ fn exact_duplicates_merge_to_one_and_the_summary_names_the_opacity_rule() {
     // Three opacities of 0.731 over one area.
     let rules = [("sum", 1.0f64), ("union", 1.0 - (1.0f64 - 0.731_058_6).powi(3)), ("area", 1.0)];
     for (rule, opacity) in rules {
-        let request = format!("three.ply --overwrite -o out.ply --merge-only --no-refine --opacity {rule}");
+        let request = format!("three.ply --overwrite -o out.ply --merge-only --no-refine --set opacity={rule}");
         let summary = workplace.summary(&request);
         assert_eq!((&summary["gaussians"], &summary["merge"]["opacity"]), (&10.into(), &rule.into()));
         let rows = PlyRows::read(&workplace.path("out.ply"));

@@ -9,7 +9,7 @@ use super::scene::{PlyRows, Workplace, arrays, index_map};
 use super::{CAMERA, balls, close};
 
 /// Merges nothing but what formulas let merge.
-const MERGE: &str = "--merge-only --no-refine --choose-by-views=false --coverage projected --overwrite";
+const MERGE: &str = "--merge-only --no-refine --set choose_by_views=false --set coverage=projected --overwrite";
 
 /// Two equal balls at one place, and one far off so that the scene has an extent.
 fn twins() -> Gaussians {
@@ -113,7 +113,7 @@ fn merged(edit: impl Fn(&mut Gaussians), flags: &str) -> ([f64; 3], DMat3, PlyRo
 }
 
 /// Lengths are scene units and pairs a whole unit apart may merge, however unlike in place.
-const WIDE: &str = "--length-unit scene --merge-pass 1,1e9,-1,-1";
+const WIDE: &str = "--set length_unit=scene --set passes=1,1e9,-1,-1";
 
 /// Row 21, for needles along every axis and any way round.
 #[test]
@@ -172,7 +172,7 @@ fn a_covariance_with_equal_diagonal_has_its_axes() {
             cloud.position.set_row(0, direction.map(|x| (half * x) as f32));
             cloud.position.set_row(1, direction.map(|x| (-half * x) as f32));
         };
-        let (scales, axes, rows) = merged(apart, &format!("{WIDE} --placement mean"));
+        let (scales, axes, rows) = merged(apart, &format!("{WIDE} --set placement=mean"));
         let long = (0..3).max_by(|&a, &b| scales[a].total_cmp(&scales[b])).unwrap();
         let along = DVec3::from(direction).normalize();
         close(format!("axis of {direction:?}"), axes.col(long).dot(along).abs(), 1.0, 1e-6);
@@ -231,7 +231,7 @@ fn balls_of_1e_minus_12_and_of_1e6_merge_with_what_is_near_for_their_size() {
             (0..2).for_each(|i| cloud.log_scale.set_row(i, [size.ln() as f32; 3]));
             cloud.position.set_row(1, [(apart * size.min(1.0)) as f32, 0.0, 0.0]);
             workplace.ply("two.ply", &cloud);
-            let flags = format!("{MERGE} --length-unit scene --merge-pass 1,1,-1,-1");
+            let flags = format!("{MERGE} --set length_unit=scene --set passes=1,1,-1,-1");
             workplace.done(&format!("compress two.ply -o out.ply {flags}"));
             let rows = PlyRows::read(&workplace.path("out.ply"));
             assert_eq!(rows.rows.len(), if apart < 1.0 { 1 } else { 2 }, "size {size:e}, {apart} apart");
@@ -265,7 +265,7 @@ fn scales_from_1e_minus_12_to_1e6_overflow_nothing() {
         format!("{},{}", near.trim_end_matches(']'), far.trim_start_matches('[')),
     )
     .unwrap();
-    for preset in ["paper", "default", "default --coverage projected --no-refine", "strong"] {
+    for preset in ["paper", "default", "default --set coverage=projected --no-refine", "strong"] {
         let request = format!("cloud.ply --cameras cameras.json -o out.ply --overwrite --preset {preset}");
         let summary = workplace.summary(&request);
         assert!(summary["gaussians"].as_u64().unwrap() > 0);
@@ -274,7 +274,7 @@ fn scales_from_1e_minus_12_to_1e6_overflow_nothing() {
             assert!(rows.value(i, name).is_finite(), "{preset}: {name} of {i}");
         }
         let score = format!("score cloud.ply --cameras cameras.json -o rows.npz --overwrite --preset {preset}");
-        workplace.done(&score.replace(" --no-refine", "").replace("--overwrite", "--force"));
+        workplace.done(&score.replace(" --no-refine", "").replace("--overwrite", "--overwrite"));
         for (name, values) in arrays(&workplace.path("rows.npz")) {
             assert!(values.iter().all(|x| x.is_finite()), "{preset}: {name}");
             // The picture has so many pixels.
@@ -307,11 +307,11 @@ fn what_is_hidden_goes_first_and_a_giant_background_stays_and_swallows_nothing()
     workplace.ply("cloud.ply", &cloud);
     fs::write(workplace.path("cameras.json"), CAMERA).unwrap();
     let request = "cloud.ply --cameras cameras.json -o out.ply --overwrite --no-refine";
-    workplace.done(&format!("compress {request} --prune-only --target-count 50"));
+    workplace.done(&format!("compress {request} --prune-only --count 50"));
     let map = index_map(&workplace.path("out.ply.index_map.npy"));
     assert!((0..10).all(|i| map[i] < 0), "{map:?}");
     for more in ["", "--merge-only", "--preset paper"] {
-        workplace.done(&format!("compress {request} {more} --tau-static 0"));
+        workplace.done(&format!("compress {request} {more} --set tau_static=0"));
         let map = index_map(&workplace.path("out.ply.index_map.npy"));
         assert!(map[20] >= 0, "{more}: the background went");
         assert_eq!(map.iter().filter(|&&place| place == map[20]).count(), 1, "{more}: it swallowed others");
@@ -322,8 +322,8 @@ fn what_is_hidden_goes_first_and_a_giant_background_stays_and_swallows_nothing()
         cloud.sh.set_row(i, cloud.sh.row::<3>(20));
     }
     workplace.ply("cloud.ply", &cloud);
-    for (preset, expected) in [("default", 1), ("strong", 1), ("default --max-scale-ratio inf", 11)] {
-        workplace.done(&format!("compress {request} --merge-only --choose-by-views=false --preset {preset}"));
+    for (preset, expected) in [("default", 1), ("strong", 1), ("default --set max_scale_ratio=inf", 11)] {
+        workplace.done(&format!("compress {request} --merge-only --set choose_by_views=false --preset {preset}"));
         let map = index_map(&workplace.path("out.ply.index_map.npy"));
         let with_giant = map.iter().filter(|&&place| place == map[20]).count();
         assert_eq!(with_giant, expected, "{preset}: Gaussians that are one with the background");
@@ -341,7 +341,7 @@ fn a_crowd_in_one_voxel_is_cut_and_said_to_be() {
         cloud.position.set_row(i, [value(0.618_033_988), value(0.754_877_666), value(0.569_840_290)]);
     }
     workplace.ply("crowd.ply", &cloud);
-    let summary = workplace.summary(&format!("crowd.ply -o out.ply {MERGE} --length-unit scene"));
+    let summary = workplace.summary(&format!("crowd.ply -o out.ply {MERGE} --set length_unit=scene"));
     let pass = &summary["merge"]["passes"][0];
     assert_eq!(pass["truncated"], N, "{pass}");
     // The search returns at most 32 neighbors of each Gaussian, so there are at most 32 pairs for each.
@@ -366,9 +366,9 @@ fn a_sorted_chain_merges_as_the_sequential_rule_says() {
         CAMERA.replace("[0.5, 0.5, -3]", "[2, 0, -400]").replace("\"fx\": 60, \"fy\": 60", "\"fx\": 900, \"fy\": 900");
     fs::write(workplace.path("cameras.json"), camera).unwrap();
     // Neighbors lie within reach, and who comes next but one does not.
-    let flags = "--length-unit scene --merge-pass 0.0011,1e9,-1,-1 --cameras cameras.json";
+    let flags = "--set length_unit=scene --set passes=0.0011,1e9,-1,-1 --cameras cameras.json";
     let summary = workplace.summary(&format!("chain.ply -o out.ply {MERGE} {flags}"));
-    workplace.done("score chain.ply --coverage projected --cameras cameras.json -o rows.npz");
+    workplace.done("score chain.ply --set coverage=projected --cameras cameras.json -o rows.npz");
     let c = arrays(&workplace.path("rows.npz"))["C"].clone();
     assert!(c.windows(2).all(|pair| pair[0] > pair[1]), "the chain must be sorted");
     let map = index_map(&workplace.path("out.ply.index_map.npy"));
@@ -391,7 +391,7 @@ fn what_nobody_sees_merges_by_opacity_times_area() {
         }
         workplace.ply("two.ply", &cloud);
         fs::write(workplace.path("cameras.json"), CAMERA).unwrap();
-        let flags = format!("{MERGE} {WIDE} --placement mean --alpha-min 0 --cameras cameras.json");
+        let flags = format!("{MERGE} {WIDE} --set placement=mean --set alpha_min=0 --cameras cameras.json");
         let summary = workplace.summary(&format!("two.ply -o out.ply {flags}"));
         assert_eq!((&summary["gaussians"], &summary["flags"]["never_in_view"]), (&2.into(), &2.into()));
         let opacity = logits.map(|x| 1.0 / (1.0 + (-f64::from(x)).exp()));

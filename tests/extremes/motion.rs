@@ -9,8 +9,8 @@ use super::{Rows, Sequence, close};
 const ALIVE: f32 = 0.0;
 const DEAD: f32 = -7.0;
 /// Both ways to count motion; rounding noise stays in, as here nothing is noise.
-const RUNS: &str = "--preset default --snap-noise=false";
-const LITERAL: &str = "--preset paper --snap-noise=false";
+const RUNS: &str = "--preset default --set snap_noise=false";
+const LITERAL: &str = "--preset paper --set snap_noise=false";
 
 /// Rows of Gaussians that move along x, `x(i, t)`, with logits `life(i, t)`.
 fn walking(
@@ -199,7 +199,7 @@ fn far_from_the_origin_noise_is_snapped_and_counted_and_motion_is_that_of_the_fl
             (0..2 * RESTING).for_each(|i| state.position.set_row(i, [x(i, t) as f32, 0.0, 0.0]));
         };
         let rows = sequence().rows("--preset default", fill);
-        let summary = sequence().summary("--preset default --coverage projected --prune-only --no-refine", fill);
+        let summary = sequence().summary("--preset default --set coverage=projected --prune-only --no-refine", fill);
         assert!(rows.values().flatten().all(|value| value.is_finite()), "offset {offset:e}");
         for i in 0..2 * RESTING {
             let at = |t: usize| f64::from(x(i, t) as f32);

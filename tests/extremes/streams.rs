@@ -24,7 +24,7 @@ fn frame(t: usize) -> usize {
 
 /// Every verb that reads streams refuses `bytes` with these parts in its message, and leaves nothing.
 fn refused(bytes: &[u8], parts: &[&str]) {
-    for arguments in ["compress - -o out", "pack - -o a.gseq", "score - -o rows.npz", "info -"] {
+    for arguments in ["compress - -o out", "convert - a.gseq", "score - -o rows.npz", "info -"] {
         let (workplace, bytes) = (Workplace::new(), bytes.to_owned());
         let output = piped(&workplace, arguments, move |to| drop(to.write_all(&bytes)));
         let text = String::from_utf8_lossy(&output.stderr).into_owned();

@@ -59,7 +59,7 @@ fn ply_with_900_further_properties_keeps_within_memory() {
     out.write_all(ply_header("binary_little_endian", count, extra).as_bytes()).unwrap();
     (0..count as usize).for_each(|i| out.write_all(&ply_row(i, extra)).unwrap());
     drop(out);
-    small(&folder, "pack wide.ply -o wide.gseq").succeeded();
+    small(&folder, "convert wide.ply wide.gseq").succeeded();
     small(&folder, "convert wide.ply copy.ply").succeeded();
     assert_eq!(
         fs::metadata(folder.path("copy.ply")).unwrap().len(),
@@ -76,7 +76,7 @@ fn ply_with_a_tail_of_300_mb_keeps_within_memory() {
     let len = head.len() as u64 + 300 * MIB;
     sparse(&folder, "tail.ply", head, len);
     small(&folder, "info tail.ply").succeeded();
-    small(&folder, "pack tail.ply -o tail.gseq").succeeded();
+    small(&folder, "convert tail.ply tail.gseq").succeeded();
     small(&folder, "convert tail.ply copy.ply").succeeded();
     assert_eq!(fs::metadata(folder.path("copy.ply")).unwrap().len(), len);
 }
@@ -139,7 +139,7 @@ fn text_ply_is_parsed_once_however_many_blocks_it_has() {
     let rows = if is_optimized() { 200_000 } else { 30_000 };
     text_ply(&folder, "text.ply", rows);
     // Reading it once more for each block of 1024 rows took 31 s for 100,000 rows.
-    let outcome = small(&folder, "pack text.ply -o text.gseq").succeeded();
+    let outcome = small(&folder, "convert text.ply text.gseq").succeeded();
     assert!(outcome.seconds < 10.0, "{} s", outcome.seconds);
 }
 
@@ -180,7 +180,7 @@ fn stream_with_an_endless_frame_is_refused_before_it_arrives() {
     let endless = u64::from(u32::MAX) * ROW;
     let stream = [stream_header(2, 0, 31), stream_frame(endless)].concat();
     let path = sparse(&folder, "endless", stream, 1 << 34);
-    for verb in ["info -", "pack - -o a.gseq"] {
+    for verb in ["info -", "convert - a.gseq"] {
         small_with_stdin(&folder, verb, &path)
             .refused(1, &["standard input, frame 0, byte 48", "one frame", "--memory"]);
     }
@@ -229,7 +229,7 @@ fn archives_that_decompress_to_gigabytes_are_refused() {
     for (name, bytes, says) in bombs {
         folder.write(&format!("{name}.gsz"), bytes);
         // Whatever the budget is.
-        let arguments = [format!("info {name}.gsz"), format!("unpack {name}.gsz -o out")];
+        let arguments = [format!("info {name}.gsz"), format!("convert {name}.gsz out")];
         for arguments in arguments {
             let outcome = folder.attack(&arguments).run().refused(1, &[&format!("{name}.gsz"), says]);
             outcome.within(SMALL_MEMORY.1);
@@ -387,10 +387,10 @@ fn files_of_other_kinds_are_refused_by_name_without_waiting() {
             small(&folder, &format!("info {name}")).refused(1, &[&name, found, "standard input, given as -"]);
         }
     }
-    for verb in ["verify pipe.gseq", "recover pipe.gseq -o out.gseq"] {
+    for verb in ["info pipe.gseq --check", "info pipe.gseq --repair out.gseq"] {
         folder.attack(verb).run().refused(1, &["pipe.gseq", "regular file"]).within(SMALL_MEMORY.1);
     }
-    folder.attack("unpack zero.gsz -o out").run().refused(1, &["zero.gsz", "a device"]).within(SMALL_MEMORY.1);
+    folder.attack("convert zero.gsz out").run().refused(1, &["zero.gsz", "a device"]).within(SMALL_MEMORY.1);
     assert!(!folder.path("out.gseq").exists() && !folder.path("out").exists());
 }
 
@@ -437,7 +437,7 @@ fn cut_while_read(runs: u64) {
     let len = header.len() as u64 + rows * (ROW + 4 * extra as u64);
     for run in 0..runs {
         let path = sparse(&folder, "cut.ply", &header, len);
-        let running = folder.attack("pack cut.ply -o cut.gseq --overwrite").start();
+        let running = folder.attack("convert cut.ply cut.gseq --overwrite").start();
         thread::sleep(Duration::from_millis(if is_optimized() { 2 + run } else { 40 + 60 * run }));
         File::options().write(true).open(&path).unwrap().set_len(header.len() as u64 + 10).unwrap();
         let outcome = running.wait().ended();

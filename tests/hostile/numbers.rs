@@ -9,7 +9,8 @@ use splatsieve::model::{Column, Gaussians};
 use crate::runner::{Attack, Folder, Outcome};
 
 /// Options with which a run of a few Gaussians takes little time.
-const QUICK: &str = "--cameras cameras.json --refine-pictures 26 --refine-steps 12 --refine-cut-steps 3 --quiet";
+const QUICK: &str =
+    "--cameras cameras.json --set refine_pictures=26 --set refine_steps=12 --set refine_cut_steps=3 --quiet";
 
 /// Gaussians of a middle size strewn over a cube of side 2 by the golden ratio, of SH degree 1.
 fn cloud(count: usize) -> Gaussians {
@@ -87,7 +88,7 @@ fn searches_among_less_than_six_gaussians_end() {
 #[test]
 fn no_gaussians_give_an_empty_output_by_any_size() {
     let folder = folder_of(&cloud(0));
-    for size in ["", "--target-ratio 0.5", "--target-count 1", "--min-psnr 30dB", "--target-size 100kB"] {
+    for size in ["", "--ratio 0.5", "--count 1", "--min-psnr 30dB", "--size 100kB"] {
         let outcome = compress(&folder, "out.ply", size).run().succeeded();
         assert_eq!(summary(&folder, "out.ply")["gaussians"], 0, "{}", outcome.shown);
         folder.names().iter().filter(|name| name.starts_with("out")).for_each(|name| {
@@ -102,9 +103,10 @@ fn recipe_values_that_make_a_run_endless_are_refused() {
     let refused = |options: &str, parts: &[&str]| {
         compress(&folder, "out.ply", options).run().refused(2, parts);
     };
-    refused("--target-ratio 0.5 --round-fraction 0.9999999999", &["select.round_fraction", "0.1 to 0.99"]);
+    refused("--ratio 0.5 --set round_fraction=0.9999999999", &["select.round_fraction", "0.1 to 0.99"]);
     let folder = folder_of(&cloud(7));
-    let outcome = folder.attack("compress in.ply -o out.ply --cameras cameras.json --refine-steps 4000000000").run();
+    let outcome =
+        folder.attack("compress in.ply -o out.ply --cameras cameras.json --set refine_steps=4000000000").run();
     outcome.refused(2, &["refine.refine_steps", "0 to 1000000"]);
 }
 
@@ -116,10 +118,9 @@ fn dropped_gaussians_change_no_byte_of_the_others() {
     odd.sh.plane_mut(0)[40] = f32::INFINITY;
     odd.sh.plane_mut(1)[40] = f32::NAN;
     let [odd, whole] = [odd, whole].map(|cloud| folder_of(&cloud));
-    for (output, size) in [("a.ply", "--target-count 25"), ("b.ply", "--min-psnr 25dB"), ("c.gsz", "--target-count 30")]
-    {
+    for (output, size) in [("a.ply", "--count 25"), ("b.ply", "--min-psnr 25dB"), ("c.gsz", "--count 30")] {
         let options = format!("{size} --no-refine");
-        compress(&odd, output, &format!("{options} --non-finite drop")).run().succeeded();
+        compress(&odd, output, &format!("{options} --set non_finite=drop")).run().succeeded();
         compress(&whole, output, &options).run().succeeded();
         let [found, expected] = [&odd, &whole].map(|folder| fs::read(folder.path(output)).unwrap());
         assert!(found == expected, "{output}: {} bytes, expected {}", found.len(), expected.len());
@@ -131,10 +132,10 @@ fn an_infinite_color_is_no_panic_in_an_archive() {
     let mut odd = cloud(16);
     odd.sh.plane_mut(2)[3] = f32::INFINITY;
     let folder = folder_of(&odd);
-    let left = wrote_all_or_nothing(compress(&folder, "q.gsz", "--non-finite drop").run(), &folder, "q.gsz");
+    let left = wrote_all_or_nothing(compress(&folder, "q.gsz", "--set non_finite=drop").run(), &folder, "q.gsz");
     assert!(left.unwrap() <= 15);
     let folder = folder_of(&odd);
-    let outcome = compress(&folder, "q.gsz", "--non-finite keep").run();
+    let outcome = compress(&folder, "q.gsz", "--set non_finite=keep").run();
     assert_eq!(wrote_all_or_nothing(outcome, &folder, "q.gsz"), None, "an archive holds finite values");
 }
 
@@ -201,7 +202,7 @@ fn edited(edit: &Edit) -> Folder {
 #[test]
 #[ignore = "slow: 225 runs"]
 fn slow_tiny_counts_by_every_size_to_every_kind_end() {
-    let sizes = ["", "--target-ratio 0.5", "--target-count 2", "--min-psnr 20dB", "--target-size 200kB"];
+    let sizes = ["", "--ratio 0.5", "--count 2", "--min-psnr 20dB", "--size 200kB"];
     for count in [0u64, 1, 2, 3, 4, 5, 7, 16, 50] {
         let cloud = cloud(count as usize);
         for size in sizes {
@@ -210,12 +211,12 @@ fn slow_tiny_counts_by_every_size_to_every_kind_end() {
                 let left = wrote_all_or_nothing(compress(&folder, output, size).run(), &folder, output);
                 let case = format!("{count} Gaussians, {size:?}, {output}: {left:?}");
                 match (size, left) {
-                    ("--target-count 2", None) => assert_eq!(count, 1, "{case}"),
+                    ("--count 2", None) => assert_eq!(count, 1, "{case}"),
                     (_, None) => panic!("{case}"),
-                    ("--target-ratio 0.5", Some(left)) => {
+                    ("--ratio 0.5", Some(left)) => {
                         assert_eq!(left, if count == 0 { 0 } else { count.div_ceil(2) }, "{case}");
                     }
-                    ("--target-count 2", Some(left)) => assert_eq!(left, count.min(2), "{case}"),
+                    ("--count 2", Some(left)) => assert_eq!(left, count.min(2), "{case}"),
                     (_, Some(left)) => assert!(left <= count && (left > 0 || count == 0), "{case}"),
                 }
             }
@@ -228,13 +229,13 @@ fn slow_tiny_counts_by_every_size_to_every_kind_end() {
 fn slow_values_that_are_not_finite_are_refused_dropped_or_kept() {
     for edit in &NOT_FINITE {
         let folder = edited(edit);
-        for size in ["", "--target-ratio 0.5"] {
+        for size in ["", "--ratio 0.5"] {
             compress(&folder, "out.ply", size).run().refused(1, &["in.ply", "Gaussian 3", "--non-finite"]);
         }
-        for size in ["--target-ratio 0.5", "--min-psnr 20dB", "--target-size 100kB"] {
+        for size in ["--ratio 0.5", "--min-psnr 20dB", "--size 100kB"] {
             for output in OUTPUTS {
                 let folder = edited(edit);
-                let outcome = compress(&folder, output, &format!("{size} --non-finite drop")).run();
+                let outcome = compress(&folder, output, &format!("{size} --set non_finite=drop")).run();
                 let left = wrote_all_or_nothing(outcome, &folder, output);
                 assert!(left.is_some_and(|left| (1..=23).contains(&left)), "{}, {size}, {output}: {left:?}", edit.0);
             }
@@ -246,10 +247,10 @@ fn slow_values_that_are_not_finite_are_refused_dropped_or_kept() {
 #[ignore = "slow: 120 runs"]
 fn slow_values_that_are_kept_though_not_finite_end() {
     for edit in &NOT_FINITE {
-        for size in ["", "--target-ratio 0.5", "--min-psnr 20dB"] {
+        for size in ["", "--ratio 0.5", "--min-psnr 20dB"] {
             for output in OUTPUTS {
                 let folder = edited(edit);
-                let outcome = compress(&folder, output, &format!("{size} --non-finite keep")).run();
+                let outcome = compress(&folder, output, &format!("{size} --set non_finite=keep")).run();
                 wrote_all_or_nothing(outcome, &folder, output);
             }
         }
@@ -260,7 +261,7 @@ fn slow_values_that_are_kept_though_not_finite_end() {
 #[ignore = "slow: 180 runs"]
 fn slow_extreme_values_end_with_a_result_or_a_clear_error() {
     for edit in &EXTREME {
-        for size in ["", "--target-ratio 0.5", "--min-psnr 20dB"] {
+        for size in ["", "--ratio 0.5", "--min-psnr 20dB"] {
             for output in OUTPUTS {
                 let folder = edited(edit);
                 let left = wrote_all_or_nothing(compress(&folder, output, size).run(), &folder, output);
@@ -279,7 +280,7 @@ fn slow_sweep_and_precision_of_few_gaussians_end() {
         let folder = folder_of(&cloud(count));
         for attack in [
             "sweep in.ply --cameras cameras.json --fractions 0.5,1 --methods default,paper --steps 10 -o sweep --quiet",
-            "precision in.ply --cameras cameras.json -o precision --runs 1 --max-frames 1 --refine-steps 12 --quiet",
+            "precision in.ply --cameras cameras.json -o precision --runs 1 --max-frames 1 --set refine_steps=12 --quiet",
         ] {
             let outcome = folder.attack(attack).within(120.0).run().ended();
             assert!(matches!(outcome.code, Some(0..=2)), "{}: {}", outcome.shown, outcome.stderr);
@@ -293,17 +294,17 @@ fn slow_extreme_parameters_end() {
     let folder = folder_of(&cloud(16));
     for (k, options) in [
         "--epsilon 1e300 --no-refine",
-        "--max-neighbors 1024 --no-refine",
-        "--round-fraction 0.99 --target-count 1",
-        "--round-fraction 0.1 --target-count 1",
-        "--refine-knots 1000",
-        "--round-turns 1000",
-        "--round-pictures 1000000000",
-        "--look-pictures 1000000000",
-        "--pixel-stride 4294967295",
-        "--frame-stride 4294967295",
-        "--alpha-min 1",
-        "--w-static 0",
+        "--set max_neighbors=1024 --no-refine",
+        "--set round_fraction=0.99 --count 1",
+        "--set round_fraction=0.1 --count 1",
+        "--set refine_knots=1000",
+        "--set round_turns=1000",
+        "--set round_pictures=1000000000",
+        "--set look_pictures=1000000000",
+        "--set pixel_stride=4294967295",
+        "--set frame_stride=4294967295",
+        "--set alpha_min=1",
+        "--set w_static=0",
     ]
     .into_iter()
     .enumerate()

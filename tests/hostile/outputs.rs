@@ -59,7 +59,7 @@ fn outputs(folder: &Folder) -> Vec<String> {
 /// Arguments of the fastest run that writes four files, or a folder: `count` Gaussians are kept.
 fn compress(output: &str, count: u64) -> String {
     let fast = "--cameras views.json --prune-only --no-refine --threads 1 --quiet";
-    format!("compress in.ply -o {output} --target-count {count} {fast}")
+    format!("compress in.ply -o {output} --count {count} {fast}")
 }
 
 /// Number of Gaussians in a PLY.
@@ -214,7 +214,7 @@ fn a_character_device_is_written_and_stays() {
     if !made {
         symlink("/dev/null", &device).unwrap();
     }
-    for flags in ["", "--overwrite", "--force"] {
+    for flags in ["", "--overwrite", "--overwrite"] {
         folder.attack(&format!("convert in.ply null.ply {flags}")).run().succeeded();
         assert!(fs::metadata(&device).unwrap().file_type().is_char_device());
         assert_eq!(fs::symlink_metadata(&device).unwrap().is_symlink(), !made);
@@ -233,7 +233,7 @@ fn a_fifo_receives_the_result_and_stays() {
         File::open(fifo).unwrap().read_to_end(&mut bytes).unwrap();
         bytes
     });
-    folder.attack("convert in.ply fifo.ply --force").run().succeeded();
+    folder.attack("convert in.ply fifo.ply --overwrite").run().succeeded();
     assert!(reader.join().unwrap() == fs::read(folder.path("expected.ply")).unwrap());
     assert!(fs::symlink_metadata(folder.path("fifo.ply")).unwrap().file_type().is_fifo());
 }
@@ -244,7 +244,7 @@ fn standard_output_as_a_link_receives_only_the_result() {
     symlink("/proc/self/fd/1", folder.path("out.ply")).unwrap();
     let mut command = Command::new(program());
     let output =
-        command.current_dir(folder.path("")).args(["convert", "in.ply", "out.ply", "--force"]).output().unwrap();
+        command.current_dir(folder.path("")).args(["convert", "in.ply", "out.ply", "--overwrite"]).output().unwrap();
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     folder.attack("convert in.ply expected.ply").run().succeeded();
     assert!(output.stdout == fs::read(folder.path("expected.ply")).unwrap());
@@ -257,7 +257,7 @@ fn redirected_standard_output_as_a_link_is_not_replaced() {
     let folder = folder_with_input();
     symlink("/proc/self/fd/1", folder.path("out.ply")).unwrap();
     let file = File::create(folder.path("redirected")).unwrap();
-    let attack = folder.attack("convert in.ply out.ply --force").stdout(file);
+    let attack = folder.attack("convert in.ply out.ply --overwrite").stdout(file);
     attack.run().refused(2, &["out.ply", "a link of the system", "give another output"]);
     assert!(fs::symlink_metadata(folder.path("out.ply")).unwrap().is_symlink());
 }
@@ -266,7 +266,7 @@ fn redirected_standard_output_as_a_link_is_not_replaced() {
 fn a_socket_is_not_replaced() {
     let folder = folder_with_input();
     let _socket = UnixListener::bind(folder.path("out.ply")).unwrap();
-    for flags in ["", "--overwrite", "--force"] {
+    for flags in ["", "--overwrite", "--overwrite"] {
         folder.attack(&format!("convert in.ply out.ply {flags}")).run().refused(2, &["out.ply", "a socket"]);
     }
     assert!(fs::symlink_metadata(folder.path("out.ply")).unwrap().file_type().is_socket());
@@ -276,7 +276,7 @@ fn a_socket_is_not_replaced() {
 fn a_link_to_nothing_is_not_replaced() {
     let folder = folder_with_input();
     symlink("nowhere", folder.path("out.ply")).unwrap();
-    folder.attack("convert in.ply out.ply --force").run().refused(2, &["out.ply", "a link to nothing"]);
+    folder.attack("convert in.ply out.ply --overwrite").run().refused(2, &["out.ply", "a link to nothing"]);
     assert_eq!(fs::read_link(folder.path("out.ply")).unwrap(), Path::new("nowhere"));
 }
 
@@ -286,7 +286,7 @@ fn several_files_do_not_go_into_a_device() {
     symlink("/dev/null", folder.path("out.ply")).unwrap();
     make_fifo(&folder.path("b.ply.summary.json"));
     for output in ["out.ply", "b.ply"] {
-        let line = compress(output, 20) + " --force";
+        let line = compress(output, 20) + " --overwrite";
         folder.attack(&line).run().refused(2, &[output, "a device or FIFO", "several files"]);
     }
     assert_eq!(outputs(&folder), ["b.ply.summary.json", "out.ply"]);
@@ -296,7 +296,7 @@ fn several_files_do_not_go_into_a_device() {
 fn a_folder_does_not_replace_a_device() {
     let folder = folder_with_input();
     make_fifo(&folder.path("out"));
-    folder.attack("unpack in.ply -o out --force").run().refused(2, &["out is no folder"]);
+    folder.attack("convert in.ply out --as ply-sequence --overwrite").run().refused(2, &["out is no folder"]);
     assert!(fs::symlink_metadata(folder.path("out")).unwrap().file_type().is_fifo());
 }
 
@@ -339,24 +339,24 @@ fn a_huge_or_endless_summary_is_not_read() {
     attack.refused(2, &["small.ply", "nothing says"]).within(SMALL_MEMORY.1);
     fs::create_dir(folder.path("frames")).unwrap();
     make_fifo(&folder.path("frames/summary.json"));
-    folder.attack("unpack in.ply -o frames --overwrite").run().refused(2, &["frames is not a result"]);
+    folder.attack("convert in.ply frames --as ply-sequence --overwrite").run().refused(2, &["frames is not a result"]);
 }
 
 #[test]
 fn a_read_only_folder_in_a_result_blocks_no_later_run() {
     let folder = folder_with_input();
     let user = ordinary_user(&folder);
-    folder.attack("unpack in.ply -o frames").with(&user).run().succeeded();
+    folder.attack("convert in.ply frames --as ply-sequence").with(&user).run().succeeded();
     let made = Command::new("mkdir").arg(folder.path("frames/mine")).with_user(&user).status().unwrap();
     assert!(made.success());
     folder.write("frames/mine/notes", "precious");
     fs::set_permissions(folder.path("frames/mine"), fs::Permissions::from_mode(0o555)).unwrap();
     for _ in 0..2 {
-        folder.attack("unpack in.ply -o frames --overwrite").with(&user).run().succeeded();
+        folder.attack("convert in.ply frames --as ply-sequence --overwrite").with(&user).run().succeeded();
         assert_eq!(fs::read(folder.path("frames/mine/notes")).unwrap(), b"precious");
         assert_eq!(fs::metadata(folder.path("frames/mine")).unwrap().permissions().mode() & 0o777, 0o555);
     }
-    folder.attack("unpack in.ply -o frames --force").with(&user).run().succeeded();
+    folder.attack("convert in.ply frames --as ply-sequence --overwrite").with(&user).run().succeeded();
     assert_eq!(outputs(&folder), ["frames"]);
     assert!(!folder.path("frames/mine").exists());
 }
@@ -368,13 +368,13 @@ fn a_folder_of_another_user_is_kept_beside_the_result() {
     }
     let folder = folder_with_input();
     let user = ordinary_user(&folder);
-    folder.attack("unpack in.ply -o frames").with(&user).run().succeeded();
+    folder.attack("convert in.ply frames --as ply-sequence").with(&user).run().succeeded();
     folder.write("frames/theirs/notes", "precious");
-    let outcome = folder.attack("unpack in.ply -o frames --overwrite").with(&user).run().succeeded();
+    let outcome = folder.attack("convert in.ply frames --as ply-sequence --overwrite").with(&user).run().succeeded();
     let parts = ["warning: frames is in place", "frames.kept"];
     assert!(parts.iter().all(|part| outcome.stderr.contains(part)), "{}", outcome.stderr);
     assert_eq!(fs::read(folder.path("frames.kept/theirs/notes")).unwrap(), b"precious");
-    let outcome = folder.attack("unpack in.ply -o frames --overwrite").with(&user).run().succeeded();
+    let outcome = folder.attack("convert in.ply frames --as ply-sequence --overwrite").with(&user).run().succeeded();
     assert!(!outcome.stderr.contains("warning"), "{}", outcome.stderr);
     assert_eq!(outputs(&folder), ["frames", "frames.kept"]);
 }
@@ -382,10 +382,10 @@ fn a_folder_of_another_user_is_kept_beside_the_result() {
 #[test]
 fn folders_for_caches_and_scratch_files_lie_outside_inputs() {
     let folder = folder_with_input();
-    folder.attack("unpack in.ply -o frames").run().succeeded();
+    folder.attack("convert in.ply frames --as ply-sequence").run().succeeded();
     let before = tree(&folder.path("frames"));
     for (option, place) in
-        [("--work", "frames/cache"), ("--work", "frames"), ("--scratch-dir", "frames"), ("--scratch-dir", "link/.")]
+        [("--cache", "frames/cache"), ("--cache", "frames"), ("--scratch-dir", "frames"), ("--scratch-dir", "link/.")]
     {
         _ = symlink(folder.path("frames"), folder.path("link"));
         let attack = folder.attack(&format!("compress frames -o small --no-refine {option} {place}"));
@@ -490,10 +490,11 @@ fn foreign_entries(folder: &Folder) -> Vec<BTreeMap<PathBuf, Vec<u8>>> {
 
 /// Arguments of a run of the stress test.
 fn stress_line(random: &mut Random, output: &str) -> String {
-    // --force would replace the folder with the foreign file in it.
-    let flags = ["--overwrite", "", "--overwrite", "--force"][random.below(if output == "d" { 3 } else { 4 }) as usize];
+    // --overwrite would replace the folder with the foreign file in it.
+    let flags =
+        ["--overwrite", "", "--overwrite", "--overwrite"][random.below(if output == "d" { 3 } else { 4 }) as usize];
     let kind = if output == "d" { "--as ply-sequence" } else { "" };
-    let cache = ["", "--work cache-1", "--work cache-2"][random.below(3) as usize];
+    let cache = ["", "--cache cache-1", "--cache cache-2"][random.below(3) as usize];
     format!("{} {kind} {flags} {cache}", compress(output, 5 + random.below(31)))
 }
 
@@ -551,7 +552,7 @@ fn slow_killed_parallel_runs_neither_mix_nor_lose_files() {
     }
     println!("{runs} runs, {kills} killed, {published} published, {:.1} s", start.elapsed().as_secs_f64());
     for cache in ["cache-1", "cache-2"] {
-        folder.attack(&format!("{} --force --work {cache}", compress("a.ply", 20))).run().succeeded();
+        folder.attack(&format!("{} --overwrite --cache {cache}", compress("a.ply", 20))).run().succeeded();
         let names = fs::read_dir(folder.path(cache)).unwrap().map(|entry| entry.unwrap().file_name());
         let left: Vec<_> = names.filter(|name| name.to_string_lossy().contains("splatsieve-tmp")).collect();
         assert!(left.is_empty(), "leftovers in {cache}: {left:?}");

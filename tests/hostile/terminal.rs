@@ -14,7 +14,7 @@ use serde_json::Value;
 use crate::runner::{Attack, Folder, Outcome, full_device, tiny_model};
 
 /// Options that make a run on the tiny model short.
-const SHORT: &str = "--no-refine --prune-only --target-ratio 0.5";
+const SHORT: &str = "--no-refine --prune-only --ratio 0.5";
 
 #[test]
 fn the_runner_reports_code_message_and_memory() {
@@ -151,29 +151,29 @@ fn a_run_with_broken_streams_writes_its_whole_result() {
 #[ignore = "slow: every command with every broken stream"]
 fn slow_every_command_survives_broken_streams() {
     let folder = Folder::new();
-    folder.attack("pack {tiny} --cameras {tiny} -o scene.gseq").run().succeeded();
+    folder.attack("convert {tiny} scene.gseq --cameras {tiny}").run().succeeded();
     folder.attack(&format!("compress {{tiny}} --cameras {{tiny}} {SHORT} -o small")).run().succeeded();
-    folder.attack("unpack {tiny} --cameras {tiny} -o frames").run().succeeded();
+    folder.attack("convert {tiny} frames --cameras {tiny} --as ply-sequence").run().succeeded();
     let commands = [
-        format!("compress {{tiny}} --cameras {{tiny}} {SHORT} -o out --force --explain"),
-        format!("compress {{tiny}} --cameras {{tiny}} {SHORT} -o out --force --json"),
-        "compress {tiny} --cameras {tiny} --list-stages -o out --force".to_owned(),
-        "score {tiny} --cameras {tiny} -o out.csv --force".to_owned(),
-        "render {tiny} --cameras {tiny} --view 0 --frame 0 -o out.png --force".to_owned(),
-        "render {tiny} --cameras {tiny} --view 0 --video out.gif --force".to_owned(),
+        format!("compress {{tiny}} --cameras {{tiny}} {SHORT} -o out --overwrite --explain"),
+        format!("compress {{tiny}} --cameras {{tiny}} {SHORT} -o out --overwrite --json"),
+        "compress {tiny} --cameras {tiny} --list-stages -o out --overwrite".to_owned(),
+        "score {tiny} --cameras {tiny} -o out.csv --overwrite".to_owned(),
+        "render {tiny} --cameras {tiny} --view 0 --frame 0 -o out.png --overwrite".to_owned(),
+        "render {tiny} --cameras {tiny} --view 0 --video out.gif --overwrite".to_owned(),
         "evaluate {tiny} small --cameras {tiny} --max-frames 2".to_owned(),
-        "evaluate {tiny} small --cameras {tiny} --max-frames 2 --json --csv out.csv --force".to_owned(),
-        "report {tiny} small --cameras {tiny} --max-frames 2 -o out --force".to_owned(),
-        "sweep {tiny} --cameras {tiny} -o out --force --methods random --fractions 0.5 --max-frames 1".to_owned(),
-        "view {tiny} small --cameras {tiny} -o out.html --force".to_owned(),
-        "convert frames/frame_00000.ply out.spz --force".to_owned(),
-        "convert {tiny} out.gseq --cameras {tiny} --force --json".to_owned(),
-        "pack {tiny} --cameras {tiny} -o out.gseq --force".to_owned(),
+        "evaluate {tiny} small --cameras {tiny} --max-frames 2 --json --csv out.csv --overwrite".to_owned(),
+        "report {tiny} small --cameras {tiny} --max-frames 2 -o out --overwrite".to_owned(),
+        "sweep {tiny} --cameras {tiny} -o out --overwrite --methods random --fractions 0.5 --max-frames 1".to_owned(),
+        "view {tiny} small --cameras {tiny} -o out.html --overwrite".to_owned(),
+        "convert frames/frame_00000.ply out.spz --overwrite".to_owned(),
+        "convert {tiny} out.gseq --cameras {tiny} --overwrite --json".to_owned(),
+        "convert {tiny} out.gseq --cameras {tiny} --overwrite".to_owned(),
         "info scene.gseq".to_owned(),
-        "verify scene.gseq --json".to_owned(),
-        "unpack scene.gseq -o out --force".to_owned(),
-        "unpack scene.gseq --stream".to_owned(),
-        "recover scene.gseq -o out.gseq --force".to_owned(),
+        "info scene.gseq --check --json".to_owned(),
+        "convert scene.gseq out --as ply-sequence --overwrite".to_owned(),
+        "convert scene.gseq -".to_owned(),
+        "info scene.gseq --repair out.gseq --overwrite".to_owned(),
         "demo --gaussians 100 --frames 1 --no-refine".to_owned(),
         "selfcheck --json".to_owned(),
         "man pages".to_owned(),
@@ -215,20 +215,20 @@ fn names_in_messages_control_no_terminal() {
     for words in [
         &["info", EVIL][..],
         &["info", &in_folder],
-        &["verify", EVIL],
-        &["recover", EVIL, "-o", EVIL],
+        &["info", EVIL, "--check"],
+        &["info", EVIL, "--repair", EVIL],
         &["compress", EVIL, "-o", "small"],
         &["compress", tiny, "-o", &in_folder],
         &["compress", "x", "--recipe", EVIL, "-o", "y"],
         &["compress", "x", "-o", "y", "--keep-ids", EVIL],
         &["evaluate", EVIL, EVIL, "--cameras", EVIL],
         &["view", EVIL, "-o", "x.html"],
-        &["work", EVIL],
+        &["cache", EVIL],
         // What clap says of arguments.
         &[EVIL],
         &["info", "x", EVIL],
         &["recipe", EVIL],
-        &["compress", "x", "-o", "y", "--target-ratio", EVIL],
+        &["compress", "x", "-o", "y", "--ratio", EVIL],
     ] {
         let outcome = run_words(&folder, words);
         assert!(matches!(outcome.code, Some(1 | 2)), "{words:?}: {:?}", outcome.code);
@@ -354,7 +354,7 @@ fn outputs_name_no_folder_of_the_machine() {
     let secret = Secret::new();
     secret.run(&format!("compress {{m}} --cameras {{m}} {SHORT} -o {{o}}/small"));
     secret.run("render {m} --cameras {m} --frame 0 --view 0 -o {o}/picture.png");
-    secret.run("unpack {m} --cameras {m} -o {o}/frames");
+    secret.run("convert {m} {o}/frames --cameras {m} --as ply-sequence");
     secret.check(true);
     let recipe = fs::read_to_string(secret.place.join("out/small/recipe.toml")).unwrap();
     assert!(recipe.contains("cameras = \"../../model\""), "{recipe}");
@@ -368,7 +368,7 @@ fn outputs_name_no_folder_of_the_machine() {
 fn slow_outputs_of_all_commands_name_no_folder() {
     let secret = Secret::new();
     for arguments in [
-        "compress {m} --cameras {m} SHORT -o {o}/small --view --work {m}/../work",
+        "compress {m} --cameras {m} SHORT -o {o}/small --view --cache {m}/../work",
         "compress {m} --cameras {m} SHORT -o {o}/small.gseq",
         "compress {m} --cameras {m} SHORT -o {o}/small.splatv",
         "compress {m} --cameras {m} SHORT -o {o}/small.4dgs",
@@ -376,12 +376,12 @@ fn slow_outputs_of_all_commands_name_no_folder() {
         "demo -o {o}/demo --gaussians 100 --frames 2 --no-refine",
         "convert {m} {o}/scene.splatv --cameras {m}",
         "convert {m} {o}/scene.4dgs --cameras {m}",
-        "unpack {m} --cameras {m} -o {o}/frames",
+        "convert {m} {o}/frames --cameras {m} --as ply-sequence",
         "convert {o}/frames/frame_00000.ply {o}/one.spz",
         "compress {o}/frames/frame_00000.ply SHORT --archive-psnr 30 -o {o}/one.gsz",
-        "pack {m} --cameras {m} -o {o}/scene.gseq",
-        "pack {o}/frames -o {o}/frames.gseq",
-        "recover {o}/scene.gseq -o {o}/recovered.gseq",
+        "convert {m} {o}/scene.gseq --cameras {m}",
+        "convert {o}/frames {o}/frames.gseq",
+        "info {o}/scene.gseq --repair {o}/recovered.gseq",
         "score {m} --cameras {m} -o {o}/rows.npz",
         "score {m} --cameras {m} -o {o}/rows.csv",
         "render {m} --cameras {m} --all -o {o}/photos",
@@ -407,7 +407,7 @@ fn slow_outputs_of_all_commands_name_no_folder() {
 fn slow_archives_name_no_folder_of_the_training_machine() {
     let secret = Secret::new();
     secret.run(&format!("compress {{m}} --cameras {{m}} {SHORT} --archive-psnr 30 -o {{o}}/small.gsz"));
-    secret.run("unpack {o}/small.gsz -o {o}/small");
+    secret.run("convert {o}/small.gsz {o}/small");
     secret.check(false);
     let config = fs::read_to_string(secret.place.join("out/small/cfg_args")).unwrap();
     assert!(config.contains("source_path='model', model_path='tiny'"), "{config}");

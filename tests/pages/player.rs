@@ -235,7 +235,7 @@ fn a_trained_model_looks_as_its_rasteriser_renders_it() {
             "-o".as_ref(),
             "scene.html".as_ref(),
         ];
-        let run = at.run_words(words.into_iter().chain(["--max-frames", "4", "--force"].map(str::as_ref)));
+        let run = at.run_words(words.into_iter().chain(["--max-frames", "4", "--overwrite"].map(str::as_ref)));
         assert_eq!(run.code, 0, "{}", run.stderr);
         let scene = opened(&model, &model);
         let mut page = Browser::start_drawing(&program);
@@ -306,13 +306,13 @@ fn a_page_that_would_be_too_large_is_a_folder_and_what_is_there_stays() {
 #[test]
 fn every_family_can_be_viewed_and_compress_writes_the_page_beside_its_result() {
     let at = Workplace::new();
-    at.done("compress {tiny} --cameras {tiny} -o small --target-ratio 0.5 --view");
+    at.done("compress {tiny} --cameras {tiny} -o small --ratio 0.5 --view");
     let told = fs::read_to_string(at.path("small.html")).unwrap();
     assert!(told.contains("\"role\":\"original\"") && told.contains("\"role\":\"compressed\""));
-    at.done("compress {tiny} --cameras {tiny} -o small.gsz --target-ratio 0.5 --view=both.html");
+    at.done("compress {tiny} --cameras {tiny} -o small.gsz --ratio 0.5 --view=both.html");
     assert!(at.path("both.html").exists());
-    at.done("unpack small --cameras {tiny} -o frames");
-    at.done("pack small --cameras {tiny} -o small.gseq");
+    at.done("convert small frames --cameras {tiny} --as ply-sequence");
+    at.done("convert small small.gseq --cameras {tiny}");
     fs::copy(at.path("frames/frame_00000.ply"), at.path("one.ply")).unwrap();
     for (k, input) in ["small.gsz", "frames", "small.gseq", "one.ply"].iter().enumerate() {
         at.done(&format!("view {input} -o {k}.html"));
@@ -330,7 +330,7 @@ fn every_family_can_be_viewed_and_compress_writes_the_page_beside_its_result() {
 fn pages_of_hostile_names_break_no_policy_in_a_browser() {
     let program = browser::installed();
     let at = Workplace::new();
-    at.done("unpack {tiny} --cameras {tiny} -o frames --frames 2");
+    at.done("convert {tiny} frames --cameras {tiny} --as ply-sequence --frames 2");
     let name = "<script>window.ran=1<img src=x onerror=window.ran=2>'\"&";
     fs::rename(at.path("frames"), at.path(name)).unwrap();
     for output in ["page.html", "pages"] {

@@ -11,7 +11,7 @@ use serde_json::{Value, json};
 fn compressed() -> Workplace {
     let at = Workplace::new();
     at.done("demo -o d --gaussians 1200 --frames 5");
-    at.done("compress d/scene.gseq --cameras d/cameras.json --choose-by-views=false --no-refine -o small.gseq");
+    at.done("compress d/scene.gseq --cameras d/cameras.json --set choose_by_views=false --no-refine -o small.gseq");
     at
 }
 

@@ -161,7 +161,7 @@ fn background_is_the_asked_one_else_the_cameras_else_that_of_the_model_beside_th
     let corner = |extra: &str| {
         done(
             folder.path(),
-            &format!("render scene.gseq --cameras cameras.json --frame 0 --view 3 -o x.png --force {extra}"),
+            &format!("render scene.gseq --cameras cameras.json --frame 0 --view 3 -o x.png --overwrite {extra}"),
         );
         bytes(&folder.path().join("x.png"))[..3].to_vec()
     };

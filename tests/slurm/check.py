@@ -52,7 +52,7 @@ class Bench:
         return self.cluster.run(SCRIPTS / script, "--submit", *words, cwd=self.folder).split()[-1]
 
     def long(self, work, output, words, *options):
-        options = ["--work", work, "--program", self.program, *options]
+        options = ["--cache", work, "--program", self.program, *options]
         return self.submit("long_scene.py", *options, "--", *words, "-o", output)
 
     def meet(self, job_name, act, which=lambda _: True, once=False):
@@ -178,9 +178,9 @@ def one_broken_scene_of_four_is_told(bench):
     listed.write_text(
         "# What there is\n\n"
         '"demo scene/scene.gseq" "demo scene/cameras.json" "small 1.gseq" --no-refine\n'
-        "demo\\ scene/scene.gseq - small2.gseq --no-refine --target-ratio 0.3\n"
+        "demo\\ scene/scene.gseq - small2.gseq --no-refine --ratio 0.3\n"
         '"broken scene.gseq" - small3.gseq\n'
-        "  'demo scene/scene.gseq' 'demo scene/cameras.json' small4.gseq --no-refine --target-count 500\n"
+        "  'demo scene/scene.gseq' 'demo scene/cameras.json' small4.gseq --no-refine --count 500\n"
     )
     run = Path(f"{listed}.run")
 

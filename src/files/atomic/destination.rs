@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use splat_platform::{FileKind, is_system_folder};
 
-use super::named::{MARKER, Owner, entries, is_our_file, parts};
+use super::named::{MARKER, Owner, entries, parts};
 use crate::error::{Error, Result, ShowPath};
 
 /// Kind of an output.
@@ -23,12 +23,10 @@ pub enum Replace {
     /// Nothing is replaced.
     #[default]
     Never,
-    /// Results of this program are replaced. In a result's folder these are the files that its summary lists; every
-    /// other file stays where it is, or gets `.kept` behind its name where the new result has a file of that name. A
-    /// single file is known as a result if it is a container or if a summary beside it lists it.
-    Ours,
-    /// Any file or folder is replaced, a folder with everything in it.
-    Any,
+    /// A file is replaced, whatever it holds: the user named it. In a folder that holds an earlier result, the files that
+    /// its summary lists are replaced; every other file stays where it is, or gets `.kept` behind its name where the new
+    /// result has a file of that name. A folder without such a summary is refused unless it is empty.
+    Existing,
 }
 
 /// What lies at an output path.
@@ -105,7 +103,7 @@ pub(super) fn check_replace(target: &Path, kind: Kind, replace: Replace) -> Resu
         (Kind::Folder, Destination::Folder) if is_empty_folder(target) => Ok(()),
         (_, Destination::File | Destination::Folder | Destination::FolderLink) if replace == Replace::Never => {
             Err(Error::usage(format!(
-                "{shown} exists already\n  --overwrite replaces a result of splatsieve, --force whatever is there"
+                "{shown} exists already\n  --overwrite replaces a file, or the files of an earlier result in a folder; or name another output"
             )))
         }
         (Kind::File, Destination::Folder | Destination::FolderLink) => {
@@ -114,12 +112,7 @@ pub(super) fn check_replace(target: &Path, kind: Kind, replace: Replace) -> Resu
         (Kind::Folder, Destination::File | Destination::FolderLink | Destination::Stream) => {
             Err(Error::usage(format!("{shown} is no folder; a folder cannot replace it")))
         }
-        _ if replace == Replace::Any => Ok(()),
-        (Kind::File, Destination::File) if is_our_file(target) => Ok(()),
-        (Kind::File, Destination::File) => Err(Error::usage(format!(
-            "{shown} exists already, and nothing says that splatsieve wrote it: it is no container, and no summary beside \
-             it lists it\n  --force replaces it all the same; or give another output"
-        ))),
+        (Kind::File, Destination::File) => Ok(()),
         (Kind::Folder, Destination::Folder) => check_folder(target),
     }
 }
@@ -130,8 +123,8 @@ fn check_folder(target: &Path) -> Result<()> {
     match Owner::read(&target.join(MARKER)) {
         Owner::Listed(_) => Ok(()),
         Owner::Unknown => Err(Error::usage(format!(
-            "{shown} is not a result of splatsieve (no {MARKER} of its own that lists its files), so --overwrite leaves it alone\n  \
-             --force replaces it with all that is in it; or give another output"
+            "{shown} is not a result of splatsieve (no {MARKER} in it that lists its files), so --overwrite leaves it as it is\n  \
+             remove the folder first, or name another output"
         ))),
     }
 }

@@ -12,8 +12,8 @@ use super::destination::{Kind, Replace, check_replace};
 use super::named::{MARKER, carry_foreign, parts};
 use super::warnings::warn;
 use super::workspace::{
-    DISCARDED, JOURNAL, Leftover, REPLACED, REPLACED_WHOLE, Refusal, SCRATCH, Workspace, is_unfinished, is_workspace,
-    publishing_name, target_name,
+    DISCARDED, JOURNAL, Leftover, REPLACED, Refusal, SCRATCH, Workspace, is_unfinished, is_workspace, publishing_name,
+    target_name,
 };
 use crate::error::{Error, Result, ShowPath};
 
@@ -152,17 +152,10 @@ pub(super) fn settle(folder: &FolderHandle, parent: &FolderHandle, target: &Path
     if folder.has(JOURNAL) {
         complete(folder, parent, target)?;
     }
-    for aside in [REPLACED, REPLACED_WHOLE] {
-        if folder.has(aside) && !parent.has(name) {
-            folder.rename(aside, parent, name).map_err(Error::io("put back", target))?;
-        }
+    if folder.has(REPLACED) && !parent.has(name) {
+        folder.rename(REPLACED, parent, name).map_err(Error::io("put back", target))?;
     }
     // In one step: a part of an earlier result must not be taken for a result.
-    let discard =
-        |aside| folder.rename(aside, folder, DISCARDED).map_err(Error::io("discard the earlier folder of", target));
-    if folder.has(REPLACED_WHOLE) {
-        return discard(REPLACED_WHOLE);
-    }
     if !folder.has(REPLACED) {
         return Ok(());
     }
@@ -172,7 +165,7 @@ pub(super) fn settle(folder: &FolderHandle, parent: &FolderHandle, target: &Path
         false => Err(io::Error::from(io::ErrorKind::NotADirectory)),
     };
     let Err(refused) = carried else {
-        return discard(REPLACED);
+        return folder.rename(REPLACED, folder, DISCARDED).map_err(Error::io("discard the earlier folder of", target));
     };
     let _ = old.remove(MARKER);
     let mut kept = name.to_owned();

@@ -61,21 +61,6 @@ impl Owner {
     }
 }
 
-/// Whether a file is known as this program's: a container that opens, or one that a summary beside it names.
-pub(super) fn is_our_file(path: &Path) -> bool {
-    if !path.is_file() {
-        return false;
-    }
-    if gseq::Reader::open(path).is_ok() {
-        return true;
-    }
-    let Some(name) = path.file_name().and_then(OsStr::to_str) else { return false };
-    // Of x.ply and of x.ply.recipe.toml it is x.ply.summary.json.
-    let ends = name.match_indices('.').map(|(dot, _)| dot).chain([name.len()]);
-    ends.map(|end| path.with_file_name(format!("{}.{MARKER}", &name[..end])))
-        .any(|summary| matches!(Owner::read(&summary), Owner::Listed(files) if files.contains(name)))
-}
-
 /// Writes into the summary at `path` that these are its files.
 pub(super) fn name_files(path: &Path, files: &[String]) -> Result<()> {
     let text = fs::read_to_string(path).map_err(Error::io("read back", path))?;

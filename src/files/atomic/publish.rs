@@ -10,7 +10,7 @@ use super::destination::{Kind, Replace, check_replace};
 use super::leftovers::{Journal, PublishLock, repair, settle};
 use super::named::{parts, present};
 use super::warnings::warn;
-use super::workspace::{JOURNAL, REPLACED, REPLACED_WHOLE, Workspace, live};
+use super::workspace::{JOURNAL, REPLACED, Workspace, live};
 use crate::error::{Error, Result, ShowPath};
 
 /// Gives files in `workspace` the names beside it that go with them, in order; the last one is the output itself, the others
@@ -73,7 +73,7 @@ pub(super) fn publish_folder(workspace: &Workspace, target: &Path, replace: Repl
     repair(target, true);
     check_replace(target, Kind::Folder, replace)?;
     let held = live();
-    let aside = workspace.folder.join(if replace == Replace::Any { REPLACED_WHOLE } else { REPLACED });
+    let aside = workspace.folder.join(REPLACED);
     if present(target) {
         workspace.sync().map_err(Error::io("sync", &workspace.folder))?;
         fs::rename(target, &aside).map_err(Error::io("move aside", target))?;

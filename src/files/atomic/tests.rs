@@ -46,30 +46,15 @@ fn what_is_dropped_leaves_nothing_and_the_old_output_whole() {
     let (file, folder) = (base.path().join("out.ply"), base.path().join("out"));
     put(&file, "old");
     result_folder(&folder, "old");
-    let staged = StagedFile::new(&file, Replace::Any).unwrap();
+    let staged = StagedFile::new(&file, Replace::Existing).unwrap();
     fs::write(staged.path(), "new").unwrap();
     drop(staged);
-    let staged = StagedFolder::new(&folder, Replace::Ours).unwrap();
+    let staged = StagedFolder::new(&folder, Replace::Existing).unwrap();
     put(&staged.path().join("deep/content"), "new");
     drop(staged);
     assert_eq!(names(base.path()), ["out", "out.ply"]);
     assert_eq!(fs::read_to_string(file).unwrap(), "old");
     assert_eq!(fs::read_to_string(folder.join("content")).unwrap(), "old");
-}
-
-#[test]
-fn force_replaces_the_whole_folder() {
-    let base = tempfile::tempdir().unwrap();
-    let target = base.path().join("out");
-    result_folder(&target, "old");
-    put(&target.join("only in the old one"), "");
-    check_target(&target, Kind::Folder, &[], Replace::Any).unwrap();
-    let staged = StagedFolder::new(&target, Replace::Any).unwrap();
-    result_folder(staged.path(), "new");
-    staged.commit().unwrap();
-    assert_eq!(names(&target), ["content", MARKER]);
-    assert_eq!(fs::read_to_string(target.join("content")).unwrap(), "new");
-    assert_eq!(names(base.path()), ["out"]);
 }
 
 #[test]
@@ -84,8 +69,7 @@ fn an_existing_target_is_refused_before_work_and_again_at_commit() {
     assert_eq!(fs::read_to_string(&target).unwrap(), "somebody else's");
     assert!(refusal(&target, Kind::File, &[], Replace::Never).contains("--overwrite"));
     assert!(StagedFile::new(&target, Replace::Never).is_err());
-    assert!(refusal(&target, Kind::File, &[], Replace::Ours).contains("nothing says that splatsieve wrote it"));
-    check_target(&target, Kind::File, &[], Replace::Any).unwrap();
+    check_target(&target, Kind::File, &[], Replace::Existing).unwrap();
     assert_eq!(names(base.path()), ["out.ply"]);
 }
 
@@ -96,7 +80,7 @@ fn the_input_what_holds_it_and_what_lies_in_it_are_never_a_target() {
     let cloud = model.join("point_cloud.ply");
     result_folder(&model, "");
     put(&cloud, "");
-    for replace in [Replace::Never, Replace::Ours, Replace::Any] {
+    for replace in [Replace::Never, Replace::Existing] {
         assert!(refusal(&model, Kind::Folder, &[&model], replace).contains("input itself"));
         assert!(refusal(&cloud, Kind::File, &[&cloud], replace).contains("input itself"));
         assert!(refusal(&model, Kind::Folder, &[&cloud], replace).contains("contains the input"));
@@ -116,8 +100,8 @@ fn a_link_to_the_input_is_the_input() {
     let (model, link) = (base.path().join("model"), base.path().join("link"));
     result_folder(&model, "");
     std::os::unix::fs::symlink(&model, &link).unwrap();
-    assert!(refusal(&link, Kind::Folder, &[&model], Replace::Ours).contains("input itself"));
-    assert!(refusal(&model, Kind::Folder, &[&link], Replace::Ours).contains("input itself"));
+    assert!(refusal(&link, Kind::Folder, &[&model], Replace::Existing).contains("input itself"));
+    assert!(refusal(&model, Kind::Folder, &[&link], Replace::Existing).contains("input itself"));
 }
 
 #[test]
@@ -125,27 +109,29 @@ fn overwrite_deletes_only_folders_this_program_wrote() {
     let base = tempfile::tempdir().unwrap();
     let home = base.path().join("home");
     put(&home.join("thesis.txt"), "years of work");
-    assert!(refusal(&home, Kind::Folder, &[], Replace::Ours).contains("not a result of splatsieve"));
+    assert!(refusal(&home, Kind::Folder, &[], Replace::Existing).contains("not a result of splatsieve"));
     let unlisted = r#"{"tool": "splatsieve 0.1.0"}"#;
     for foreign in ["{}", "[]", "no json", r#"{"tool": "another"}"#, r#"{"tool": 1}"#, unlisted] {
         put(&home.join(MARKER), foreign);
-        assert!(refusal(&home, Kind::Folder, &[], Replace::Ours).contains("not a result of splatsieve"), "{foreign}");
+        assert!(
+            refusal(&home, Kind::Folder, &[], Replace::Existing).contains("not a result of splatsieve"),
+            "{foreign}"
+        );
     }
-    check_target(&home, Kind::Folder, &[], Replace::Any).unwrap();
     put(&home.join(MARKER), r#"{"tool": "splatsieve 0.1.0", "files": ["summary.json"]}"#);
-    check_target(&home, Kind::Folder, &[], Replace::Ours).unwrap();
+    check_target(&home, Kind::Folder, &[], Replace::Existing).unwrap();
     let empty = base.path().join("empty");
     fs::create_dir(&empty).unwrap();
-    check_target(&empty, Kind::Folder, &[], Replace::Ours).unwrap();
-    assert!(refusal(&home, Kind::File, &[], Replace::Ours).contains("is a folder"));
-    assert!(refusal(&home.join("thesis.txt"), Kind::Folder, &[], Replace::Ours).contains("is no folder"));
+    check_target(&empty, Kind::Folder, &[], Replace::Existing).unwrap();
+    assert!(refusal(&home, Kind::File, &[], Replace::Existing).contains("is a folder"));
+    assert!(refusal(&home.join("thesis.txt"), Kind::Folder, &[], Replace::Existing).contains("is no folder"));
 }
 
 #[test]
 fn a_folder_that_became_foreign_during_the_run_is_left_alone() {
     let base = tempfile::tempdir().unwrap();
     let target = base.path().join("out");
-    let staged = StagedFolder::new(&target, Replace::Ours).unwrap();
+    let staged = StagedFolder::new(&target, Replace::Existing).unwrap();
     result_folder(staged.path(), "new");
     put(&target.join("thesis.txt"), "years of work");
     staged.commit().unwrap_err();
@@ -160,7 +146,7 @@ fn impossible_targets_are_refused() {
     assert!(refusal(&base.path().join("no/such/out"), Kind::Folder, &[], Replace::Never).contains("create it first"));
     assert!(refusal(&base.path().join("file/out"), Kind::File, &[], Replace::Never).contains("is not a folder"));
     for nameless in ["", "/", ".."] {
-        assert!(refusal(Path::new(nameless), Kind::Folder, &[], Replace::Ours).contains("no name"), "{nameless}");
+        assert!(refusal(Path::new(nameless), Kind::Folder, &[], Replace::Existing).contains("no name"), "{nameless}");
     }
 }
 
@@ -211,7 +197,7 @@ fn a_run_killed_between_its_renames_does_not_lose_the_old_output() {
         let base = tempfile::tempdir().unwrap();
         let target = base.path().join("out");
         result_folder(&left_behind(base.path(), "dead").join(aside), "old");
-        drop(StagedFolder::new(&target, Replace::Ours).unwrap());
+        drop(StagedFolder::new(&target, Replace::Existing).unwrap());
         assert_eq!(names(base.path()), ["out"]);
         assert_eq!(fs::read_to_string(target.join("content")).unwrap(), "old");
     }
@@ -241,7 +227,7 @@ fn a_run_killed_after_its_renames_has_the_new_output_and_does_not_lose_foreign_f
         let old = left_behind(base.path(), "dead").join(aside);
         result_folder(&old, "old");
         put(&old.join("test/one.png"), "precious");
-        drop(StagedFolder::new(&target, Replace::Ours).unwrap());
+        drop(StagedFolder::new(&target, Replace::Existing).unwrap());
         assert_eq!(names(base.path()), ["out"]);
         assert_eq!(fs::read_to_string(target.join("content")).unwrap(), "new");
         assert_eq!(target.join("test/one.png").exists(), is_carried, "{aside}");
@@ -260,7 +246,7 @@ fn what_another_put_into_a_result_stays_and_where_the_new_one_has_its_place_lies
     let foreign = ["a/theirs", "a/b/own2", "all/theirs/deep", "file", "folder/theirs", "file in the new one/theirs"];
     foreign.iter().for_each(|name| put(&target.join(name), name));
     fs::create_dir(target.join("empty")).unwrap();
-    let staged = StagedFolder::new(&target, Replace::Ours).unwrap();
+    let staged = StagedFolder::new(&target, Replace::Existing).unwrap();
     for name in [MARKER, "a/own", "file", "folder/own", "file in the new one"] {
         put(&staged.path().join(name), r#"{"tool": "splatsieve 0.1.0"}"#);
     }
@@ -318,22 +304,14 @@ fn stage_set(base: &Path, text: &str, replace: Replace) -> Result<StagedFiles> {
 }
 
 #[test]
-fn files_side_by_side_are_known_by_the_summary_that_lists_them() {
+fn overwriting_a_file_replaces_it_with_its_companions() {
     let base = tempfile::tempdir().unwrap();
-    let target = |name: &str| base.path().join(name);
-    let names_of = ["x.ply", "x.ply.recipe.toml", "x.ply.summary.json"];
-    stage_set(base.path(), "", Replace::Never).unwrap().commit().unwrap();
-    assert_eq!(names(base.path()), names_of);
-    put(&target("x.ply.notes"), "precious");
-    put(&target("x.csv"), "precious");
-    for name in names_of {
-        check_target(&target(name), Kind::File, &[], Replace::Ours).unwrap();
-    }
-    for name in ["x.ply.notes", "x.csv"] {
-        assert!(refusal(&target(name), Kind::File, &[], Replace::Ours).contains("--force"));
-        check_target(&target(name), Kind::File, &[], Replace::Any).unwrap();
-    }
-    drop(stage_set(base.path(), "", Replace::Ours));
+    put(&base.path().join("x.ply"), "written by another program");
+    put(&base.path().join("x.ply.notes"), "precious");
+    stage_set(base.path(), "new", Replace::Existing).unwrap().commit().unwrap();
+    assert_eq!(names(base.path()), ["x.ply", "x.ply.notes", "x.ply.recipe.toml", "x.ply.summary.json"]);
+    assert_eq!(fs::read_to_string(base.path().join("x.ply")).unwrap(), "new");
+    assert_eq!(fs::read_to_string(base.path().join("x.ply.notes")).unwrap(), "precious");
 }
 
 /// What a run leaves in `base` that is killed after it published `published` of its companions.
@@ -365,10 +343,10 @@ fn a_killed_publication_is_completed_by_the_next_run() {
 #[test]
 fn a_killed_publication_is_never_completed_over_a_later_one() {
     let base = tempfile::tempdir().unwrap();
-    let staged = stage_set(base.path(), "new", Replace::Any).unwrap();
-    leave_half_published(base.path(), 1, Replace::Any);
+    let staged = stage_set(base.path(), "new", Replace::Existing).unwrap();
+    leave_half_published(base.path(), 1, Replace::Existing);
     staged.commit().unwrap();
-    check_target(&base.path().join("x.ply"), Kind::File, &[], Replace::Any).unwrap();
+    check_target(&base.path().join("x.ply"), Kind::File, &[], Replace::Existing).unwrap();
     assert_eq!(names(base.path()), ["x.ply", "x.ply.recipe.toml", "x.ply.summary.json"]);
     assert_eq!(fs::read_to_string(base.path().join("x.ply")).unwrap(), "new");
     assert_eq!(fs::read_to_string(base.path().join("x.ply.recipe.toml")).unwrap(), "new");
@@ -379,7 +357,7 @@ fn a_killed_publication_does_not_replace_a_file_that_came_later() {
     let base = tempfile::tempdir().unwrap();
     leave_half_published(base.path(), 1, Replace::Never);
     put(&base.path().join("x.ply"), "precious");
-    refusal(&base.path().join("x.ply"), Kind::File, &[], Replace::Ours);
+    refusal(&base.path().join("x.ply"), Kind::File, &[], Replace::Never);
     assert_eq!(fs::read_to_string(base.path().join("x.ply")).unwrap(), "precious");
     assert!(take_warnings().iter().any(|warning| warning.contains("could not be repaired")));
 }

@@ -34,14 +34,12 @@ pub(super) const LOCK_LINE: &str = "workspace of a splatsieve run\n";
 pub(super) const CONTENT: &str = "content";
 /// Earlier folder that is being replaced; entries that its summary does not list are moved into the new one.
 pub(super) const REPLACED: &str = "replaced";
-/// Earlier folder that is being replaced with everything in it.
-pub(super) const REPLACED_WHOLE: &str = "replaced-whole";
 /// Entries that only have to be deleted.
 pub(super) const DISCARDED: &str = "discarded";
 /// Journal of files that are being published together.
 pub(super) const JOURNAL: &str = "journal";
 /// Entries of a workspace that must not be deleted with it: the next run with the same output deals with them.
-const UNFINISHED: [&str; 3] = [REPLACED, REPLACED_WHOLE, JOURNAL];
+const UNFINISHED: [&str; 2] = [REPLACED, JOURNAL];
 
 /// Workspaces of this process. A thread that publishes a result holds the guard, so that a signal is handled either before
 /// the result has its name or after.

@@ -29,7 +29,6 @@ use crate::source::FrameSource;
 
 /// An archive.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
-    expected: "a .gsz",
     recognizes: |found| found.is_file_of(&archive::MAGIC, "gsz"),
     open: |path, options| Ok(Box::new(OpenArchive::open(path, options)?)),
 };

@@ -19,7 +19,6 @@ use crate::models::motion_model::{MotionModel, copy_stored};
 
 /// A model folder.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
-    expected: "a Deformable-3D-Gaussians model folder",
     recognizes: |found| found.is_folder && has_network(found.path),
     open: |path, options| Folder::open(path, options, DeformationKind::new),
 };

@@ -32,7 +32,6 @@ const FILE: &str = "params.npz";
 
 /// A model's file, or its folder.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
-    expected: "a Dynamic3DGaussians params.npz",
     recognizes: |found| {
         let named = |path: &Path| path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("npz"));
         match found.is_folder {

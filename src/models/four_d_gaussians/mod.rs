@@ -36,7 +36,6 @@ pub use model_folder::ModelFolder;
 
 /// A model folder.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
-    expected: "a 4DGaussians model folder",
     recognizes: |found| {
         found.is_folder && (found.path.join("cfg_args").exists() || found.path.join("point_cloud").is_dir())
     },

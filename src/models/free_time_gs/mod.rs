@@ -23,7 +23,6 @@ const FOLDER: &str = "ckpts";
 
 /// A checkpoint, or the folder of a result.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
-    expected: "a gsplat checkpoint",
     recognizes: |found| match found.is_folder {
         true => !checkpoints(found.path).is_empty(),
         false => found.is_checkpoint() && splats_in(found.path, found.memory),

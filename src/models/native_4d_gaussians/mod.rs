@@ -32,7 +32,6 @@ const STATIC: usize = 12;
 
 /// A checkpoint, or the folder of a model.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
-    expected: "a 4D Gaussian Splatting checkpoint",
     recognizes: |found| match found.is_folder {
         // Other families save checkpoints of their own beside their clouds.
         true if found.path.join("point_cloud").is_dir() => {

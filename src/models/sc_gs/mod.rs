@@ -23,7 +23,6 @@ use nodes::Nodes;
 
 /// A model folder, told from the other family of such by a key of its configuration or by its nodes.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
-    expected: "an SC-GS model folder",
     recognizes: |found| {
         let typed = || {
             let arguments = Arguments::read(&found.path.join("cfg_args")).ok();

@@ -53,7 +53,6 @@ const CAMERAS: &str = "cameras.json";
 
 /// A model's folder, or its PLY.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
-    expected: "a SpacetimeGaussians model folder",
     recognizes: |found| match found.is_folder {
         true => iteration(&found.path.join(CLOUDS), None).is_ok_and(|(_, folder)| is_marked(&folder.join(CLOUD))),
         false => found.is_file_of(b"ply", "ply") && is_marked(found.path),

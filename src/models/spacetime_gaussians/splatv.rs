@@ -44,7 +44,6 @@ const UNBOUNDED_LOG_WIDTH: f32 = 40.0;
 
 /// A `.splatv`.
 pub(in super::super) const SPLATV: ModelFormat = ModelFormat {
-    expected: "a .splatv",
     recognizes: |found| found.is_file_of(&MAGIC.to_le_bytes(), "splatv"),
     open: |path, options| {
         options.refuse_for(path)?;

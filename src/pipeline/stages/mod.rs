@@ -10,6 +10,7 @@ pub(crate) mod field;
 pub mod measure;
 pub(crate) mod merge;
 pub(crate) mod prune;
+pub(crate) mod quality;
 pub(crate) mod reference_views;
 pub(crate) mod refine;
 pub(crate) mod rounds;
@@ -37,5 +38,6 @@ pub(super) const STAGES: &[PlanStage] = &[
     bands::plan,
     size::plan_shrink,
     archive::plan,
+    quality::plan,
     write::plan,
 ];

@@ -118,6 +118,7 @@ impl Stage for Emit {
             field: journal.field,
             bands: journal.bands,
             refined: journal.refined,
+            quality: run.quality,
             archive,
             left_out: journal.left_out,
             notes: journal.notes,

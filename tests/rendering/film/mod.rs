@@ -36,7 +36,10 @@ fn apng(path: &Path) -> Apng {
 
 /// RGB of the still of `input` at `frame`, from `view`.
 fn still(folder: &Path, input: &str, frame: usize, view: u32) -> Vec<u8> {
-    done(folder, &format!("render {input} --cameras cameras.json --frame {frame} --view {view} --force -o still.png"));
+    done(
+        folder,
+        &format!("render {input} --cameras cameras.json --frame {frame} --view {view} --overwrite -o still.png"),
+    );
     let mut reader =
         png::Decoder::new(BufReader::new(File::open(folder.join("still.png")).unwrap())).read_info().unwrap();
     let mut pixels = vec![0; reader.output_buffer_size().unwrap()];
@@ -93,7 +96,7 @@ fn films_are_the_same_bytes_for_any_number_of_threads() {
     for kind in ["png", "gif"] {
         let made = ["1", "2", "5"].map(|threads| {
             let line = "render scene.gseq --cameras cameras.json --beside smaller.gseq --path --fps 30";
-            done(at, &format!("{line} --threads {threads} --force --video film.{kind}"));
+            done(at, &format!("{line} --threads {threads} --overwrite --video film.{kind}"));
             fs::read(at.join(format!("film.{kind}"))).unwrap()
         });
         assert!(made[0] == made[1] && made[0] == made[2], "{kind}");
@@ -112,7 +115,7 @@ fn a_model_between_its_cameras_times_is_filmed_at_as_many_frames_as_asked_for() 
     let folder = tempfile::tempdir().unwrap();
     let tiny = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/tiny_model");
     let tiny = tiny.to_str().unwrap();
-    done(folder.path(), &format!("render {tiny} --cameras {tiny} --frames 7 --size 40x30 --video tiny.gif"));
+    done(folder.path(), &format!("render {tiny} --cameras {tiny} --frames 7 --resolution 40x30 --video tiny.gif"));
     let mut gif = gif::DecodeOptions::new().read_info(File::open(folder.path().join("tiny.gif")).unwrap()).unwrap();
     let mut frames = 0;
     while gif.next_frame_info().unwrap().is_some() {
@@ -138,7 +141,7 @@ fn what_cannot_be_filmed_is_said_and_leaves_nothing() {
         ("--beside smaller.gseq --all -o y", &["--video"]),
         ("--fps 9 --frame 0 --view 0 -o y.png", &["--video"]),
         ("--video x.gif --all", &["--all"]),
-        ("--video x.gif --work w", &["--work"]),
+        ("--video x.gif --cache w", &["--cache"]),
         ("--video x.gif --beside scene.gseq --frames 3", &["--frames"]),
         ("--video scene.gseq", &["scene.gseq"]),
         ("--video no/x.gif", &["does not exist"]),

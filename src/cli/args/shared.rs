@@ -1,0 +1,177 @@
+//! Options that several commands share: input, cameras, memory, cache, overwriting.
+
+use std::path::PathBuf;
+
+use clap::{Args, ValueEnum};
+
+use super::values::{parse_bytes, parse_duration, parse_size, parse_times};
+use super::{CACHE, CAMERAS, MACHINE};
+use splatsieve::cache::Shard;
+use splatsieve::files::atomic::Replace;
+use splatsieve::files::cameras::Times;
+use splatsieve::models::Link;
+
+/// Input of a command.
+#[derive(Debug, Args)]
+pub(in crate::cli) struct Input {
+    /// Trained model (folder or checkpoint of any supported trainer), folder of PLY frames, .ply, .splatv, .gsz or .gseq file, or -
+    /// for a frame stream on standard input. See docs/inputs.md
+    pub(in crate::cli) input: PathBuf,
+    /// Training iteration of a model folder [default: the largest]
+    #[arg(long, value_name = "K", hide_short_help = true)]
+    pub(in crate::cli) iteration: Option<u32>,
+    #[command(flatten)]
+    pub(in crate::cli) trained: Trained,
+    /// Accept a folder of PLY frames with missing frame numbers or with entries that are no files
+    #[arg(long, hide_short_help = true)]
+    pub(in crate::cli) allow_gaps: bool,
+    /// Tracking: find which Gaussian of one frame is which of the next, for frames that do not keep the order of their Gaussians
+    /// [default: auto]
+    #[arg(long, hide_short_help = true)]
+    pub(in crate::cli) link: Option<LinkArg>,
+    /// Folder for temporary files of the run: received or tracked frames, and what does not fit into --memory [default: the
+    /// folder of the output, else the system's]
+    #[arg(long, value_name = "FOLDER", help_heading = MACHINE, hide_short_help = true)]
+    pub(in crate::cli) scratch_dir: Option<PathBuf>,
+    #[command(flatten)]
+    pub(in crate::cli) memory: Memory,
+}
+
+/// Facts about the training that a model's files do not contain.
+#[derive(Debug, Args)]
+pub(in crate::cli) struct Trained {
+    /// Length of time_duration of a 4D Gaussian Splatting checkpoint, or its ends A,B [default: as in a YAML file beside it, else 10
+    /// if frame times exceed 1, else 1]
+    #[arg(long, value_name = "L", hide_short_help = true, value_parser = parse_duration, allow_hyphen_values = true)]
+    pub(in crate::cli) time_duration: Option<f64>,
+    /// Layout of the 4D rotations of a 4D Gaussian Splatting checkpoint: unflipped in code before 15 September 2024 [default: flipped]
+    #[arg(long, value_name = "HOW", hide_short_help = true)]
+    pub(in crate::cli) rot4d: Option<Rot4d>,
+    /// Handling of Gaussians of a .splatv whose quaternion is zero; players do not draw them [default: drop]
+    #[arg(long, value_name = "HOW", hide_short_help = true)]
+    pub(in crate::cli) zero_rotation: Option<ZeroRotationArg>,
+}
+
+/// Handling of zero quaternions of a .splatv.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(in crate::cli) enum ZeroRotationArg {
+    /// Remove these Gaussians
+    Drop,
+    /// Keep them with the identity rotation
+    Identity,
+}
+
+/// Layout of 4D rotations.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(in crate::cli) enum Rot4d {
+    /// Order of both axes reversed
+    Flipped,
+    /// Plain product of both quaternions
+    Unflipped,
+}
+
+/// Cache folder of a run, for resuming it and for dividing it among several processes.
+#[derive(Debug, Args)]
+pub(in crate::cli) struct CacheArgs {
+    /// Keep the results of finished stages in this folder: an interrupted run continues from there
+    #[arg(long, help_heading = CACHE, value_name = "FOLDER")]
+    pub(in crate::cli) cache: Option<PathBuf>,
+    /// Compute only shard I of N of the next stage that can be divided, and keep it in the cache; a run without this
+    /// option joins the shards and does the rest
+    #[arg(long, help_heading = CACHE, value_name = "I/N", requires = "cache", hide_short_help = true)]
+    pub(in crate::cli) shard: Option<Shard>,
+}
+
+/// Policy for an output path that already exists.
+#[derive(Debug, Args)]
+pub(in crate::cli) struct Earlier {
+    /// Replace an output file that exists; in a folder, replace the files of an earlier result and keep all others
+    #[arg(long)]
+    pub(in crate::cli) overwrite: bool,
+}
+
+impl Earlier {
+    pub(in crate::cli) fn replace(&self) -> Replace {
+        if self.overwrite { Replace::Existing } else { Replace::Never }
+    }
+}
+
+/// Memory limit.
+#[derive(Debug, Args)]
+pub(in crate::cli) struct Memory {
+    /// Memory limit, such as 512MiB or 4GB [default: a quarter of the machine's memory]
+    ///
+    /// The limit does not change the result, except that refinement is reduced or left out if it needs more; the summary says so.
+    #[arg(long, help_heading = MACHINE, value_name = "SIZE", value_parser = parse_bytes)]
+    pub(in crate::cli) memory: Option<u64>,
+    /// Print the plan before the run: stages, memory, time, reads; and at the end what was used
+    #[arg(long, help_heading = MACHINE)]
+    pub(in crate::cli) explain: bool,
+}
+
+/// Cameras of the scene.
+#[derive(Debug, Args)]
+pub(in crate::cli) struct CameraFile {
+    /// Cameras: the data folder, or transforms*.json, cameras.json, poses_bounds.npy, a COLMAP reconstruction, or dataset.json (NeRFies,
+    /// HyperNeRF). A folder gives all its splits, a file only itself [default: the data folder named in cfg_args; without it,
+    /// invented views]
+    #[arg(long, help_heading = CAMERAS, value_name = "PATH")]
+    pub(in crate::cli) cameras: Option<PathBuf>,
+    /// Number of evenly spaced frames, for a model that is continuous in time [default: the times of the cameras]
+    #[arg(long, help_heading = CAMERAS, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    pub(in crate::cli) frames: Option<u32>,
+    /// Width and height of the views where the cameras name none; views of COLMAP, NeRFies and LLFF are scaled to it
+    #[arg(long, help_heading = CAMERAS, value_name = "WxH", value_parser = parse_size)]
+    pub(in crate::cli) resolution: Option<(u32, u32)>,
+    /// Times of images that have none (COLMAP, cameras.json): `names`, the numbers in their names; `none`, every camera sees every
+    /// frame; or a CSV file of name,time [default: names for COLMAP images with numbers and an input in motion, else none]
+    #[arg(long, help_heading = CAMERAS, hide_short_help = true, value_name = "names|none|FILE", value_parser = parse_times)]
+    pub(in crate::cli) times: Option<Times>,
+}
+
+/// Cameras and the split that is used.
+#[derive(Debug, Args)]
+pub(in crate::cli) struct Cameras {
+    #[command(flatten)]
+    pub(in crate::cli) file: CameraFile,
+    /// Split of the views that Gaussians are scored by [default: train]
+    #[arg(long, value_enum, help_heading = CAMERAS)]
+    pub(in crate::cli) split: Option<SplitArg>,
+}
+
+/// When frames are tracked.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(in crate::cli) enum LinkArg {
+    /// Only where the number of Gaussians changes or their order is not the same
+    Auto,
+    /// Always, also for a container or a stream
+    Always,
+    /// Always, but do not join tracks that seem to belong together, and store small changes too
+    Apart,
+    /// Never: the same index means the same Gaussian
+    Never,
+}
+
+impl From<LinkArg> for Link {
+    fn from(given: LinkArg) -> Link {
+        match given {
+            LinkArg::Auto => Link::Auto,
+            LinkArg::Always => Link::Always,
+            LinkArg::Apart => Link::Apart,
+            LinkArg::Never => Link::Never,
+        }
+    }
+}
+
+/// Split of a data set.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(in crate::cli) enum SplitArg {
+    /// Training views
+    Train,
+    /// Validation views (transforms_val.json)
+    Val,
+    /// Test views
+    Test,
+    /// All views
+    All,
+}

@@ -1,0 +1,84 @@
+//! Options of the commands that study methods and settings: `sweep` and `precision`.
+
+use std::path::PathBuf;
+
+use clap::Args;
+
+use super::values::parse_ratio;
+use super::{Background, CameraFile, Earlier, Input, RecipeFlags};
+use splatsieve::diagnostics::precision::Turned;
+use splatsieve::evaluation::method::Method;
+
+/// `sweep`
+#[derive(Debug, Args)]
+pub(in crate::cli) struct Sweep {
+    #[command(flatten)]
+    pub(in crate::cli) input: Input,
+    #[command(flatten)]
+    pub(in crate::cli) cameras: CameraFile,
+    /// Methods to compare: `default` and `paper`, the presets; `no-refine`, the first without refining; `paper-prune`,
+    /// `paper-merge`, the paper's ablations; prunings by `visible` contribution, `projected` coverage, `opacity` or `scale` alone, and at `random`
+    #[arg(long, value_name = "METHODS", value_delimiter = ',', default_values_t = Method::ALL.map(Method::name).map(str::to_owned),
+          value_parser = clap::builder::PossibleValuesParser::new(Method::ALL.map(Method::name)))]
+    pub(in crate::cli) methods: Vec<String>,
+    /// Fractions of the Gaussians to keep, such as 0.5,20%,10x
+    #[arg(long, value_name = "FRACTIONS", value_delimiter = ',', default_value = "0.8,0.6,0.4,0.2,0.1", value_parser = parse_ratio)]
+    pub(in crate::cli) fractions: Vec<f64>,
+    /// Also run `default` with these numbers of refinement steps, for error against run time; 0 leaves out refinement. The steps
+    /// before prune steps change in proportion
+    #[arg(long, value_name = "STEPS", value_delimiter = ',', value_parser = clap::value_parser!(u32).range(..=1_000_000))]
+    pub(in crate::cli) steps: Vec<u32>,
+    /// Fraction of the Gaussians to keep with --steps
+    #[arg(long, value_name = "FRACTION", default_value_t = 0.1, requires = "steps")]
+    pub(in crate::cli) steps_at: f64,
+    /// Number of runs per point; the median time is given
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=100))]
+    pub(in crate::cli) repeat: u32,
+    /// Maximum number of frames to compare, spread evenly
+    #[arg(long, value_name = "N", default_value_t = 15, value_parser = clap::value_parser!(u32).range(1..))]
+    pub(in crate::cli) max_frames: u32,
+    #[command(flatten)]
+    pub(in crate::cli) background: Background,
+    /// Output folder: sweep.html with the curves, and its data as JSON and CSV
+    #[arg(short, long, value_name = "FOLDER")]
+    pub(in crate::cli) output: PathBuf,
+    #[command(flatten)]
+    pub(in crate::cli) earlier: Earlier,
+    /// Print JSON
+    #[arg(long)]
+    pub(in crate::cli) json: bool,
+}
+
+/// `precision`
+#[derive(Debug, Args)]
+pub(in crate::cli) struct PrecisionArgs {
+    #[command(flatten)]
+    pub(in crate::cli) input: Input,
+    #[command(flatten)]
+    pub(in crate::cli) cameras: CameraFile,
+    /// Settings to vary: views and strides of the first scoring pass (`look`); views and steps of pruning `rounds`; bits of
+    /// `percentiles`; f32 and f64 `sums`; radius and passes of `merging`; steps and views of `refining`; threads and memory of the
+    /// `machine` [default: all; long inputs without the last three, which take whole runs]
+    #[arg(long, value_name = "KNOBS", value_delimiter = ',',
+          value_parser = clap::builder::PossibleValuesParser::new(Turned::ALL.map(Turned::name)))]
+    pub(in crate::cli) knobs: Vec<String>,
+    /// Fraction of the Gaussians that every setting keeps
+    #[arg(long, value_name = "FRACTION", default_value = "0.3", value_parser = parse_ratio)]
+    pub(in crate::cli) ratio: f64,
+    /// Maximum number of frames for scoring and ranking, spread evenly; whole runs use all
+    #[arg(long, value_name = "N", default_value_t = 60, value_parser = clap::value_parser!(u32).range(1..))]
+    pub(in crate::cli) max_frames: u32,
+    /// Maximum number of runs per setting, for median and range; fewer where they take more than 10 s
+    #[arg(long, value_name = "N", default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..=100))]
+    pub(in crate::cli) repeat: u32,
+    /// Output folder: precision.html with the plots, and its data as JSON and CSV
+    #[arg(short, long, value_name = "FOLDER")]
+    pub(in crate::cli) output: PathBuf,
+    #[command(flatten)]
+    pub(in crate::cli) earlier: Earlier,
+    /// Print JSON
+    #[arg(long)]
+    pub(in crate::cli) json: bool,
+    #[command(flatten)]
+    pub(in crate::cli) recipe: RecipeFlags,
+}

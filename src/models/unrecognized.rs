@@ -1,0 +1,156 @@
+//! Error for a path that no model format recognizes: the closest layout with its missing file, and the list of all layouts.
+
+use std::fs;
+use std::path::Path;
+
+use crate::error::{Error, ShowPath};
+use crate::files::names::shown_name;
+
+/// Files by which a folder of a layout is recognized, relative to it. `iteration_N` stands for any such folder.
+struct Layout {
+    name: &'static str,
+    files: &'static [&'static str],
+}
+
+/// Layouts of folders, the more specific ones first.
+const LAYOUTS: [Layout; 6] = [
+    Layout {
+        name: "4DGaussians model",
+        files: &["cfg_args", "point_cloud/iteration_N/point_cloud.ply", "point_cloud/iteration_N/deformation.pth"],
+    },
+    Layout {
+        name: "Deformable-3D-Gaussians or SC-GS model",
+        files: &["cfg_args", "point_cloud/iteration_N/point_cloud.ply", "deform/iteration_N/deform.pth"],
+    },
+    Layout {
+        name: "SpacetimeGaussians or 3D Gaussian Splatting model",
+        files: &["point_cloud/iteration_N/point_cloud.ply"],
+    },
+    Layout { name: "Dynamic3DGaussians model", files: &["params.npz"] },
+    Layout { name: "4D Gaussian Splatting model", files: &["chkpntN.pth"] },
+    Layout { name: "PLY frames", files: &["one .ply per frame, such as frame_00000.ply"] },
+];
+
+/// Files that a data set for training has, and a model has not.
+const DATA: [&str; 6] =
+    ["transforms_train.json", "transforms.json", "poses_bounds.npy", "sparse", "dataset.json", "images"];
+
+/// Returns the error for a folder that is no input: what it looks like and what is missing, or all layouts.
+pub(super) fn unrecognized_folder(path: &Path) -> Error {
+    let entries = names(path);
+    let found = match entries.len() {
+        0 => "an empty folder".to_owned(),
+        1 => format!("a folder with {}", entries[0]),
+        count => format!("a folder with {count} entries, such as {}", entries[0]),
+    };
+    let expected = "a trained model or frames of one";
+    let error = |found: String| Error::input(path, "", expected, found);
+    let mut closest: Option<(&Layout, Vec<&str>)> = None;
+    for layout in &LAYOUTS {
+        let missing: Vec<&str> = layout.files.iter().copied().filter(|file| !has(path, file)).collect();
+        let is_close = missing.len() < layout.files.len();
+        if is_close && closest.as_ref().is_none_or(|(_, fewest)| missing.len() < fewest.len()) {
+            closest = Some((layout, missing));
+        }
+    }
+    if let Some((layout, missing)) = closest {
+        let found = format!("what looks like a {}, but {} is missing", layout.name, missing.join(" and "));
+        return error(found).hint("copy the missing file into the folder, or give another folder");
+    }
+    let inside = entries
+        .iter()
+        .find(|name| LAYOUTS.iter().any(|layout| layout.files.iter().all(|file| has(&path.join(name), file))));
+    if let Some(name) = inside {
+        let folder = path.join(name);
+        return error(found).hint(format!("a model lies one level down: give {}", folder.shown()));
+    }
+    if DATA.iter().any(|name| path.join(name).exists()) {
+        return error("a data set: images and cameras".to_owned())
+            .hint(format!("give the folder of the trained model, and this one as --cameras {}", path.shown()));
+    }
+    error(found).hint(layouts())
+}
+
+/// Returns the error for a file that is no input.
+pub(super) fn unrecognized_file(path: &Path) -> Error {
+    Error::input(path, "", "a model or frames in a file", "a file of none of the known formats").hint(layouts())
+}
+
+/// Returns a line for each input that can be read.
+fn layouts() -> String {
+    let folders = LAYOUTS.iter().map(|layout| format!("{}: a folder with {}", layout.name, layout.files.join(", ")));
+    let files = "files: .gseq, .gsz, .splatv, .ply, params.npz, a checkpoint (.pth, .pt)".to_owned();
+    let lines: Vec<String> = folders.chain([files]).collect();
+    format!("inputs that can be read:\n    {}", lines.join("\n    "))
+}
+
+/// Returns whether `folder` holds `file`, a pattern of [`Layout::files`].
+fn has(folder: &Path, file: &str) -> bool {
+    let Some((head, rest)) = file.split_once('/') else {
+        return match file {
+            "chkpntN.pth" => names(folder).iter().any(|name| name.starts_with("chkpnt") && name.ends_with(".pth")),
+            _ if file.contains(' ') => names(folder).iter().any(|name| name.ends_with(".ply")),
+            _ => folder.join(file).exists(),
+        };
+    };
+    match head {
+        "iteration_N" => {
+            names(folder).iter().filter(|name| name.starts_with("iteration_")).any(|name| has(&folder.join(name), rest))
+        }
+        _ => has(&folder.join(head), rest),
+    }
+}
+
+/// Returns the names of at most 1,000 entries of `folder`, sorted; none if it cannot be read.
+fn names(folder: &Path) -> Vec<String> {
+    let entries = fs::read_dir(folder).into_iter().flatten().flatten().take(1000);
+    let mut names: Vec<String> = entries.map(|entry| shown_name(&entry.path())).collect();
+    names.sort();
+    names
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Makes empty files in a new folder and returns the error for it.
+    fn message(files: &[&str]) -> String {
+        let folder = tempfile::tempdir().unwrap();
+        for file in files {
+            let path = folder.path().join(file);
+            fs::create_dir_all(path.parent().unwrap()).unwrap();
+            fs::write(path, "").unwrap();
+        }
+        unrecognized_folder(folder.path()).to_string()
+    }
+
+    #[test]
+    fn the_closest_layout_and_its_missing_file_are_named() {
+        let text = message(&["cfg_args", "point_cloud/iteration_7/point_cloud.ply"]);
+        assert!(text.contains("3D Gaussian Splatting model"), "{text}");
+        let text = message(&["cfg_args", "point_cloud/iteration_7/deformation.pth"]);
+        assert!(text.contains("4DGaussians model") && text.contains("point_cloud.ply is missing"), "{text}");
+    }
+
+    #[test]
+    fn a_data_set_is_told_from_a_model() {
+        let text = message(&["transforms_train.json", "train/r_000.png"]);
+        assert!(text.contains("a data set") && text.contains("--cameras"), "{text}");
+    }
+
+    #[test]
+    fn a_model_one_level_down_is_found() {
+        let text = message(&["output/point_cloud/iteration_7/point_cloud.ply", "notes.txt"]);
+        assert!(text.contains("one level down") && text.contains("output"), "{text}");
+    }
+
+    #[test]
+    fn other_folders_get_the_list_of_layouts() {
+        for files in [&[][..], &["thesis.txt"]] {
+            let text = message(files);
+            for part in ["4DGaussians model", "deformation.pth", "PLY frames", ".gseq"] {
+                assert!(text.contains(part), "{part} is not in {text}");
+            }
+        }
+    }
+}

@@ -1,0 +1,201 @@
+//! Stage `quality`: PSNR and SSIM of the result against the original on views that nothing was fitted to or chosen by, and
+//! the time of a render before and after.
+//!
+//! Test views are measured where the cameras have a test split: at most [`MOST_VIEWS`], spread over frames and views, fewer
+//! where the run itself is short ([`SHARE`]). Without a test split the figure is that of the validation views of refinement,
+//! which chose the best state and are labeled so. Without either, training views are measured.
+//!
+//! Memory: one frame state of each model, two views per thread, and the scores.
+
+use std::fs;
+use std::time::Instant;
+
+use rayon::prelude::*;
+
+use crate::error::{Error, Result};
+use crate::files::atomic::ScratchFolder;
+use crate::journal::Journal;
+use crate::journal::records::{QualitySummary, RenderTime, ViewKind};
+use crate::limits::Limits;
+use crate::memory_plan::{PICTURE_ON_ALL_THREADS, RENDER, ResourceEstimate, Throughput, Workload, of_left};
+use crate::metrics::{BYTES_PER_PIXEL, psnr, ssim};
+use crate::model::{Columns, Picture};
+use crate::passes::{Batch, Subject, ViewStates, show};
+use crate::pipeline::planning::Planning;
+use crate::pipeline::stage::{Archived, EstimateInput, MeasuredOnArrival, Phase, RunState, Stage, StageList};
+use crate::pruning::score::scored_memory;
+use crate::render;
+use crate::scene::pictures::{PictureSet, pictures, spread_views};
+use crate::scene::{InputOptions, Scene, open_compressed};
+use crate::source::FrameSource;
+
+/// Name of the stage.
+const NAME: &str = "quality";
+/// Maximum number of views that are measured.
+const MOST_VIEWS: usize = 60;
+/// Minimum number of views, however short the run is.
+const FEWEST_VIEWS: usize = 4;
+/// Share of the run's estimated processor time that measuring may take.
+const SHARE: f64 = 0.02;
+/// Number of views whose rendering is timed, on one thread.
+const TIMED_VIEWS: usize = 3;
+
+/// Measurement of the result's quality.
+#[derive(Debug, Clone)]
+pub(crate) struct QualityStage {
+    input: InputOptions,
+}
+
+/// Adds the stage, unless it does not fit within the memory limit or was left out on purpose.
+pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
+    match planning.measures_quality {
+        true => stages.add(Phase::Write, QualityStage { input: planning.request.input.clone() }),
+        false => stages.leave_out("quality on test views", "memory: it does not fit within the limit (--memory)"),
+    }
+}
+
+impl Stage for QualityStage {
+    fn estimates(&self, EstimateInput { work, limits, left, .. }: EstimateInput<'_>) -> Vec<ResourceEstimate> {
+        vec![self.need(work, limits, left)]
+    }
+
+    fn run(&self, run: &mut RunState<'_>) -> Result<()> {
+        run.scene.work.not_divided("measuring quality")?;
+        if run.result.is_empty() {
+            return Ok(());
+        }
+        let (scene, count) = (run.scene, run.result.len());
+        let mut journal = std::mem::take(&mut run.journal);
+        let quality = journal.stage(NAME, count, scene.source(), |journal| Ok((self.measure(run, journal)?, count)))?;
+        run.journal = journal;
+        run.quality = quality;
+        Ok(())
+    }
+}
+
+impl QualityStage {
+    /// Returns the estimate for rendering [`MOST_VIEWS`] views of both models; a fraction `left` of the Gaussians is in the result.
+    fn need(&self, work: &Workload, limits: &Limits, left: f64) -> ResourceEstimate {
+        let whole = work.state(Columns::all());
+        let together = work.threads.min(limits.pictures_together as u64);
+        let views = (MOST_VIEWS as u64).min(work.pictures.max(1));
+        let per_gaussian = vec![
+            ("kept", of_left(left, 24)),
+            ("states", whole + of_left(left, whole)),
+            ("result", of_left(left, 2 * work.input.reduced)),
+            ("readers", work.input.reader + of_left(left, work.input.reader)),
+            ("pictures", together * PICTURE_ON_ALL_THREADS),
+        ];
+        ResourceEstimate {
+            stage: NAME,
+            seconds: 0.0,
+            reads: work.reads(views, limits),
+            per_gaussian: [scored_memory(limits), per_gaussian].concat(),
+            fixed: vec![
+                work.arriving(),
+                ("field", work.input.fixed),
+                ("pictures", together * (render::STRIP_BYTES as u64 + (24 + BYTES_PER_PIXEL as u64) * work.pixels)),
+            ],
+        }
+    }
+
+    /// Measures the result of `run`. Returns `None` where it has no frames that can be rendered.
+    fn measure(&self, run: &RunState<'_>, journal: &mut Journal) -> Result<Option<QualitySummary>> {
+        let scene = run.scene;
+        let times = &scene.source().info().times;
+        let kind = match scene.rig.held_out() {
+            Some(_) => ViewKind::Test,
+            None if journal.refined.is_some() => ViewKind::Validation,
+            None if scene.has_cameras => ViewKind::Training,
+            None => ViewKind::Virtual,
+        };
+        let all = pictures(&scene.rig, times, PictureSet::HeldOut)?;
+        let views = spread_views(all, self.view_count(run));
+        let folder;
+        let (opened, reduced);
+        let result: &dyn FrameSource = match &run.archived {
+            None => {
+                reduced = scene.input.reduced(&run.result)?;
+                &*reduced
+            }
+            Some(Archived::Content(encoded)) => {
+                folder = ScratchFolder::new(&scene.scratch)?;
+                let path = folder.path().join("result.gsz");
+                fs::write(&path, &encoded.bytes).map_err(Error::io("write", &path))?;
+                opened = open_compressed(&path, scene, &self.input)?;
+                opened.source()
+            }
+            // Frames within bounds exist only once they are written.
+            Some(Archived::Frames(_)) => return Ok(None),
+        };
+        let render_ms = render_times(scene, result, &views)?;
+        if let (ViewKind::Validation, Some(refined)) = (kind, journal.refined) {
+            let psnr = journal.result_psnr().unwrap_or(refined.result);
+            return Ok(Some(QualitySummary { kind, views: refined.pictures, psnr, ssim: None, render_ms }));
+        }
+        let (psnr, ssim) = mean_scores(scene, result, &views)?;
+        Ok(Some(QualitySummary { kind, views: views.len(), psnr, ssim: Some(ssim), render_ms }))
+    }
+
+    /// Returns how many views are measured: [`MOST_VIEWS`], or fewer where they would take more than [`SHARE`] of the run. The
+    /// figures are estimates for a reference machine, so that the number is the same on every machine.
+    fn view_count(&self, run: &RunState<'_>) -> usize {
+        let scene = run.scene;
+        let work = Workload { pace: Throughput::UNKNOWN, ..scene.workload() };
+        let left = run.result.len() as f64 / work.count().max(1.0);
+        let input = EstimateInput { work: &work, limits: &Limits::NONE, left, measured: MeasuredOnArrival::default() };
+        let seconds: f64 = run.stages.all().flat_map(|stage| stage.estimates(input)).map(|need| need.seconds).sum();
+        let per_view = work.picturing(1.0, (1.0 + left) * work.count(), RENDER)
+            + work.reading(work.count(), 2.0)
+            + 2.0 * SCORE_SECONDS_PER_PIXEL * work.pixels as f64;
+        ((SHARE * seconds / per_view.max(1e-9)) as usize).clamp(FEWEST_VIEWS, MOST_VIEWS)
+    }
+}
+
+/// Processor seconds of PSNR and SSIM per pixel, about (`benches/filters.rs`).
+const SCORE_SECONDS_PER_PIXEL: f64 = 6e-8;
+
+/// Returns the mean PSNR, dB, and the mean SSIM of `result` against the original over `views`.
+fn mean_scores(scene: &Scene, result: &dyn FrameSource, views: &[Picture]) -> Result<(f64, f64)> {
+    let progress = scene.events.task(NAME, "views", views.len() as u64);
+    let mut scores: Vec<(f64, f64)> = Vec::with_capacity(views.len());
+    let subjects = [scene.source(), result].map(Subject::all);
+    show(subjects, &scene.rig.cameras, views, Batch::of_frame(&scene.limits), |batch| {
+        let score = |view: &ViewStates<'_, 2>| {
+            let [original, compressed] = [0, 1].map(|subject| view.render(subject, scene.background));
+            progress.advance(1);
+            (psnr(&compressed, &original), ssim(&compressed, &original))
+        };
+        scores.par_extend(batch.par_iter().map(score));
+        Ok(())
+    })?;
+    let mean = |score: fn(&(f64, f64)) -> f64| scores.iter().map(score).sum::<f64>() / scores.len().max(1) as f64;
+    Ok((mean(|score| score.0), mean(|score| score.1)))
+}
+
+/// Returns the median time of rendering one view of both models on one thread, in milliseconds, without the evaluation of the
+/// deformation field. The first render of each view warms the caches and is not counted.
+pub(crate) fn render_times(scene: &Scene, result: &dyn FrameSource, views: &[Picture]) -> Result<Option<RenderTime>> {
+    let Ok(pool) = rayon::ThreadPoolBuilder::new().num_threads(1).build() else { return Ok(None) };
+    let views = spread_views(views.to_vec(), TIMED_VIEWS);
+    let mut times = [Vec::new(), Vec::new()];
+    let subjects = [scene.source(), result].map(Subject::all);
+    show(subjects, &scene.rig.cameras, &views, Batch::of_frame(&scene.limits), |batch| {
+        for view in batch {
+            for (subject, times) in times.iter_mut().enumerate() {
+                times.push(pool.install(|| {
+                    std::hint::black_box(view.render(subject, scene.background));
+                    let start = Instant::now();
+                    std::hint::black_box(view.render(subject, scene.background));
+                    1e3 * start.elapsed().as_secs_f64()
+                }));
+            }
+        }
+        Ok(())
+    })?;
+    let [before, after] = times.map(|mut times| {
+        times.sort_by(f64::total_cmp);
+        times.get(times.len() / 2).copied()
+    });
+    Ok(before.zip(after).map(|(before, after)| RenderTime { before, after }))
+}

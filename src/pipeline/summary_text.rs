@@ -1,0 +1,257 @@
+//! Text of a summary for a person: a table of Gaussians, size, render time and quality before and after.
+
+use std::fmt::Write as _;
+use std::path::Path;
+
+use bytesize::ByteSize;
+
+use super::summary::{Detail, Summary};
+use crate::error::ShowPath;
+use crate::journal::records::{QualitySummary, ViewKind};
+use crate::metrics::{PSNR_CAP_DB, decibels_text};
+use crate::models::Size;
+use crate::outputs::kind::OutputKind;
+use crate::progress::duration;
+
+/// Maximum number of notes that are shown unless all are asked for.
+const NOTES: usize = 2;
+
+/// Width of the line with the title, in columns.
+const TITLE_WIDTH: usize = 52;
+
+impl Summary {
+    /// Returns the text for a person: the table of the result, and with [`Detail::All`] the stages and all notes before it.
+    pub fn text(&self, detail: Detail) -> String {
+        let mut out = String::new();
+        // Writing to a String cannot fail.
+        let _ = match detail {
+            Detail::All => self.write_stages(&mut out),
+            Detail::Most => Ok(()),
+        };
+        let _ = self.write_table(&mut out);
+        let _ = self.write_notes(&mut out, detail);
+        let _ = self.write_next_steps(&mut out);
+        out
+    }
+
+    /// Writes input, cameras, stages and what was left out.
+    fn write_stages(&self, out: &mut String) -> std::fmt::Result {
+        let input = &self.input;
+        writeln!(
+            out,
+            "{}: {}, {} Gaussians x {} frames, SH degree {}",
+            Path::new(&input.path).shown(),
+            input.kind,
+            input.gaussians,
+            input.frames.unwrap_or(0),
+            input.sh_degree
+        )?;
+        writeln!(
+            out,
+            "cameras: {} ({} cameras, {} views)",
+            self.cameras.origin, self.cameras.cameras, self.cameras.pairs
+        )?;
+        for stage in &self.stages {
+            let scratch = match stage.scratch_bytes {
+                0 => String::new(),
+                bytes => format!(", {:.1} MiB of scratch", bytes as f64 / f64::from(1 << 20)),
+            };
+            let processors = stage.processor_seconds.map_or(String::new(), |s| format!(" ({s:.1} s of processors)"));
+            let memory = stage.peak_memory_bytes.map_or(String::new(), |b| format!(", peak {} MiB", b >> 20));
+            writeln!(
+                out,
+                "  {:<7} {:>9} -> {:>9}  {:8.2} s{processors}, {:.2} reads{scratch}{memory}",
+                stage.name, stage.gaussians_in, stage.gaussians_out, stage.seconds, stage.full_reads
+            )?;
+        }
+        if let Some(planned) = self.planned_reads {
+            writeln!(out, "full reads of the input: {:.2}, planned at most {planned:.2}", self.full_reads())?;
+        }
+        if let Some(field) = self.field.as_ref().filter(|field| field.half) {
+            writeln!(out, "deformation field: in half precision: {}", field.why())?;
+        }
+        if let Some(bands) = self.bands.as_ref().filter(|bands| bands.sh_degree < input.sh_degree) {
+            writeln!(out, "SH degree: {} of {}: {}", bands.sh_degree, input.sh_degree, bands.why())?;
+        }
+        writeln!(out, "bytes: {}", self.output_size.parts_of(&input.size))?;
+        for left in &self.left_out {
+            writeln!(out, "  left out: {} ({})", left.what, left.reason())?;
+        }
+        writeln!(out)
+    }
+
+    /// Writes the title and the table before/after.
+    fn write_table(&self, out: &mut String) -> std::fmt::Result {
+        let (seconds, peak) = self.taken();
+        let memory = peak.map_or(String::new(), |bytes| format!(", {} MiB peak", bytes >> 20));
+        let from = Path::new(&self.input.path).shown().to_string();
+        let to = Path::new(&self.output).shown().to_string();
+        let title = if to.is_empty() { from } else { format!("{from} → {to}") };
+        writeln!(out, "{title:<TITLE_WIDTH$}  {}{memory}\n", duration(seconds))?;
+        writeln!(out, "{:<14}{:>12}{:>12}", "", "before", "after")?;
+        let (all, kept) = (self.input.gaussians as u64, self.gaussians as u64);
+        row(out, "Gaussians", &grouped(all), &grouped(kept), &times(all, kept, "fewer"))?;
+        let (before, after) = (self.input.bytes, self.output_bytes);
+        row(out, "Size", &bytes(before), &bytes(after), &times(before, after, "smaller"))?;
+        self.write_size_parts(out)?;
+        if let Some(time) = self.quality.and_then(|quality| quality.render_ms) {
+            let [before, after] = [time.before, time.after].map(|ms| format!("{ms:.1} ms"));
+            row(out, "Render time", &before, &after, "per view, one thread of this machine")?;
+        }
+        writeln!(out, "{:<14}  {}", "Quality", self.quality_text())?;
+        if let Some(goal) = &self.goal {
+            let of = if goal.name == "max_loss" { "loss against photographs" } else { "PSNR vs. original" };
+            let views = goal.held_pictures.len();
+            writeln!(
+                out,
+                "{:<14}  {} dB {of} asked for, {:.2} dB on {} apart from the search",
+                "Target",
+                goal.asked,
+                goal.held,
+                counted(views, "view")
+            )?;
+        }
+        if let Some(archive) = &self.archive {
+            write!(out, "{:<14}  {:.2} dB PSNR vs. the result before quantization", "Archive", archive.psnr)?;
+            match archive.level < PSNR_CAP_DB {
+                true => writeln!(out, "; quantization costs {:.2} dB", archive.loss)?,
+                false => writeln!(out)?,
+            }
+        }
+        Ok(())
+    }
+
+    /// Writes the parts of the size, where there are several, and marks the largest part of the output.
+    fn write_size_parts(&self, out: &mut String) -> std::fmt::Result {
+        let named = |size: &Size| {
+            [
+                ("  Gaussians", size.cloud),
+                ("  deformation", size.field),
+                ("  frames", size.frames),
+                ("  other", size.rest),
+            ]
+        };
+        let (before, after) = (named(&self.input.size), named(&self.output_size));
+        if after.iter().filter(|(_, bytes)| *bytes > 0).count() < 2 {
+            return Ok(());
+        }
+        let largest = after.iter().map(|(_, bytes)| *bytes).max().unwrap_or(0);
+        for ((name, before), (_, after)) in before.into_iter().zip(after) {
+            if before + after == 0 {
+                continue;
+            }
+            let is_most = after == largest && 2 * after > self.output_bytes && name != "  Gaussians";
+            row(out, name, &bytes(before), &bytes(after), if is_most { "← most of what is left" } else { "" })?;
+        }
+        Ok(())
+    }
+
+    /// Returns how close renders of the result are to those of the original.
+    fn quality_text(&self) -> String {
+        let Some(QualitySummary { kind, views, psnr, ssim, .. }) = self.quality else {
+            return "not measured; `splatsieve evaluate` measures it".to_owned();
+        };
+        let views = match kind {
+            ViewKind::Test => counted(views, "test view"),
+            ViewKind::Validation => counted(views, "validation view"),
+            ViewKind::Training => counted(views, "training view"),
+            ViewKind::Virtual => counted(views, "virtual view"),
+        };
+        if psnr >= PSNR_CAP_DB {
+            return format!("no difference from the original ({views})");
+        }
+        let ssim = ssim.map_or(String::new(), |ssim| format!(", {ssim:.3} SSIM"));
+        format!("{} PSNR{ssim} vs. original ({views})", decibels_text(psnr, 2))
+    }
+
+    /// Writes notes, the first ones unless all are asked for.
+    fn write_notes(&self, out: &mut String, detail: Detail) -> std::fmt::Result {
+        let shown = match detail {
+            Detail::All => self.notes.len(),
+            Detail::Most => self.notes.len().min(NOTES),
+        };
+        for note in &self.notes[..shown] {
+            writeln!(out, "note: {note}")?;
+        }
+        match self.notes.len() - shown {
+            0 => Ok(()),
+            more => writeln!(out, "{more} more notes with --verbose"),
+        }
+    }
+
+    /// Writes commands that a user may want next.
+    fn write_next_steps(&self, out: &mut String) -> std::fmt::Result {
+        let output = Path::new(&self.output);
+        if self.output.is_empty() || self.input.path == "-" || self.gaussians == 0 {
+            return Ok(());
+        }
+        let stem = output.with_extension("");
+        let input = Path::new(&self.input.path);
+        writeln!(out, "\nSee it:   splatsieve view {} {} -o {}.html", input.shown(), output.shown(), stem.shown())?;
+        let kind = OutputKind::from_path(output, None, OutputKind::Model);
+        if kind == OutputKind::Model && self.output_size.field > 0 {
+            writeln!(out, "Smaller:  -o {}.gsz writes an archive, which unpacks to the same folder", stem.shown())?;
+        }
+        Ok(())
+    }
+
+    /// Returns the wall-clock seconds of all stages of this run, and the largest resident memory in bytes.
+    fn taken(&self) -> (f64, Option<u64>) {
+        let seconds = self.stages.iter().filter(|stage| !stage.kept).map(|stage| stage.seconds).sum();
+        (seconds, self.stages.iter().filter_map(|stage| stage.peak_memory_bytes).max())
+    }
+}
+
+/// Writes a row of the table.
+fn row(out: &mut String, name: &str, before: &str, after: &str, comment: &str) -> std::fmt::Result {
+    let line = format!("{name:<14}{before:>12}{after:>12}    {comment}");
+    writeln!(out, "{}", line.trim_end())
+}
+
+/// Returns "10.0× fewer" where `after` is less than `before`.
+fn times(before: u64, after: u64, word: &str) -> String {
+    match after {
+        0 => String::new(),
+        after if after < before => format!("{:.1}× {word}", before as f64 / after as f64),
+        after if after > before => format!("{:.1}× larger", after as f64 / before.max(1) as f64),
+        _ => String::new(),
+    }
+}
+
+/// Returns a size with a decimal unit.
+fn bytes(bytes: u64) -> String {
+    ByteSize(bytes).display().si().to_string()
+}
+
+/// Returns a number with a comma between groups of three digits.
+fn grouped(number: u64) -> String {
+    let digits = number.to_string();
+    let groups: Vec<&str> =
+        digits.as_bytes().rchunks(3).rev().filter_map(|group| std::str::from_utf8(group).ok()).collect();
+    groups.join(",")
+}
+
+/// Returns "1 view" or "60 views".
+fn counted(count: usize, noun: &str) -> String {
+    format!("{count} {noun}{}", if count == 1 { "" } else { "s" })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_are_grouped_by_three_digits() {
+        for (number, text) in [(0, "0"), (999, "999"), (20883, "20,883"), (1_234_567, "1,234,567")] {
+            assert_eq!(grouped(number), text);
+        }
+    }
+
+    #[test]
+    fn factors_say_which_way_a_value_changed() {
+        assert_eq!(times(20_883, 2_088, "fewer"), "10.0× fewer");
+        assert_eq!(times(10, 20, "smaller"), "2.0× larger");
+        assert_eq!(times(10, 10, "fewer"), "");
+        assert_eq!(times(10, 0, "fewer"), "");
+    }
+}

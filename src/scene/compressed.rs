@@ -1,0 +1,42 @@
+//! Opening a compressed model beside its original.
+
+use std::path::Path;
+
+use super::{InputOptions, Scene};
+use crate::error::{Error, Result, ShowPath};
+use crate::models::{self, InputModel, OpenOptions, Timing};
+
+/// Maximum difference between the times of the same frame in two models, as a fraction of the time span: files round times.
+const TIME_TOLERANCE: f64 = 1e-6;
+
+/// Opens the compressed model at `path` at the frames of the original. `options` are those of the original; its training
+/// iteration does not apply.
+///
+/// # Errors
+/// Inputs that cannot be read; a model whose frames are not those of the original.
+pub fn open_compressed(path: &Path, original: &Scene, options: &InputOptions) -> Result<Box<dyn InputModel>> {
+    let times = &original.source().info().times;
+    let input = models::open(path, &OpenOptions { iteration: None, ..options.opening() })?;
+    let input = match input.timing() {
+        Timing::Continuous => input.with_times(times.clone())?,
+        Timing::Numbered if input.source().info().times.len() == times.len() => input.with_times(times.clone())?,
+        Timing::Numbered | Timing::Stamped => input,
+    };
+    let found = &input.source().info().times;
+    let expected = |what: String| format!("{what}, as in {}", original.path.shown());
+    if found.len() != times.len() {
+        let expected = expected(format!("{} frames", times.len()));
+        return Err(Error::input(path, "", expected, format!("{} frames", found.len()))
+            .hint("compare models of the same scene, with the cameras both were made for"));
+    }
+    let span = times.first().zip(times.last()).map_or(0.0, |(first, last)| last - first);
+    let tolerance = TIME_TOLERANCE * if times.len() > 1 { span } else { 1.0 };
+    match (0..times.len()).find(|&frame| (found[frame] - times[frame]).abs() > tolerance) {
+        Some(frame) => {
+            let expected = expected(format!("time {}", times[frame]));
+            Err(Error::input(path, format!("frame {frame}"), expected, found[frame].to_string())
+                .hint("compare models of the same scene, with the cameras both were made for"))
+        }
+        None => Ok(input),
+    }
+}
