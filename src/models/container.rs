@@ -1,4 +1,4 @@
-//! Containers (`.gseq`) as a family.
+//! Containers (`.gseq`) as a model format.
 
 use gseq::{Encoding, Reader, TileId};
 
@@ -9,7 +9,7 @@ use crate::files::container::Container;
 use crate::models::input_model::{ColumnInfo, InputModel, MemoryProfile, ModelFormat, Timing};
 use crate::source::FrameSource;
 
-/// A container.
+/// Container of frame states (`.gseq`).
 pub(super) const ENTRY: ModelFormat = ModelFormat {
     expected: "a .gseq",
     recognizes: |found| found.is_file_of(&gseq::MAGIC, "gseq"),
@@ -51,7 +51,7 @@ impl InputModel for Container {
 
     fn residence(&self) -> MemoryProfile {
         let layout = self.reader().layout();
-        // The tiles decide what is decoded together.
+        // The tiles of the file determine which Gaussians are decoded together.
         MemoryProfile {
             gaussian_block: layout.gaussian_block.into(),
             columns: layout.columns.len() as u64,
@@ -77,6 +77,7 @@ impl InputModel for Container {
     }
 }
 
+/// Collects the statistics of every column from the tile index.
 fn columns(reader: &Reader) -> Result<Vec<ColumnInfo>> {
     let layout = reader.layout();
     let mut out = Vec::new();

@@ -1,6 +1,6 @@
-//! Models that are known and not read: what they are, and the way that works.
+//! Models that are recognized but not read. Their error says which model it is and how to convert it.
 //!
-//! What renders at any time a PLY or a frame stream can hold; so every message says to write one.
+//! Any renderer can export frames as PLY files or a frame stream, so every message suggests that.
 
 use std::path::Path;
 
@@ -9,11 +9,11 @@ use crate::files::checkpoint::{Checkpoint, Pickle};
 use crate::limits::ReadLimit;
 use crate::models::input_model::ModelFormat;
 
-/// The way that works with every renderer.
+/// Advice that works for every renderer.
 const WAY: &str = "write its frames as PLY files, one per frame and all with the same Gaussians in the same order, or as a \
                    frame stream, with its own renderer, and give those";
 
-/// A checkpoint of another kind, or a folder of one.
+/// Checkpoint of an unsupported trainer, or a folder of one.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
     expected: "",
     recognizes: |found| match found.is_folder {
@@ -29,7 +29,7 @@ pub(super) const ENTRY: ModelFormat = ModelFormat {
 const UNKNOWN: &str = "a checkpoint of another kind, such as Ex4DGS, Gaussian-Flow, MEGA or OMG4 write";
 const ROTOR: &str = "a 4D-Rotor model of nerfstudio";
 
-/// What a folder is, by names that no other family's has.
+/// Returns the description of an unsupported model folder, recognized by file names that no other format uses.
 fn in_folder(folder: &Path) -> Option<&'static str> {
     let has = |name: &str| folder.join(name).exists();
     if has("nerfstudio_models") {
@@ -41,10 +41,9 @@ fn in_folder(folder: &Path) -> Option<&'static str> {
     None
 }
 
-/// What a checkpoint is, by its tree.
+/// Returns the description of an unsupported checkpoint, recognized by the names in its tree.
 ///
-/// # Errors
-/// A file that is no checkpoint.
+/// # Errors Fails if the file is not a checkpoint.
 fn in_file(path: &Path, memory: ReadLimit) -> crate::error::Result<&'static str> {
     let checkpoint = Checkpoint::open(path, memory)?;
     let pickle = checkpoint.pickle();
@@ -58,7 +57,7 @@ fn in_file(path: &Path, memory: ReadLimit) -> crate::error::Result<&'static str>
     })
 }
 
-/// Names of tensors, of dicts in the root and in its values.
+/// Iterates over the tensor names of dictionaries in the root and in its values.
 fn names(pickle: &Pickle) -> impl Iterator<Item = &str> {
     let root = pickle.root();
     let inner = pickle.items(root).into_iter().flatten().map(|(_, id)| id);

@@ -1,7 +1,7 @@
-//! Frames in PLY files: a folder with one for each, or a single one. Where they do not say which Gaussian is which, they
-//! are [linked](super::linked).
+//! Frames in PLY files: a folder with one file per frame, or a single file. Frames that do not identify Gaussians
+//! across frames are [linked](super::linked).
 //!
-//! What is written back has the properties, comments and names that the files had.
+//! Output files keep the properties, comments and names of the input files.
 
 use std::path::{Path, PathBuf};
 
@@ -28,7 +28,7 @@ use crate::progress::Events;
 use crate::source::{FrameSource, Ids};
 use crate::tracking::{OrderDifference, identity};
 
-/// A folder with one PLY per frame.
+/// Folder with one PLY per frame.
 pub(super) const FOLDER: ModelFormat = ModelFormat {
     expected: "a folder of PLY files",
     recognizes: |found| found.is_folder,
@@ -38,14 +38,14 @@ pub(super) const FOLDER: ModelFormat = ModelFormat {
     },
 };
 
-/// One PLY.
+/// Single PLY file.
 pub(super) const FILE: ModelFormat = ModelFormat {
     expected: "a .ply",
     recognizes: |found| found.is_file_of(b"ply", "ply"),
     open: |path, options| open_frames(PlyFrames::single(path, &options.ply())?, path, options),
 };
 
-/// Opens frames as they are if the same place means the same Gaussian in all of them, else linked.
+/// Opens frames unchanged if the same index means the same Gaussian in all of them, else links them.
 fn open_frames(frames: PlyFrames, path: &Path, options: &OpenOptions) -> Result<Box<dyn InputModel>> {
     options.refuse_for(path)?;
     let order = match options.link {
@@ -63,21 +63,23 @@ fn open_frames(frames: PlyFrames, path: &Path, options: &OpenOptions) -> Result<
     }
 }
 
-/// Pairs of frames whose order is measured.
+/// Maximum number of pairs of frames whose order is measured.
 const MEASURED: usize = 5;
 
-/// Whether the order of frames tells which Gaussian is which.
+/// Whether the order of Gaussians in frames identifies them.
 enum FrameOrder {
-    /// Nobody looked.
+    /// Order trusted without measurement.
     Believed,
-    /// It does, as the note says.
+    /// Order that identifies Gaussians; the note gives the measured differences.
     Kept(String),
-    /// It does not, and why.
+    /// Order that does not identify Gaussians, with the reason.
     Lost(String),
 }
 
-/// Whether order tells which Gaussian is which: it does where it holds in most pairs of neighboring frames, of five that
-/// are evenly spread.
+/// Measures whether the index identifies Gaussians. It does if it holds in at least half of up to five evenly spread
+/// pairs of neighboring frames.
+///
+/// Frames with different numbers of Gaussians have no common order.
 fn order(frames: &PlyFrames) -> Result<FrameOrder> {
     if let Some(other) = frames.other_count() {
         let (counts, name) = (frames.counts(), shown_name(&frames.paths()[other]));
@@ -149,7 +151,7 @@ impl InputModel for PlySequence {
             reader: 4,
             reduced: 0,
             jacobian: 0,
-            // Normals and the like stand beside the values.
+            // Normals and other extra properties are stored beside the attributes.
             file: state_bytes(self.info().sh_degree, Columns::all()) + 24,
             fixed: 0,
             frame_block: 0,
@@ -206,7 +208,7 @@ impl InputModel for PlySequence {
     }
 }
 
-/// Writes every frame's file again with the properties, comments and names it had.
+/// Writes the file of every frame again with its original properties, comments and name.
 fn write_files(
     sequence: &PlySequence,
     reduction: &CompressedModel,
@@ -230,7 +232,7 @@ fn write_files(
         progress.advance(1);
         Ok(())
     };
-    // A batch at a time: a thread that waits for proxies would begin another frame.
+    // Work in batches: while a thread waits for proxies, it would otherwise begin another frame.
     let all: Vec<usize> = (0..sequence.paths().len()).collect();
     all.chunks(rayon::current_num_threads()).try_for_each(|batch| batch.par_iter().try_for_each(write))
 }

@@ -1,4 +1,4 @@
-//! How large a model is on disk, by part.
+//! Size of a model on disk, by part.
 
 use std::fs;
 use std::path::Path;
@@ -8,16 +8,16 @@ use serde::{Deserialize, Serialize};
 use crate::archive::ArchiveSize;
 use crate::error::{Error, Result};
 
-/// Bytes of everything that a renderer opens of a model, by part. What only training reads is no part of it.
+/// Bytes of all files that a renderer opens of a model, by part. Files that only training reads are not counted.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Size {
-    /// Gaussians from which frames follow.
+    /// Bytes of the canonical Gaussians.
     pub cloud: u64,
-    /// What deforms them.
+    /// Bytes of the deformation field.
     pub field: u64,
-    /// States of Gaussians, frame by frame.
+    /// Bytes of states stored frame by frame.
     pub frames: u64,
-    /// Everything else.
+    /// Bytes of everything else.
     pub rest: u64,
 }
 
@@ -28,29 +28,29 @@ impl From<ArchiveSize> for Size {
 }
 
 impl Size {
-    /// Of frames and nothing else.
+    /// Returns the size of a model that consists of `frames` bytes of frame states only.
     pub fn of_frames(frames: u64) -> Size {
         Size { frames, ..Size::default() }
     }
 
-    /// All parts together.
+    /// Returns the sum of all parts, bytes.
     pub fn whole(&self) -> u64 {
         self.cloud + self.field + self.frames + self.rest
     }
 
-    /// Parts with a name each.
+    /// Returns each part with its name.
     pub fn named(&self) -> [(&'static str, u64); 4] {
         [("cloud", self.cloud), ("field", self.field), ("frames", self.frames), ("rest", self.rest)]
     }
 
-    /// The parts, for a person: `cloud 248, field 1000`.
+    /// Formats the parts that are not 0 for messages: `cloud 248, field 1000`.
     pub fn parts(&self) -> String {
         let parts = self.named().into_iter().filter(|part| part.1 > 0);
         parts.map(|(name, bytes)| format!("{name} {bytes}")).collect::<Vec<_>>().join(", ")
     }
 
-    /// The parts as parts of those of `before`, for a person: `cloud 248 of 2480 (10.0%)`. A part that one of both lacks
-    /// is compared with nothing.
+    /// Formats the parts relative to the parts of `before` for messages: `cloud 248 of 2480 (10.0%)`. A part that
+    /// exists on one side only is compared with `none`.
     pub fn parts_of(&self, before: &Size) -> String {
         let part = |((name, after), (_, before)): ((_, u64), (_, u64))| match (after, before) {
             (0, 0) => None,
@@ -61,7 +61,8 @@ impl Size {
         self.named().into_iter().zip(before.named()).filter_map(part).collect::<Vec<_>>().join(", ")
     }
 
-    /// Why this, made of what takes `before`, takes more bytes; none if it does not.
+    /// Returns a message that explains why this output of an input of size `before` is larger; `None` if it is not
+    /// larger.
     pub fn why_larger_than(&self, before: &Size) -> Option<String> {
         let (after, whole) = (self.whole(), before.whole());
         let why = match (self.frames > 0, before.frames > 0) {
@@ -72,17 +73,17 @@ impl Size {
     }
 }
 
-/// So many bytes of so many, with what part that is.
+/// Formats bytes as `{after} of {before}` with a percentage.
 pub fn compared(after: u64, before: u64) -> String {
     format!("{after} of {before} ({:.1}%)", 100.0 * after as f64 / before.max(1) as f64)
 }
 
-/// Sum of the sizes of files, bytes.
+/// Returns the sum of the sizes of files, bytes. Fails if one cannot be read.
 pub(super) fn bytes_of<'a>(paths: impl IntoIterator<Item = &'a Path>) -> Result<u64> {
     paths.into_iter().map(|path| Ok(fs::metadata(path).map_err(Error::io("read", path))?.len())).sum()
 }
 
-/// Bytes of a file, or of all files below a folder.
+/// Returns the bytes of a file, or of all files below a folder.
 pub(super) fn bytes_below(path: &Path) -> Result<u64> {
     let found = fs::metadata(path).map_err(Error::io("read", path))?;
     if !found.is_dir() {

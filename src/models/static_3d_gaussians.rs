@@ -1,7 +1,7 @@
-//! Model folders of 3D Gaussian Splatting: a cloud that nothing deforms.
+//! Model folders of 3D Gaussian Splatting: Gaussians without a deformation field.
 //!
-//! In: `<root>/point_cloud/iteration_K/point_cloud.ply`, of the largest K unless one is named. Out: a folder of the same layout
-//! with fewer rows, `cfg_args` and `cameras.json`.
+//! Input: `<root>/point_cloud/iteration_K/point_cloud.ply` with the largest K unless one is chosen. Output: a folder of
+//! the same layout with fewer rows, `cfg_args` and `cameras.json`.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -20,10 +20,12 @@ use crate::outputs::kind::OutputKind;
 use crate::progress::Events;
 use crate::source::FrameSource;
 
+/// Name of the folder of iterations.
 const CLOUDS: &str = "point_cloud";
+/// Name of the point cloud file in an iteration folder.
 const CLOUD: &str = "point_cloud.ply";
 
-/// A model folder with a cloud, and nothing that deforms it.
+/// Model folder with a point cloud file and no deformation field.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
     expected: "a 3D Gaussian Splatting model folder",
     recognizes: |found| {
@@ -34,16 +36,16 @@ pub(super) const ENTRY: ModelFormat = ModelFormat {
     open: |path, options| Ok(Box::new(Static::open(path, options)?)),
 };
 
-/// Whether a model's folder says that its cloud is deformed, even where the file that does it is missing.
+/// Returns whether a model folder says that its Gaussians are deformed, even if the deformation file is missing.
 fn deforms(root: &Path) -> bool {
     let arguments = cfg_args::read(&root.join("cfg_args")).unwrap_or_default();
     root.join("deform").exists() || ["kplanes_config", "defor_depth"].iter().any(|name| arguments.contains(name))
 }
 
-/// Files of the root that a result has too.
+/// Files of the model folder that are copied to the output.
 const BESIDE: [&str; 2] = ["cfg_args", "cameras.json"];
 
-/// A model folder.
+/// Open model folder of 3DGS.
 struct Static {
     root: PathBuf,
     iteration: u32,
@@ -51,6 +53,7 @@ struct Static {
 }
 
 impl Static {
+    /// Opens the requested iteration of the model folder `root`, or the largest.
     fn open(root: &Path, options: &OpenOptions) -> Result<Static> {
         let (iteration, folder) = iteration(&root.join(CLOUDS), options.iteration)?;
         Ok(Static {
@@ -60,10 +63,12 @@ impl Static {
         })
     }
 
+    /// Returns the paths of existing files that are copied to the output.
     fn beside(&self) -> impl Iterator<Item = PathBuf> {
         BESIDE.iter().map(|name| self.root.join(name)).filter(|path| path.is_file())
     }
 
+    /// Returns the path of the point cloud file in a model folder `root`.
     fn cloud_in(&self, root: &Path) -> PathBuf {
         root.join(CLOUDS).join(format!("iteration_{}", self.iteration)).join(CLOUD)
     }
@@ -199,7 +204,7 @@ mod tests {
         let first = gather_all(open(&root, Some(7000)).unwrap().source(), 0, Columns::POSITION).unwrap();
         assert_eq!(first.position.row::<1>(0), [7000.0]);
         assert!(open(&root, Some(8)).err().unwrap().to_string().contains("iteration_7000, iteration_30000"));
-        // A field that is missing is no static model.
+        // A model whose deformation file is missing is not a static model.
         fs::write(root.join("cfg_args"), "Namespace(sh_degree=3, defor_depth=1)").unwrap();
         assert!(open(&root, None).err().unwrap().to_string().contains("deformation.pth"));
     }

@@ -1,8 +1,8 @@
-//! Frames that came another way than as files, kept as files and then linked like files: a stream of frames that do not know
-//! one another (format/STREAM.md, version 2), or what says which Gaussian is which and is linked all the same.
+//! Frames that did not come from PLY files of the user, saved as PLY and then linked: a frame stream without ids
+//! (format/STREAM.md, version 2), or an input that identifies Gaussians and is linked anew at the user's request.
 //!
-//! Memory while they arrive: a frame; of a container up to 128 MiB of what is seen, and a tile of every column and thread.
-//! On the disk, in a folder without a name, every frame as PLY.
+//! Memory while frames arrive: one frame; for a container up to 128 MiB of visible Gaussians, and a tile of every
+//! column per thread. Disk, in a temporary folder: every frame as PLY.
 
 use std::io::Read;
 use std::ops::Range;
@@ -25,20 +25,23 @@ use crate::models::trajectories::state_bytes;
 use crate::outputs::container::{GAUSSIAN_BLOCK, of_block};
 use crate::source::{FrameSource, Ids, ReadPlan};
 
-/// Files of frames that are arriving, and their times.
+/// PLY files of frames that are being received, and their times.
 struct Arriving {
     folder: ScratchFolder,
     times: Vec<f64>,
-    /// Bytes of what they are read from, and of the largest as it is read.
+    /// Bytes of memory of the reader that provides the frames.
     beside: u64,
+    /// Bytes of the largest frame in memory.
     largest: u64,
 }
 
 impl Arriving {
+    /// Creates an empty folder in `scratch`. `beside` is the memory of the reader that provides the frames, bytes.
     fn new(scratch: &Path, beside: u64) -> Result<Arriving> {
         Ok(Arriving { folder: ScratchFolder::new(scratch)?, times: Vec::new(), beside, largest: 0 })
     }
 
+    /// Writes the next frame as PLY.
     fn push(&mut self, time: f64, state: &Gaussians) -> Result<()> {
         write_inria(state, &[], &self.folder.path().join(format!("frame_{:05}.ply", self.times.len())))?;
         self.times.push(time);
@@ -46,7 +49,7 @@ impl Arriving {
         Ok(())
     }
 
-    /// Links them: a `kind` of input of `bytes`, called `name` in messages.
+    /// Links the received frames. `kind` names the original input of `bytes` bytes; messages call it `name`.
     fn link(
         self,
         kind: &'static str,
@@ -64,10 +67,10 @@ impl Arriving {
 }
 
 impl LinkedFrames {
-    /// Receives all of a stream, called `name`, and links it, and lives that are one if `joins`.
+    /// Receives a whole stream, called `name` in messages, and links it. If `joins`, also joins tracks of the same
+    /// Gaussian.
     ///
-    /// # Errors
-    /// What is wrong with the stream; none but the end of it; a failed write.
+    /// # Errors Fails if the stream is damaged or has no frames, or if a write fails.
     pub fn receive(
         mut stream: FrameStream<impl Read>,
         name: &Path,
@@ -89,11 +92,10 @@ impl LinkedFrames {
         arriving.link("linked frame stream", name, stream.received(), why, joins, options)
     }
 
-    /// Links what `input` shows, which says itself which Gaussian is which, and lives that are one if `joins`: in each frame
-    /// those that any picture may show. `kind` says what that is.
+    /// Links the frames of `input` anew, ignoring which Gaussian is which. Each frame consists of the Gaussians that
+    /// may be visible in it. If `joins`, tracks of the same Gaussian are joined. `kind` names the input.
     ///
-    /// # Errors
-    /// A frame that cannot be read; a failed write.
+    /// # Errors Fails if a frame cannot be read or a write fails.
     pub fn relink(
         input: &dyn InputModel,
         kind: &'static str,
@@ -135,19 +137,19 @@ impl LinkedFrames {
     }
 }
 
-/// Blocks of Gaussians of `source`, as they are read.
+/// Returns the ranges of Gaussians of the blocks of `source`, for parallel reading.
 fn blocks(source: &dyn FrameSource) -> impl IndexedParallelIterator<Item = Range<usize>> {
     let count = source.info().count;
     (0..count.div_ceil(GAUSSIAN_BLOCK)).into_par_iter().map(move |block| of_block(count, block))
 }
 
-/// Rows of `state` that any picture may show.
+/// Returns the rows of `state` that may be visible: with an opacity of at least [`SEEN`].
 fn seen(state: &Gaussians) -> Vec<u32> {
     let opacities = (0u32..).zip(state.opacity_logit.plane(0));
     opacities.filter(|&(_, &logit)| opacity(logit) >= SEEN).map(|(row, _)| row).collect()
 }
 
-/// How many are [seen] in each frame of `source`.
+/// Returns the number of [seen] Gaussians in each frame of `source`.
 fn count_seen(source: &dyn FrameSource) -> Result<Vec<u64>> {
     let frames = source.info().times.len();
     let count = |range: Range<usize>| -> Result<Vec<u64>> {
@@ -166,7 +168,7 @@ fn count_seen(source: &dyn FrameSource) -> Result<Vec<u64>> {
     blocks(source).map(count).try_reduce(|| vec![0; frames], add)
 }
 
-/// Those of every block that are [seen] in each of `frames`.
+/// Returns, for each block of Gaussians, the [seen] ones in each of `frames`.
 fn unpack(source: &dyn FrameSource, frames: Range<usize>) -> Result<Vec<Vec<Gaussians>>> {
     let wanted = ReadPlan::new(frames.clone());
     let unpack = |range: Range<usize>| {

@@ -1,4 +1,4 @@
-//! Which lives are made one and what is held along them, and what that costs in pictures.
+//! Joining of tracks and choice of constant attributes, with their cost in PSNR of renders.
 
 use std::ops::Range;
 use std::path::Path;
@@ -14,18 +14,18 @@ use crate::model::{Columns, Gaussians};
 use crate::render::Renderer;
 use crate::tracking::{Joiner, Linker};
 
-/// Pictures with joined lives are at least as near to those of lives apart, and those with what is held to those without, dB.
+/// Minimum PSNR of renders after a change (joined tracks, constant attributes) against renders before it, dB.
 const LEAST_DB: f64 = 40.0;
-/// Views of each frame that is looked at.
+/// Number of views rendered of each sampled frame.
 const VIEWS: usize = 3;
-/// What may change along a track and be held: no more than trainers leave between lives, or half of that.
+/// Bounds of the change of an attribute that becomes constant, tried in this order: the change that trainers leave
+/// between tracks of one Gaussian, and half of that.
 const BOUNDS: [Bound; 2] = [Bound { color: 0.04, other: 0.02 }, Bound { color: 0.02, other: 0.01 }];
 
-/// Joins the lives of `tracks` that `joiner` has seen as loosely as pictures allow, if any may be; gives what a person should
-/// know of that.
+/// Joins tracks that `joiner` has seen, as loosely as the PSNR of renders allows. Returns a note for the user if any
+/// tracks could be joined.
 ///
-/// # Errors
-/// A frame that cannot be read.
+/// # Errors Fails if a frame cannot be read.
 pub(super) fn join(joiner: Joiner, linker: &Linker, tracks: &mut LinkedTracks) -> Result<Option<String>> {
     let (before, median_length) = (tracks.count(), tracks.lengths()?.median());
     let mut note = None;
@@ -48,15 +48,14 @@ pub(super) fn join(joiner: Joiner, linker: &Linker, tracks: &mut LinkedTracks) -
     Ok(note)
 }
 
-/// Holds what hardly changes along `tracks` at its mean, within the largest of [`BOUNDS`] that pictures allow, if any; gives
-/// what a person should know of that.
+/// Replaces nearly constant attributes of `tracks` by their means, within the largest of [`BOUNDS`] that the PSNR of
+/// renders allows. Returns a note for the user if any attribute became constant.
 ///
-/// # Errors
-/// A frame that cannot be read; a failed write to `scratch`.
+/// # Errors Fails if a frame cannot be read or a write to `scratch` fails.
 pub(super) fn hold(tracks: &mut LinkedTracks, scratch: &Path) -> Result<Option<String>> {
     let first = tracks.first();
     for bound in BOUNDS {
-        // Tracks are numbered by their births.
+        // Tracks are numbered in the order of their first frames.
         let sums = |range: Range<usize>| sums(tracks, first[range.start].frame as usize, range);
         let steady = Steady::from_sums(tracks.count(), tracks.frames().sh_degree(), sums, bound, scratch)?;
         let parts = steady.parts();
@@ -85,7 +84,7 @@ pub(super) fn hold(tracks: &mut LinkedTracks, scratch: &Path) -> Result<Option<S
     Ok(None)
 }
 
-/// Sums along the tracks of `range`, none of which is there before the frame `born`.
+/// Sums the attributes along the tracks of `range`. None of them begins before the frame `born`.
 fn sums(tracks: &LinkedTracks, born: usize, range: Range<usize>) -> Result<TrackSums> {
     let sh_degree = tracks.frames().sh_degree();
     let (mut sums, mut state) = (TrackSums::new(range.len(), sh_degree), Gaussians::zeros(0, sh_degree));
@@ -98,7 +97,8 @@ fn sums(tracks: &LinkedTracks, born: usize, range: Range<usize>) -> Result<Track
     Ok(sums)
 }
 
-/// PSNR of pictures of joined lives against those of lives apart, where any are blended.
+/// Returns the PSNR of renders with joined tracks against renders with separate ones; `None` if no frame has blended
+/// rows.
 fn cost(tracks: &LinkedTracks) -> Result<Option<f64>> {
     let frames = tracks.lengths()?.blended;
     if frames.is_empty() {
@@ -115,13 +115,14 @@ fn cost(tracks: &LinkedTracks) -> Result<Option<f64>> {
     Ok(Some(likeness(&apart, &joined)))
 }
 
-/// Some of `frames`, evenly spread.
+/// Returns up to [`LOOKED_AT`] of `frames`, evenly spread.
 fn looked_at(frames: &[u32]) -> impl Iterator<Item = usize> {
     let count = frames.len().min(LOOKED_AT);
     (0..count).map(move |k| frames[(2 * k + 1) * frames.len() / (2 * count)] as usize)
 }
 
-/// PSNR of pictures of `b` against those of `a`, frame by frame: the mean of some views around the scene.
+/// Returns the PSNR of renders of `b` against renders of `a`: the mean over all frames and some views around the scene,
+/// dB.
 fn likeness(a: &[Gaussians], b: &[Gaussians]) -> f64 {
     let mut renderer = Renderer::on_all_threads();
     let mut found = Vec::new();
@@ -137,7 +138,7 @@ fn likeness(a: &[Gaussians], b: &[Gaussians]) -> f64 {
     found.iter().sum::<f64>() / found.len() as f64
 }
 
-/// `psnr` in words.
+/// Formats a PSNR for notes.
 fn within(psnr: f64) -> String {
     if psnr.is_finite() { format!("pictures stay within {psnr:.1} dB") } else { "no picture changes".to_owned() }
 }

@@ -1,5 +1,5 @@
-//! What is left of linked frames, as files like those that came: in each the Gaussians that are there, with the properties,
-//! comments and name it had.
+//! Compressed linked frames, written as PLY files like those of the input. Each file holds the Gaussians that are
+//! present in the frame, with its original properties, comments and name.
 
 use std::path::Path;
 
@@ -15,16 +15,14 @@ use crate::models::trajectories::merged;
 use crate::progress::Events;
 use crate::source::{FrameSource, Ids};
 
-/// What no row of a frame is of.
+/// Marks a track without a row in a frame.
 const NONE: u32 = u32::MAX;
 
 impl LinkedFrames {
-    /// Writes every frame's file into `folder`. A merged Gaussian is there where one of its members is, in the row of the
-    /// first of them; of several rows of a track there is one, in the place of the first. What is held along a track is
-    /// held.
+    /// Writes the file of every frame into `folder`. A proxy is present if one of its members is, in the row of the
+    /// first of them. Several rows of a track become one, in the place of the first. Steady columns have their means.
     ///
-    /// # Errors
-    /// Frames that cannot be read, a failed write.
+    /// # Errors Fails if frames cannot be read or a write fails.
     pub(super) fn write_files(&self, reduction: &CompressedModel, folder: &Path, events: &Events) -> Result<()> {
         let (frames, result) = (self.tracks.frames(), merged(self, reduction));
         let all = out_rows(reduction);
@@ -32,7 +30,7 @@ impl LinkedFrames {
         let write = |&frame: &usize| {
             let mut of_frame = self.tracks.rows(frame, 0..self.tracks.count())?;
             let mut row_of = vec![NONE; self.tracks.count()];
-            // Of several rows of a track the first.
+            // If a track has several rows, use the first.
             of_frame.iter().rev().for_each(|row| row_of[row.track as usize] = row.row);
             let several = of_frame.chunk_by(|a, b| a.track == b.track).filter(|of_track| of_track.len() > 1);
             let blended: HashSet<u32> = several.map(|of_track| of_track[0].track).collect();
@@ -70,7 +68,7 @@ impl LinkedFrames {
             progress.advance(1);
             Ok(())
         };
-        // A batch at a time: a thread that waits for proxies would begin another frame.
+        // Work in batches: while a thread waits for proxies, it would otherwise begin another frame.
         let numbers: Vec<usize> = (0..frames.paths().len()).collect();
         numbers.chunks(rayon::current_num_threads()).try_for_each(|batch| batch.par_iter().try_for_each(write))
     }

@@ -1,4 +1,4 @@
-//! Proxies in a family's own parameters, held to what their members do.
+//! Proxies with raw parameters of a model format, checked against the moment match of their members.
 
 use super::{MotionModel, MotionModelFrames};
 use crate::compressed_model::{Cluster, Proxies, Reference};
@@ -10,14 +10,14 @@ use crate::passes::gather_all;
 use crate::recipe::MergeParams;
 use crate::source::FrameSource;
 
-/// Furthest that a proxy's opacity may be from that of its members' moment match, at any frame.
+/// Maximum difference in opacity between a proxy and the moment match of its members, at any frame.
 const MOST_OPACITY: f64 = 0.1;
 
-/// The proxies `propose`d for `clusters`, a row for each; those whose state strays at any frame from the moment match
-/// of their members, in position by more than `max_drift` or in opacity by more than .1, are refused.
+/// Returns the proxies that `propose` computes for `clusters`, one row each. Refuses a proxy if at any frame its state
+/// differs from the moment match of its members by more than `max_drift` in position or 0.1 in opacity. Frames in which
+/// neither is visible are not compared.
 ///
-/// # Errors
-/// Frames that cannot be evaluated.
+/// # Errors Fails if `propose` fails or frames cannot be evaluated.
 pub(in crate::models) fn solve<L: MotionModel>(
     model: &MotionModelFrames<L>,
     clusters: &[Cluster],
@@ -45,7 +45,7 @@ pub(in crate::models) fn solve<L: MotionModel>(
             }
             let [to, from] = [&wanted, &made].map(|state| state.position.row::<3>(proxy).map(f64::from));
             let distance = to.iter().zip(from).map(|(to, from)| (to - from).powi(2)).sum::<f64>().sqrt();
-            // False of what is not finite.
+            // The comparison is false for values that are not finite.
             strays[proxy] |= !(distance <= drift && (a - b).abs() <= MOST_OPACITY);
             furthest[proxy] = furthest[proxy].max(distance);
         }

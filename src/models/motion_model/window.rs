@@ -1,29 +1,30 @@
 //! Opacities that fade with the distance in time.
 //!
-//! α = σ(o)·m with m = exp(e), e ≤ 0: as a logit ln α − ln(1 − α) = e − ln(exp(−o) + 1 − m), in f64 without loss where α is
-//! near 0 or near 1.
+//! α = σ(o)·m with m = exp(e), e ≤ 0. As a logit: ln α − ln(1 − α) = e − ln(exp(−o) + 1 − m), computed in f64 without
+//! loss of precision for α near 0 or 1.
 
 use crate::model::functions::{exp_m1, ln};
 
-/// Logits beyond it say no more.
+/// Maximum absolute value of a logit. Larger ones do not change the opacity noticeably.
 pub(in crate::models) const MOST: f64 = 40.0;
 
-/// exp(−o) of a stored logit.
+/// Returns exp(−o) of a stored logit o.
 pub(in crate::models) fn odds(logit: f32) -> f64 {
     (-f64::from(logit)).exp()
 }
 
-/// The logit of σ(o)·exp(`exponent`), from [`odds`] of o, within ±[`MOST`]. Without a branch, so that loops run in vectors.
+/// Returns the logit of σ(o)·exp(`exponent`), clamped to ±[`MOST`]. `odds` is exp(−o). Written without branches, so
+/// that loops are vectorized.
 #[inline(always)]
 pub(in crate::models) fn faded(odds: f64, exponent: f64) -> f64 {
-    // The opacity is no larger than m.
+    // The resulting opacity is at most m = exp(exponent).
     let exponent = if exponent < -MOST { -MOST } else { exponent };
     let logit = exponent - ln(odds - exp_m1(exponent));
     let logit = if logit > MOST { MOST } else { logit };
     if logit < -MOST { -MOST } else { logit }
 }
 
-/// ∂ [`faded`] / ∂ o; 0 where it does not change.
+/// Returns ∂ [`faded`] / ∂ o; 0 where the logit is clamped.
 pub(in crate::models) fn slope(odds: f64, exponent: f64) -> f64 {
     let logit = faded(odds, exponent);
     if logit.abs() < MOST { odds / (odds - exponent.exp_m1()) } else { 0.0 }
@@ -48,7 +49,7 @@ mod tests {
                 assert!((slope - expected).abs() < 1e-6, "{logit} {exponent}: {slope} {expected}");
             }
         }
-        // Ends, and what lies beyond them.
+        // Clamped values.
         assert_eq!([faded(odds(800.0), 0.0), faded(odds(-800.0), 0.0), faded(1.0, -1e300)], [MOST, -MOST, -MOST]);
         assert_eq!([slope(odds(800.0), 0.0), slope(odds(-800.0), 0.0), slope(1.0, -1e300)], [0.0; 3]);
     }
