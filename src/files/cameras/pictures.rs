@@ -1,4 +1,4 @@
-//! The pictures that a JSON file lists, one at a time, and what lies around them.
+//! Streaming access to the list of images in a JSON camera file, and to the keys outside that list.
 
 use std::path::Path;
 
@@ -7,8 +7,8 @@ use crate::files::json::lists::{Ask, each_element};
 use crate::files::json::small::{Keep, Small};
 use crate::files::json::{Stopped, read};
 
-/// Keys that say what a document is, and those that hold for all of its pictures.
-const AROUND: [&str; 14] = [
+/// Keys by which a document is recognized, and keys that hold for all of its images.
+const OUTLINE_KEYS: [&str; 14] = [
     "frames",
     "w2c",
     "transform_matrix",
@@ -24,29 +24,30 @@ const AROUND: [&str; 14] = [
     "background",
     "rotation",
 ];
-/// Elements kept of each list: a background has three.
-const FEW: usize = 4;
+/// Number of elements kept of each list: a background has three.
+const MAX_ELEMENTS: usize = 4;
 
-/// Reads what lies around the pictures of the document in `file`: of each list the first elements and their number.
+/// Reads the document in `file` except its images: of each list only the first elements and the length.
 ///
 /// # Errors
-/// A file that is no JSON.
+/// The file is not valid JSON.
 pub(super) fn outline(file: &Path) -> Result<Small> {
-    read(file, &Stopped::default(), Keep { wanted: &AROUND, elements: FEW })
+    read(file, &Stopped::default(), Keep { wanted: &OUTLINE_KEYS, elements: MAX_ELEMENTS })
 }
 
-/// Reads the whole of a small document.
+/// Reads the keys `wanted` of a small document.
 ///
 /// # Errors
-/// A file that is no JSON.
-pub(super) fn whole(file: &Path, wanted: &[&str]) -> Result<Small> {
-    read(file, &Stopped::default(), Keep { wanted, elements: FEW })
+/// The file is not valid JSON.
+pub(super) fn read_keys(file: &Path, wanted: &[&str]) -> Result<Small> {
+    read(file, &Stopped::default(), Keep { wanted, elements: MAX_ELEMENTS })
 }
 
-/// Hands every element of the list under `key`, or of the document if there is none, to `take`; `wanted` are its keys.
+/// Passes every element of the list under `key`, or of the document itself if `key` is `None`, to `take`, with its
+/// index. `wanted` are the keys of each element that are kept.
 ///
 /// # Errors
-/// Those of `take`; a key that is repeated; a file that is no JSON.
+/// An error of `take`; a key that occurs twice; a file that is not valid JSON.
 pub(super) fn each_picture(
     file: &Path,
     key: Option<&str>,
