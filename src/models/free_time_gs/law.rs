@@ -1,7 +1,8 @@
-//! Gaussians that move along straight lines and fade with the distance in time.
+//! Motion model of FreeTimeGS: Gaussians that move along straight lines and fade with the distance in time.
 //!
-//! dt = t − times; x = means + velocities·dt; opacity = max(σ(o)·exp(−½(dt/s)²), 1e-4), s = max(exp(durations), 0.02) + 1e-8.
-//! Source: `compute_positions_at_time`, `compute_temporal_opacity` of FreeTimeGsVanilla. Its viewer has neither bound.
+//! dt = t − times; x = means + velocities·dt; opacity = max(σ(o)·exp(−½(dt/s)²), 1e-4) with s = max(exp(durations),
+//! 0.02) + 1e-8. Source: `compute_positions_at_time`, `compute_temporal_opacity` of FreeTimeGsVanilla. Its viewer
+//! applies neither bound.
 
 use xxhash_rust::xxh3::Xxh3;
 
@@ -14,37 +15,44 @@ use crate::models::motion_model::window::{faded, odds, slope};
 use crate::models::motion_model::{MotionModel, MotionModelFrames, copy_stored};
 use crate::recipe::MergeParams;
 
-/// Planes of [`Raw::own`]: center in time, logarithm of the standard deviation, velocity.
+/// Plane of [`Raw::own`] with the center in time.
 pub(super) const TIME: usize = 0;
+/// Plane of [`Raw::own`] with the logarithm of the standard deviation in time.
 pub(super) const DURATION: usize = 1;
+/// First of three planes of [`Raw::own`] with the velocity.
 pub(super) const VELOCITY: usize = 2;
-/// How many there are.
+/// Number of planes of [`Raw::own`].
 pub(super) const OWN: usize = 5;
 
-/// Least standard deviation, and what is added to it.
+/// Minimum standard deviation in time, and the value added to it.
 const DEVIATION: [f64; 2] = [0.02, 1e-8];
-/// Least opacity, and its logit.
+/// Minimum opacity.
 const OPACITY: f64 = 1e-4;
 
-/// The law of the family.
+/// Motion model of FreeTimeGS.
 #[derive(Debug)]
 pub(super) struct FreeTime;
 
-/// 1/(2s²), and exp(−o).
+/// Time-independent values of the temporal windows of some Gaussians.
 #[derive(Debug)]
 pub(super) struct Windows {
+    /// 1/(2s²) of each Gaussian.
     rates: Vec<f64>,
+    /// exp(−o) of each opacity logit o.
     odds: Vec<f64>,
 }
 
+/// Returns the standard deviation s in time from a stored duration.
 fn deviation(duration: f32) -> f64 {
     f64::from(duration).exp().max(DEVIATION[0]) + DEVIATION[1]
 }
 
+/// Returns 1/(2s²) from a stored duration.
 fn rate(duration: f32) -> f64 {
     0.5 / deviation(duration).powi(2)
 }
 
+/// Returns the logit of the minimum opacity.
 fn least() -> f64 {
     (OPACITY / (1.0 - OPACITY)).ln()
 }
@@ -119,7 +127,7 @@ impl ProxyRule for FreeTime {
         let fades = |line: &LinearPath, time: f64| (-0.5 * ((time - line.center) / line.deviation).powi(2)).exp();
         let mut sh = vec![Vec::new(); clusters.len()];
         let matched = match_all(model, clusters, rule, line, fades, Columns::SH, |seen| {
-            // The same at every frame.
+            // SH coefficients are the same at every frame.
             if sh[seen.proxy].is_empty() {
                 let of = &seen.state.sh;
                 sh[seen.proxy] = (0..of.width()).map(|c| of.plane(c)[seen.row]).collect();

@@ -1,9 +1,10 @@
-//! Checkpoints of gsplat, static or of FreeTimeGS.
+//! Checkpoints of gsplat: static models, or FreeTimeGS.
 //!
-//! In: `ckpts/ckpt_K.pt` of a result's folder, or the file: `{"step", "splats": state dict, "optimizers": {name: Adam state}}`.
-//! `splats` has `means` [N, 3], `scales` [N, 3] log, `quats` [N, 4] wxyz of any length, `opacities` [N] logit, `sh0` [N, 1, 3],
-//! `shN` [N, K, 3]; of FreeTimeGS also `times` [N, 1], `durations` [N, 1] log, `velocities` [N, 3]. Out: the same checkpoint with
-//! fewer rows. Cameras are those of the trainer's parser: it normalizes the world, and does not store how.
+//! Input: `ckpts/ckpt_K.pt` in a result folder, or the file itself: `{"step", "splats": state dict, "optimizers":
+//! {name: Adam state}}`. `splats` holds `means` [N, 3], `scales` [N, 3] log, `quats` [N, 4] wxyz of any length,
+//! `opacities` [N] logit, `sh0` [N, 1, 3], `shN` [N, K, 3]; for FreeTimeGS also `times` [N, 1], `durations` [N, 1] log,
+//! `velocities` [N, 3]. Output: the same checkpoint with fewer rows. Cameras must be those of the trainer's parser: it
+//! normalizes the world and does not store how.
 
 mod law;
 
@@ -18,10 +19,10 @@ use crate::model::{Columns, HIGHEST_DEGREE, sh_coefficients};
 use crate::models::input_model::{InputModel, ModelFormat, OpenOptions};
 use law::{DURATION, FreeTime, OWN, TIME, VELOCITY};
 
-/// Where a result's folder has its checkpoints.
+/// Name of the subfolder of a result folder that holds the checkpoints.
 const FOLDER: &str = "ckpts";
 
-/// A checkpoint, or the folder of a result.
+/// gsplat checkpoint, or the result folder of a training.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
     expected: "a gsplat checkpoint",
     recognizes: |found| match found.is_folder {
@@ -43,7 +44,7 @@ pub(super) const ENTRY: ModelFormat = ModelFormat {
     },
 };
 
-/// The checkpoints of a result's folder, or of that of its checkpoints.
+/// Returns the checkpoints of a result folder, or of a folder of checkpoints, in order of iteration.
 fn checkpoints(path: &Path) -> Vec<(u32, PathBuf)> {
     let of = |folder: &Path| {
         let (mut one, first) = (numbered(folder, "ckpt_", ".pt"), numbered(folder, "ckpt_", "_rank0.pt"));
@@ -55,7 +56,9 @@ fn checkpoints(path: &Path) -> Vec<(u32, PathBuf)> {
     if inner.is_empty() { of(path) } else { inner }
 }
 
-/// The one that `options` name, or the last.
+/// Returns the checkpoint of the requested iteration, or the last one with a note.
+///
+/// # Errors Fails if there is no such checkpoint, or if the model is divided among several ranks.
 fn choose(path: &Path, options: &OpenOptions) -> Result<(PathBuf, Vec<String>)> {
     let found = checkpoints(path);
     let names = || found.iter().map(|(k, _)| k.to_string()).collect::<Vec<_>>().join(", ");
@@ -75,13 +78,14 @@ fn choose(path: &Path, options: &OpenOptions) -> Result<(PathBuf, Vec<String>)> 
     Ok((file.clone(), if found.len() > 1 && options.iteration.is_none() { vec![note] } else { Vec::new() }))
 }
 
-/// Whether the checkpoint at `path` has Gaussians as gsplat names them.
+/// Returns whether the checkpoint at `path` holds Gaussians under the names of gsplat.
 fn splats_in(path: &Path, memory: ReadLimit) -> bool {
     let Ok(checkpoint) = Checkpoint::open(path, memory) else { return false };
     let pickle = checkpoint.pickle();
     pickle.item(pickle.root(), "splats").is_some_and(|splats| pickle.item(splats, "means").is_some())
 }
 
+/// Opens a checkpoint as FreeTimeGS if it has velocities, else as a static model.
 fn open(about: About, options: &OpenOptions) -> Result<Box<dyn InputModel>> {
     let checkpoint = Checkpoint::open(&about.file, options.memory)?;
     let pickle = checkpoint.pickle();
@@ -157,6 +161,7 @@ fn open(about: About, options: &OpenOptions) -> Result<Box<dyn InputModel>> {
     })
 }
 
+/// Returns the name of a tensor for messages.
 fn place(name: &str) -> String {
     format!("splats[{}]", quoted(name))
 }

@@ -19,7 +19,7 @@ fn noise(n: usize, seed: f64) -> Vec<f32> {
     (0..n).map(|i| ((i as f64 * 0.754_877 + seed * 0.569_84).fract() - 0.5) as f32).collect()
 }
 
-/// Name, shape of a row, values.
+/// Name, shape of a row, and values of each tensor.
 type Splats = Vec<(&'static str, Vec<usize>, Vec<f32>)>;
 
 fn splats() -> Splats {
@@ -35,7 +35,7 @@ fn splats() -> Splats {
         of("sh0", &[1, 3], 5.0, 0.0),
         of("shN", &[15, 3], 6.0, 0.0),
         of("times", &[1], 7.0, 0.5),
-        // Some are shorter than the shortest that counts.
+        // Some durations are below the minimum.
         of("durations", &[1], 8.0, -3.6),
         of("velocities", &[3], 9.0, 0.0),
     ]
@@ -123,7 +123,7 @@ fn states_are_those_of_the_formulas() {
         }
     }
     assert!(clamped[0] > 0 && clamped[1] > 0, "{clamped:?}");
-    // The folder of checkpoints and the file are the same model.
+    // The folder of checkpoints and the file open as the same model.
     for name in ["result/ckpts", "result/ckpts/ckpt_59999.pt"] {
         assert_eq!(states(&*open(&place.path(name)).unwrap()), states(&*model));
     }
@@ -139,7 +139,7 @@ fn what_is_left_has_its_rows_in_splats_and_optimizers() {
     let [before, after] = [place.path("result"), result]
         .map(|root| Checkpoint::open(&root.join("ckpts/ckpt_59999.pt"), ReadLimit::NONE).unwrap());
     let shapes: Vec<Vec<usize>> = after.tensors().map(|tensor| tensor.shape).collect();
-    // Nine of each kind; the steps have no rows.
+    // Nine tensors each of parameters, steps and two averages; only the steps have no rows.
     assert_eq!(shapes.len(), 36);
     assert_eq!(shapes.iter().filter(|shape| shape.first() == Some(&2)).count(), 27);
     assert_eq!(before.storage("20").unwrap(), after.storage("20").unwrap());
@@ -149,10 +149,10 @@ fn what_is_left_has_its_rows_in_splats_and_optimizers() {
 #[test]
 fn a_proxy_moves_as_the_mean_of_its_members() {
     let mut made = splats();
-    // Long lives, and the two that merge lie and go nearly alike.
+    // Long windows, and two members with nearly the same position and velocity.
     made[7].2.fill(-0.5);
     made[6].2.fill(0.5);
-    // Faint ones, whose sum no pixel is full of.
+    // Low opacities, so that their sum does not saturate.
     made[3].2.fill(-3.0);
     for k in [0, 1, 8] {
         (0..3).for_each(|c| made[k].2[6 + c] = made[k].2[c] + 0.01 * (c as f32 + 1.0));

@@ -1,5 +1,5 @@
-//! What files beside a checkpoint say of how it was trained: `cfg_args`, and the YAML that training was given, where somebody put
-//! it there: it is not saved with the model.
+//! Files beside a checkpoint that record how it was trained: `cfg_args`, and the YAML configuration of the training.
+//! The YAML is not saved with the model, so it is there only if somebody copied it.
 
 use std::path::Path;
 
@@ -9,21 +9,22 @@ use crate::files::text::read_text;
 use crate::models::four_d_gaussians::cfg_args;
 use crate::models::in_checkpoint::texts_in;
 
-/// What matters of it.
+/// Values of the training configuration that are used.
 #[derive(Debug, Default)]
 pub(super) struct TrainingConfig {
     pub(super) source_path: Option<String>,
+    /// Background color: white if true, else black.
     pub(super) white_background: bool,
+    /// Variance added to Σ_tt (`prefilter_var`).
     pub(super) prefilter: f64,
-    /// L, and the file that says so.
+    /// Period L of colors, and the name of the file that gives it.
     pub(super) time_duration: Option<(f64, String)>,
 }
 
 impl TrainingConfig {
-    /// That of the model in `root`.
+    /// Reads the configuration of the model in the folder `root`.
     ///
-    /// # Errors
-    /// Files that cannot be read, or not understood; such that do not agree.
+    /// # Errors Fails if a file cannot be read or parsed, or if two files contradict each other.
     pub(super) fn read(root: &Path) -> Result<TrainingConfig> {
         let mut found = TrainingConfig { time_duration: time_duration(root)?, ..TrainingConfig::default() };
         let path = root.join("cfg_args");
@@ -44,11 +45,11 @@ impl TrainingConfig {
     }
 }
 
-/// L of the configurations in `root`.
+/// Returns the period L from the YAML files in `root`, and the name of the file.
 fn time_duration(root: &Path) -> Result<Option<(f64, String)>> {
     let mut found: Option<(f64, String)> = None;
     for path in texts_in(root) {
-        // Others may be of anything.
+        // Unrelated text files may be unreadable.
         let Ok(text) = read_text(&path, 1 << 20) else { continue };
         let Some(span) = span(&text) else { continue };
         let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
@@ -70,7 +71,7 @@ fn time_duration(root: &Path) -> Result<Option<(f64, String)>> {
     Ok(found)
 }
 
-/// What stands in the list `time_duration` of a YAML, in one line or below one another.
+/// Returns the entries of the list `time_duration` of a YAML, written in one line or one per line.
 fn span(text: &str) -> Option<Vec<&str>> {
     let mut lines = text.lines().map(|line| line.split('#').next().unwrap_or_default().trim_end());
     let after = lines.find_map(|line| line.strip_prefix("time_duration:"))?.trim();

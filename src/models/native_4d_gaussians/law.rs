@@ -1,11 +1,11 @@
-//! Gaussians of four dimensions, of which every instant is a slice.
+//! Motion model of four-dimensional Gaussians: each time is a slice of them.
 //!
-//! Σ₄ = R₄ diag(s)² R₄ᵀ; v = Σ₁₂/Σ_tt; x(t) = x + v·(t − μ); Σ = Σ₁₁ − Σ₁₂Σ₂₁/Σ_tt, the same at all times;
-//! m = exp(−½(t − μ)²/Σ_tt); opacity = σ(o)·m, and 0 where m ≤ .05. Without a rotation of four dimensions v = 0, Σ is that of
-//! `scaling` and `rotation`, and Σ_tt = exp(scaling_t), not its square. Harmonics: c_k + cos(2π(μ − t)/L)·c₁₆₊ₖ +
-//! cos(4π(μ − t)/L)·c₃₂₊ₖ. Everything is in f64: in f32 a fast, small Gaussian that lasts long would lose Σ.
-//! Source: `computeCov3D_conditional`, `get_marginal_t`, `eval_shfs_4d` of the repository (fudan-zvg). Its rasteriser sees
-//! harmonics from the side of x, the one here from that of x(t).
+//! Σ₄ = R₄ diag(s)² R₄ᵀ; v = Σ₁₂/Σ_tt; x(t) = x + v·(t − μ); Σ = Σ₁₁ − Σ₁₂Σ₂₁/Σ_tt, constant in time; m = exp(−½(t −
+//! μ)²/Σ_tt); opacity = σ(o)·m, and 0 if m ≤ 0.05. Without a 4D rotation, v = 0, Σ follows from `scaling` and
+//! `rotation`, and Σ_tt = exp(scaling_t), not its square. SH coefficients: c_k + cos(2π(μ − t)/L)·c₁₆₊ₖ + cos(4π(μ −
+//! t)/L)·c₃₂₊ₖ. All computations are in f64: in f32 a fast, small Gaussian with a long life span would lose Σ. Source:
+//! `computeCov3D_conditional`, `get_marginal_t`, `eval_shfs_4d` of the repository (fudan-zvg). Its rasterizer evaluates
+//! SH in the direction of x, this one in the direction of x(t).
 
 use std::f64::consts::TAU;
 
@@ -15,58 +15,63 @@ use crate::model::{Column, Columns, Gaussians, Jacobian, Raw, scale_rotation};
 use crate::models::motion_model::window::{MOST, faded, odds, slope};
 use crate::models::motion_model::{MotionModel, copy_stored};
 
-/// Planes of [`Raw::own`]: μ, the logarithm of the scale along time, the right quaternion, harmonics in time term by term.
+/// Plane of [`Raw::own`] with the center μ in time.
 pub(super) const TIME: usize = 0;
+/// Plane of [`Raw::own`] with the logarithm of the scale along time.
 pub(super) const SCALING_T: usize = 1;
+/// First of four planes of [`Raw::own`] with the right quaternion.
 pub(super) const ROTATION_R: usize = 2;
+/// First plane of [`Raw::own`] with the time-dependent SH coefficients, term by term.
 pub(super) const TERMS: usize = 6;
-/// Planes of a term of harmonics of degree 3.
+/// Number of planes of one term of SH coefficients of degree 3.
 pub(super) const TERM: usize = 48;
 
-/// The marginal up to which a Gaussian is not drawn.
+/// Temporal marginal m up to which a Gaussian is not drawn.
 const CUT: f64 = 0.05;
 
-/// The law of the family.
+/// Motion model of four-dimensional Gaussians.
 #[derive(Debug, Clone)]
 pub(super) struct Native {
-    /// Whether it turns in four dimensions; else time stands alone.
+    /// Whether Gaussians have a 4D rotation; if not, space and time are independent.
     pub(super) turns: bool,
-    /// Whether both axes of the rotation are reversed.
+    /// Whether both axes of the rotation matrix are reversed.
     pub(super) flipped: bool,
-    /// What is added to Σ_tt in the marginal.
+    /// Variance added to Σ_tt in the temporal marginal.
     pub(super) prefilter: f64,
-    /// Terms of harmonics in time.
+    /// Number of time-dependent SH terms.
     pub(super) terms: usize,
-    /// L as the user gives it.
+    /// Period L given by the user or the training configuration.
     pub(super) given: Option<f64>,
-    /// L.
+    /// Period L in use.
     pub(super) period: f64,
 }
 
-/// What follows from raw parameters for all times.
+/// Time-independent values of some Gaussians.
 #[derive(Debug)]
 pub(super) struct Slices {
-    /// A plane for each axis.
+    /// Velocity, one plane per axis.
     velocity: [Vec<f64>; 3],
-    /// −1/(2 Σ_tt), with the prefilter.
+    /// −1/(2 Σ_tt), including the prefilter.
     rates: Vec<f64>,
+    /// exp(−o) of each opacity logit o.
     odds: Vec<f64>,
-    /// Of Σ, where it turns in four dimensions.
+    /// Rotation of Σ; empty without a 4D rotation.
     rotation: Column,
+    /// Log scales of Σ; empty without a 4D rotation.
     log_scale: Column,
 }
 
-/// Of one Gaussian.
+/// Time-independent values of one Gaussian.
 pub(super) struct Slice {
     pub(super) velocity: [f64; 3],
-    /// Σ_tt.
+    /// Variance in time, Σ_tt.
     pub(super) variance: f64,
-    /// Σ: xx xy xz yy yz zz; none: that of the raw scales and rotation.
+    /// Spatial covariance Σ: xx xy xz yy yz zz; `None` if it follows from the raw scales and rotation.
     pub(super) covariance: Option<[f64; 6]>,
 }
 
 impl Native {
-    /// What follows for row `i`.
+    /// Computes the velocity and covariance of Gaussian `i`.
     pub(super) fn slice(&self, raw: &Raw, i: usize) -> Slice {
         let along = f64::from(raw.own.plane(SCALING_T)[i]);
         if !self.turns {
@@ -77,24 +82,25 @@ impl Native {
         let whole =
             covariance(&rotation([l.map(f64::from), r.map(f64::from)], self.flipped), [x, y, z, along].map(f64::exp));
         let variance = whole[3][3];
-        // A Gaussian as short as nothing does not move.
+        // A Gaussian without extent in time does not move.
         let velocity = [0, 1, 2].map(|c| if variance > 0.0 { whole[c][3] / variance } else { 0.0 });
         let entry = |i: usize, j: usize| whole[i][j] - velocity[i] * whole[3][j];
         let covariance = [entry(0, 0), entry(0, 1), entry(0, 2), entry(1, 1), entry(1, 2), entry(2, 2)];
         Slice { velocity, variance, covariance: Some(covariance) }
     }
 
+    /// Returns −1/(2 Σ_tt), including the prefilter.
     fn rate(&self, variance: f64) -> f64 {
         -0.5 / (variance + self.prefilter.max(0.0))
     }
 
-    /// What is left at `time` of a Gaussian with that center and Σ_tt.
+    /// Returns the temporal marginal m at `time` of a Gaussian with this center and variance Σ_tt; 0 below the cutoff.
     pub(super) fn marginal(&self, time: f64, center: f64, variance: f64) -> f64 {
         let m = (self.rate(variance) * (time - center).powi(2)).exp();
         if m > CUT { m } else { 0.0 }
     }
 
-    /// cos(2π(μ − t)/L) and its double.
+    /// Returns cos(2π(μ − t)/L) and cos(4π(μ − t)/L).
     pub(super) fn waves(&self, time: f64, center: f64) -> [f64; 2] {
         let wave = (TAU * (center - time) / self.period).cos();
         [wave, 2.0 * wave * wave - 1.0]
@@ -131,7 +137,8 @@ impl MotionModel for Native {
         Columns::POSITION | Columns::OPACITY | colors
     }
 
-    /// Scales and rotations follow from those of four dimensions together.
+    /// Excludes scales and rotations of Gaussians with a 4D rotation: they follow from the 4D scales and rotation
+    /// together.
     fn movable(&self) -> Columns {
         let mixed = if self.turns { Columns::ROTATION | Columns::LOG_SCALE } else { Columns::empty() };
         Columns::all().difference(mixed)

@@ -1,8 +1,9 @@
-//! 4D Gaussian Splatting in its native form (fudan-zvg): Gaussians of four dimensions in a training checkpoint.
+//! 4D Gaussian Splatting in its native form (fudan-zvg): four-dimensional Gaussians in a training checkpoint.
 //!
-//! In: a folder with `chkpnt<K>.pth` or `chkpnt_best.pth`, or such a file: `(capture, iteration)`, the capture a tuple of 19,
-//! or of 12 of a static model. Out: the same checkpoint with fewer rows, optimiser state included, `cfg_args` and the training
-//! configuration if it is there. What they do not say of how it was trained can be said: [`Conventions`].
+//! Input: a folder with `chkpnt<K>.pth` or `chkpnt_best.pth`, or such a file: `(capture, iteration)`, where the capture
+//! is a tuple of 19 (4D) or 12 (static model). Output: the same checkpoint with fewer rows, including optimizer state,
+//! `cfg_args` and the training configuration if it is there. Settings of the training that the files do not record can
+//! be given as [`Conventions`].
 
 mod configuration;
 mod law;
@@ -26,15 +27,16 @@ use crate::recipe::MergeParams;
 use configuration::TrainingConfig;
 use law::{Native, ROTATION_R, SCALING_T, TERM, TERMS, TIME};
 
-/// Lengths of the tuple that a model captures: of four dimensions, and static.
+/// Length of the capture tuple of a 4D model.
 const MOVING: usize = 19;
+/// Length of the capture tuple of a static model.
 const STATIC: usize = 12;
 
-/// A checkpoint, or the folder of a model.
+/// Checkpoint, or the folder of a model.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
     expected: "a 4D Gaussian Splatting checkpoint",
     recognizes: |found| match found.is_folder {
-        // Other families save checkpoints of their own beside their clouds.
+        // Other formats save checkpoints of their own beside a folder `point_cloud`.
         true if found.path.join("point_cloud").is_dir() => {
             checkpoints(found.path).iter().any(|path| captures(path, &[MOVING], found.memory))
         }
@@ -56,14 +58,14 @@ pub(super) const ENTRY: ModelFormat = ModelFormat {
     },
 };
 
-/// The best one, then those of iterations.
+/// Returns the best checkpoint, then those of iterations, last one first.
 fn checkpoints(folder: &Path) -> Vec<PathBuf> {
     let best = folder.join("chkpnt_best.pth");
     let by_number = numbered(folder, "chkpnt", ".pth").into_iter().rev().map(|(_, path)| path);
     best.is_file().then_some(best).into_iter().chain(by_number).collect()
 }
 
-/// Whether the checkpoint at `path` has a tuple of such a length and a number.
+/// Returns whether the checkpoint at `path` is a pair of a tuple with one of `lengths` and an iteration number.
 fn captures(path: &Path, lengths: &[usize], memory: ReadLimit) -> bool {
     let Ok(checkpoint) = Checkpoint::open(path, memory) else { return false };
     let pickle = checkpoint.pickle();
@@ -76,7 +78,8 @@ fn captures(path: &Path, lengths: &[usize], memory: ReadLimit) -> bool {
     }
 }
 
-/// The checkpoint that `options` name, or the best, or the last.
+/// Returns the checkpoint of the requested iteration; without a request the best one, or the last. Adds a note if there
+/// are several.
 fn choose(folder: &Path, options: &OpenOptions) -> Result<(PathBuf, Vec<String>)> {
     let found = checkpoints(folder);
     let name = |path: &Path| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
@@ -97,6 +100,7 @@ fn choose(folder: &Path, options: &OpenOptions) -> Result<(PathBuf, Vec<String>)
     }
 }
 
+/// Opens a checkpoint as a 4D or a static model.
 fn open(about: About, options: &OpenOptions) -> Result<Box<dyn InputModel>> {
     let conventions = options.conventions;
     let checkpoint = Checkpoint::open(&about.file, options.memory)?;
@@ -122,7 +126,7 @@ fn open(about: About, options: &OpenOptions) -> Result<Box<dyn InputModel>> {
     let coefficients = found.shape.get(1).map_or(0, |rest| rest.saturating_add(1));
     let (degree, stored) = match (coefficients, moves) {
         (1 | 4 | 9 | 16, _) => (coefficients.isqrt() - 1, 0),
-        // Those beyond the first 16 are of a basis that no renderer reads any more.
+        // Coefficients beyond the first 16 belong to a basis that renderers no longer read.
         (33, true) => (3, 0),
         (32 | 48, true) => (3, coefficients / 16 - 1),
         _ => {
@@ -216,7 +220,8 @@ impl ProxyRule for Native {
         hash.update(&self.given.unwrap_or(0.0).to_le_bytes());
     }
 
-    /// L is that of the videos of N3V where frames lie beyond 1, unless it is given.
+    /// Chooses the period L of colors: the given one, else 10 (the length of the N3V videos) if frames lie beyond time
+    /// 1, else 1.
     fn at(&self, times: &[f64]) -> Option<Native> {
         let beyond = times.iter().any(|&time| time > 1.0);
         let guessed = if beyond { 10.0 } else { 1.0 };

@@ -1,41 +1,46 @@
-//! Rotations of four dimensions as pairs of quaternions.
+//! Four-dimensional rotations as pairs of quaternions.
 //!
-//! R = L(l)·R̄(r): L multiplies from the left by the unit quaternion l, R̄ from the right by the conjugate of r, on (w, x, y, z).
-//! Rows and columns are then x, y, z, t once both axes are reversed. Source: `build_rotation_4d` of the repository.
+//! R = L(l)·R̄(r): L multiplies from the left by the unit quaternion l, and R̄ from the right by the conjugate of r, on
+//! (w, x, y, z). After reversing both axes, rows and columns are x, y, z, t. Source: `build_rotation_4d` of the
+//! repository.
 
-/// Rows of a matrix.
+/// 4×4 matrix, row by row.
 pub(super) type Matrix = [[f64; 4]; 4];
 
+/// Returns the matrix of multiplication from the left by a quaternion.
 fn left([a, b, c, d]: [f64; 4]) -> Matrix {
     [[a, -b, -c, -d], [b, a, -d, c], [c, d, a, -b], [d, -c, b, a]]
 }
 
+/// Returns the matrix of multiplication from the right by the conjugate of a quaternion.
 fn right([p, q, r, s]: [f64; 4]) -> Matrix {
     [[p, q, r, s], [-q, p, -s, r], [-r, s, p, -q], [-s, -r, q, p]]
 }
 
+/// Returns the matrix product.
 fn product(a: &Matrix, b: &Matrix) -> Matrix {
     [0, 1, 2, 3].map(|i| [0, 1, 2, 3].map(|j| (0..4).map(|k| a[i][k] * b[k][j]).sum()))
 }
 
-/// Both axes reversed; its own inverse.
+/// Reverses the order of rows and columns. Applied twice, it returns the original matrix.
 fn reversed(a: &Matrix) -> Matrix {
     [3, 2, 1, 0].map(|i| [3, 2, 1, 0].map(|j| a[i][j]))
 }
 
+/// Returns the normalized quaternion; 1 for a quaternion of length 0.
 fn unit(q: [f64; 4]) -> [f64; 4] {
     let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
     if length > 0.0 { q.map(|x| x / length) } else { [1.0, 0.0, 0.0, 0.0] }
 }
 
-/// The rotation of two quaternions of any length but 0, which counts as 1; not `flipped`: as in checkpoints from before
-/// 15 September 2024, without the reversal.
+/// Returns the rotation matrix of two quaternions of any length; length 0 counts as the quaternion 1. `flipped`
+/// reverses both axes; checkpoints from before 15 September 2024 have no reversal.
 pub(super) fn rotation([l, r]: [[f64; 4]; 2], flipped: bool) -> Matrix {
     let whole = product(&left(unit(l)), &right(unit(r)));
     if flipped { reversed(&whole) } else { whole }
 }
 
-/// Unit quaternions whose rotation is `matrix`, one of determinant 1.
+/// Returns unit quaternions whose rotation is `matrix`, which must have determinant 1.
 pub(super) fn quaternions(matrix: &Matrix, flipped: bool) -> [[f64; 4]; 2] {
     let matrix = if flipped { reversed(matrix) } else { *matrix };
     let axis = |i: usize| {
@@ -43,7 +48,8 @@ pub(super) fn quaternions(matrix: &Matrix, flipped: bool) -> [[f64; 4]; 2] {
         axis[i] = 1.0;
         axis
     };
-    // Products of the basis are orthogonal, each of squared length 4: these are the coefficients l_i·r_j, of rank 1.
+    // Products of the basis matrices are orthogonal, each with squared norm 4. The result is the matrix of coefficients
+    // l_i·r_j, of rank 1.
     let coefficient = |i: usize, j: usize| -> f64 {
         let of = product(&left(axis(i)), &right(axis(j)));
         of.iter().flatten().zip(matrix.iter().flatten()).map(|(a, b)| a * b).sum::<f64>() / 4.0
@@ -56,14 +62,14 @@ pub(super) fn quaternions(matrix: &Matrix, flipped: bool) -> [[f64; 4]; 2] {
     [unit(l), r]
 }
 
-/// R diag(s)² Rᵀ.
+/// Returns R diag(s)² Rᵀ.
 pub(super) fn covariance(rotation: &Matrix, scales: [f64; 4]) -> Matrix {
     [0, 1, 2, 3]
         .map(|i| [0, 1, 2, 3].map(|j| (0..4).map(|k| rotation[i][k] * scales[k].powi(2) * rotation[j][k]).sum()))
 }
 
-/// Scales and rotation (determinant 1) of a covariance, by Jacobi's method: the axis that goes furthest along time is last.
-/// Squares of scales are at least 1e-14.
+/// Returns scales and rotation (determinant 1) of a covariance by Jacobi's method. The axis with the largest time
+/// component comes last. Squares of scales are at least 1e-14.
 pub(super) fn decomposed(covariance: &Matrix) -> ([f64; 4], Matrix) {
     const SWEEPS: usize = 16;
     const LEAST: f64 = 1e-14;
@@ -108,6 +114,7 @@ pub(super) fn decomposed(covariance: &Matrix) -> ([f64; 4], Matrix) {
     (scales, rotation)
 }
 
+/// Returns the determinant by expansion along the first row.
 fn determinant(a: &Matrix) -> f64 {
     let minor = |row: [usize; 3], column: [usize; 3]| {
         let of = |i: usize, j: usize| a[row[i]][column[j]];
@@ -124,7 +131,7 @@ mod tests {
 
     use super::*;
 
-    /// Of quaternions as (w, x, y, z).
+    /// Returns the product of two quaternions (w, x, y, z).
     fn hamilton([a, b, c, d]: [f64; 4], [p, q, r, s]: [f64; 4]) -> [f64; 4] {
         [
             a * p - b * q - c * r - d * s,
@@ -153,7 +160,7 @@ mod tests {
             let apply = |matrix: &Matrix, at: [f64; 4]| matrix.map(|row| (0..4).map(|k| row[k] * at[k]).sum::<f64>());
             let got = apply(&rotation([l, r], false), at);
             prop_assert!((0..4).all(|i| (got[i] - expected[i]).abs() < 1e-13), "{got:?} {expected:?}");
-            // Reversed: of (z, y, x, w), as (z, y, x, w).
+            // Reversed axes map (z, y, x, w) to (z, y, x, w).
             let back = |[a, b, c, d]: [f64; 4]| [d, c, b, a];
             let got = back(apply(&rotation([l, r], true), back(at)));
             prop_assert!((0..4).all(|i| (got[i] - expected[i]).abs() < 1e-13), "{got:?} {expected:?}");

@@ -1,8 +1,8 @@
-//! The PLY of a model: which property is which parameter.
+//! Point cloud file of a SpacetimeGaussians model, with the mapping of its properties to parameters.
 //!
-//! `x y z trbf_center trbf_scale nx ny nz motion_0..8 f_dc_0..(2|5) opacity scale_0..2 rot_0..3 omega_0..3 [f_t_0..2]`, in any
-//! order. The authors' loader counts properties by how their names begin, so none may be there that begins so beside these.
-//! Source: `save_ply`, `load_ply` of their code.
+//! `x y z trbf_center trbf_scale nx ny nz motion_0..8 f_dc_0..(2|5) opacity scale_0..2 rot_0..3 omega_0..3 [f_t_0..2]`,
+//! in any order. The authors' loader counts properties by name prefix, so the file may have no other properties with
+//! these prefixes. Source: `save_ply`, `load_ply` of their code.
 
 use std::path::Path;
 
@@ -14,22 +14,21 @@ use crate::files::ply::write::{out_rows, put, value, write_rows_like};
 use crate::files::ply::{PlaneSource, Ply, PlyEncoding, PlyOptions, Property};
 use crate::model::{Column, Columns, Raw, SH_C0, harmonic};
 
-/// The property that no other kind of cloud has.
+/// Name of a property that no other format has.
 pub(super) const MARK: &str = "trbf_center";
 
-/// An open PLY.
+/// Open point cloud file.
 #[derive(Debug)]
 pub(super) struct Cloud {
     ply: Ply,
-    /// Properties of the planes of [`Raw::own`].
+    /// Property of each plane of [`Raw::own`].
     own: Vec<Property>,
 }
 
 impl Cloud {
     /// Opens the PLY at `path`.
     ///
-    /// # Errors
-    /// A PLY that is none of Gaussians; properties that are missing, or too many.
+    /// # Errors Fails if the PLY holds no Gaussians, or if properties are missing or too many.
     pub(super) fn open(path: &Path, options: &PlyOptions) -> Result<Cloud> {
         let ply = Ply::open_with(path, options)?;
         let beginning =
@@ -65,15 +64,14 @@ impl Cloud {
         Ok(Cloud { own: own.collect::<Result<_>>()?, ply })
     }
 
-    /// Whether it is of the full model.
+    /// Returns whether the file belongs to the full model.
     pub(super) fn is_full(&self) -> bool {
         self.own.len() == FULL_WIDTH
     }
 
-    /// The parameters of all Gaussians; `act` makes colors of the full model's first features.
+    /// Reads the parameters of all Gaussians. `act` turns the first features of the full model into colors.
     ///
-    /// # Errors
-    /// A value that is no finite number; a file cut short since it was opened.
+    /// # Errors Fails if a value is not finite or the file was cut short since it was opened.
     pub(super) fn raw(&self, act: Act) -> Result<Raw> {
         let count = self.ply.count();
         let mut raw = Raw { gaussians: self.ply.whole()?, own: Column::zeros(0, count) };
@@ -99,16 +97,15 @@ impl Cloud {
         Ok(raw)
     }
 
-    /// What stands for red, green and blue of all Gaussians.
+    /// Reads the stored red, green and blue of all Gaussians (`f_dc_0..2`).
     ///
-    /// # Errors
-    /// A file cut short since it was opened.
+    /// # Errors Fails if the file was cut short since it was opened.
     pub(super) fn colors(&self) -> Result<[Vec<f32>; 3]> {
         let of = |name: &str| -> Result<Vec<f32>> { Ok(self.ply.values(name)?.unwrap_or_default()) };
         Ok([of("f_dc_0")?, of("f_dc_1")?, of("f_dc_2")?])
     }
 
-    /// Confirms that the values of a property are finite.
+    /// Checks that the values of a property are finite.
     fn check(&self, name: &str, values: &[f32]) -> Result<()> {
         match values.iter().position(|x| !x.is_finite()) {
             Some(row) => {
@@ -120,17 +117,17 @@ impl Cloud {
         }
     }
 
-    /// Writes what `reduction` leaves, under the same header: rows as they are, but proxies in their places, and changes added.
+    /// Writes the compressed model under the same header. Rows are copied byte for byte; proxies are written in place
+    /// of their leaders, and parameter deltas are added.
     ///
-    /// # Errors
-    /// A file cut short since it was opened; a failed write.
+    /// # Errors Fails if the file was cut short since it was opened or a write fails.
     pub(super) fn write(&self, reduction: &CompressedModel, path: &Path) -> Result<()> {
         let (layout, rows) = (self.ply.layout(), out_rows(reduction));
         let big_endian = self.ply.header().encoding == PlyEncoding::BigEndian;
         let (proxies, by) = (reduction.proxies.raw.as_ref(), &reduction.change.0);
         let places = |column: Columns| layout.planes(column).iter().enumerate();
         let columns: Vec<Columns> = Columns::all().iter().filter(|&of| of != Columns::SH || !self.is_full()).collect();
-        // A color stands as it is, not as a harmonic.
+        // The lite model stores colors, not SH coefficients.
         let unit = |column: Columns| if column == Columns::SH { SH_C0 } else { 1.0 };
         let zero = |column: Columns| if column == Columns::SH { 0.5 } else { 0.0 };
         write_rows_like(
@@ -168,7 +165,7 @@ impl Cloud {
     }
 }
 
-/// Names of the planes of [`Raw::own`].
+/// Returns the property names of the planes of [`Raw::own`].
 fn names(is_full: bool) -> Vec<String> {
     let numbered = |name: &'static str, count: usize| (0..count).map(move |k| format!("{name}_{k}"));
     let mut names: Vec<String> = vec![MARK.to_owned(), "trbf_scale".to_owned()];
@@ -179,8 +176,8 @@ fn names(is_full: bool) -> Vec<String> {
     names
 }
 
-/// Turns what stands for a color into a harmonic: with `act`, that of the first features, else the color itself, which
-/// stands where a harmonic would.
+/// Replaces stored colors by SH coefficients of degree 0. With `act`, the color is `act` of the first features;
+/// without, it is the stored color, which the PLY reader put where a coefficient would be.
 fn paint(raw: &mut Raw, act: Option<Act>) {
     for c in 0..3 {
         let features = raw.own.width() > FEATURES;

@@ -1,33 +1,34 @@
-//! What makes colors of the nine features that the full model blends.
+//! Network that computes pixel colors from the nine blended features of the full model.
 //!
-//! Of a pixel's features F, camera center o and unit ray d: act(F₀₋₂ + W₂·relu(W₁·[F₃₋₅, F₆₋₈, o, d])). W₁ is `mlp1.weight`
-//! [6, 12, 1, 1], W₂ `mlp2.weight` [3, 6, 1, 1] of `point_cloud.pt`; neither has a bias. Source: `helper_model.py` of the
-//! authors' code.
+//! With features F of a pixel, camera center o and unit ray d, the color is act(F₀₋₂ + W₂·relu(W₁·[F₃₋₅, F₆₋₈, o, d])).
+//! W₁ is `mlp1.weight` [6, 12, 1, 1] and W₂ is `mlp2.weight` [3, 6, 1, 1] of `point_cloud.pt`; neither has a bias.
+//! Source: `helper_model.py` of the authors' code.
 
 use std::path::Path;
 
 use crate::deform::Tensors;
 use crate::error::{Error, Result, quoted};
 
-/// Features that are blended.
+/// Number of features that are blended.
 pub(super) const FEATURES: usize = 9;
-/// Inputs of the network: features 3 to 8, camera center, ray.
+/// Number of network inputs: features 3 to 8, camera center, ray.
 const INPUTS: usize = 12;
+/// Number of hidden units.
 const HIDDEN: usize = 6;
 
-/// What is done to a color last.
+/// Function applied to a color as the last step.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Act {
-    /// The logistic function.
+    /// Logistic function.
     Sigmoid,
-    /// Confined to 0 … 1.
+    /// Clamp to 0 … 1.
     Clamp,
-    /// Nothing.
+    /// Identity.
     None,
 }
 
 impl Act {
-    /// As `rgbfunction` of `cfg_args` calls it.
+    /// Returns the function that `rgbfunction` of `cfg_args` names; `None` for other names.
     pub(super) fn named(name: &str) -> Option<Act> {
         match name {
             "sandwich" => Some(Act::Sigmoid),
@@ -37,7 +38,7 @@ impl Act {
         }
     }
 
-    /// Of a color before it.
+    /// Applies the function to a color value.
     pub(super) fn apply(self, x: f64) -> f64 {
         match self {
             Act::Sigmoid => 1.0 / (1.0 + (-x).exp()),
@@ -47,7 +48,7 @@ impl Act {
     }
 }
 
-/// The network.
+/// Weights of the network, and its last function.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct ColorDecoder {
     first: [[f64; INPUTS]; HIDDEN],
@@ -56,10 +57,9 @@ pub(super) struct ColorDecoder {
 }
 
 impl ColorDecoder {
-    /// The network of the state dict `tensors`, read from `path`.
+    /// Reads the network from the state dict `tensors` of the file `path`.
     ///
-    /// # Errors
-    /// Weights that are missing, of other shapes, or no finite numbers.
+    /// # Errors Fails if weights are missing, have other shapes or are not finite.
     pub(super) fn new(tensors: &Tensors, act: Act, path: &Path) -> Result<ColorDecoder> {
         let weights = |name: &str, shape: [usize; 4]| {
             let place = || format!("tensor {name}");
@@ -92,7 +92,8 @@ impl ColorDecoder {
         })
     }
 
-    /// The color of a pixel whose [`FEATURES`] are `features`, seen from `center` along the unit `ray`.
+    /// Returns the color of a pixel with blended `features` ([`FEATURES`] values), seen from the camera center `center`
+    /// along the unit vector `ray`.
     pub(super) fn color(&self, features: &[f32], center: [f32; 3], ray: [f32; 3]) -> [f32; 3] {
         let mut inputs = [0.0; INPUTS];
         let all = features[3..].iter().chain(&center).chain(&ray);
@@ -109,7 +110,7 @@ pub(crate) mod tests {
     use crate::deform::Tensor;
     use crate::model::opacity;
 
-    /// Weights of a small network, as a state dict has them.
+    /// Returns the weights of a small network as in a state dict.
     pub(in super::super) fn weights() -> Tensors {
         let ramp = |n: usize, by: f32| (0..n).map(|i| by * ((i * 7 % 11) as f32 - 5.0)).collect::<Vec<f32>>();
         [
@@ -137,7 +138,7 @@ pub(crate) mod tests {
         let mut tensors = weights();
         let first = &mut tensors.get_mut("mlp1.weight").unwrap().data;
         first.fill(0.0);
-        // Hidden 0 sees feature 3, hidden 1 the ray's z.
+        // Hidden unit 0 reads feature 3; hidden unit 1 reads z of the ray.
         (first[0], first[12 + 11]) = (2.0, 3.0);
         let second = &mut tensors.get_mut("mlp2.weight").unwrap().data;
         second.fill(0.0);

@@ -1,8 +1,10 @@
-//! SpacetimeGaussians, lite and full, as a family: a folder as its training writes it, its PLY alone, or a `.splatv`.
+//! SpacetimeGaussians (lite and full) as a model format: a folder as its training writes it, its PLY alone, or a
+//! `.splatv`.
 //!
-//! The result has the same layout with fewer Gaussians: rows of the PLY byte for byte, but for what merging and refining
-//! changed of them, in the family's own parameters; everything else is copied. Of the full model a renderer blends nine features
-//! and asks a network for the color of each pixel; what is looked at here is the color that the first three have by themselves.
+//! The output has the same layout with fewer Gaussians. Rows of the PLY are kept byte for byte, except for values that
+//! merging or refinement changed; other files are copied. The renderer of the full model blends nine features and a
+//! network computes the color of each pixel from them. Statistics, merging and refinement here use the color that the
+//! first three features have without the network.
 
 mod cloud;
 mod common;
@@ -44,14 +46,18 @@ use decoder::{Act, ColorDecoder};
 use law::{FULL_WIDTH, Spacetime, WIDTH};
 pub(super) use splatv::SPLATV;
 
+/// Name of the folder of iterations.
 const CLOUDS: &str = "point_cloud";
+/// Name of the point cloud file in an iteration folder.
 const CLOUD: &str = "point_cloud.ply";
+/// Name of the file with the decoder network of the full model.
 const DECODER: &str = "point_cloud.pt";
+/// Name of the file with the training arguments.
 const CFG_ARGS: &str = "cfg_args";
-/// What is copied beside it, where it is there.
+/// File of the model folder that is copied to the output if it exists.
 const CAMERAS: &str = "cameras.json";
 
-/// A model's folder, or its PLY.
+/// SpacetimeGaussians model folder, or its PLY.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
     expected: "a SpacetimeGaussians model folder",
     recognizes: |found| match found.is_folder {
@@ -61,26 +67,27 @@ pub(super) const ENTRY: ModelFormat = ModelFormat {
     open: |path, options| Ok(Box::new(SpacetimeGaussians::open(path, options)?)),
 };
 
-/// Whether the header of the PLY at `path` has a property that only this family's has.
+/// Returns whether the header of the PLY at `path` has a property that only SpacetimeGaussians writes.
 pub(super) fn is_marked(path: &Path) -> bool {
-    // Enough for any header of this family; nothing of a model's values.
+    // 16 KiB hold the whole header of any PLY of this format; the rest of the file is not read.
     let mut head = Vec::new();
     let read = open_file(path).is_ok_and(|file| file.take(1 << 14).read_to_end(&mut head).is_ok());
     let header = head.windows(10).position(|bytes| bytes == b"end_header").map_or(&head[..], |end| &head[..end]);
     read && header.windows(MARK.len()).any(|bytes| bytes == MARK.as_bytes())
 }
 
-/// The files of a model.
+/// Paths of the files of a model.
 #[derive(Debug, Clone)]
 struct Files {
     cloud: PathBuf,
-    /// Of a folder: its root, and K of `iteration_K`.
+    /// Model folder and K of `iteration_K`; `None` for a PLY alone.
     folder: Option<(PathBuf, u32)>,
-    /// The network of the full model.
+    /// File of the decoder network of the full model.
     decoder: Option<PathBuf>,
 }
 
 impl Files {
+    /// Finds the files of the model at `path`, of the requested iteration or the largest.
     fn find(path: &Path, options: &OpenOptions) -> Result<Files> {
         if !path.is_dir() {
             options.refuse_for(path)?;
@@ -91,27 +98,28 @@ impl Files {
         Ok(Files { cloud: folder.join(CLOUD), folder: Some((path.to_owned(), number)), decoder })
     }
 
-    /// A file of the folder's root, where there is one.
+    /// Returns the path of the file `name` in the model folder if it exists.
     fn of_root(&self, name: &str) -> Option<PathBuf> {
         self.folder.as_ref().map(|(root, _)| root.join(name)).filter(|path| path.is_file())
     }
 
-    /// What a renderer opens beside the cloud.
+    /// Returns the files that a renderer opens in addition to the point cloud file.
     fn rest(&self) -> Vec<PathBuf> {
         self.decoder.clone().into_iter().chain(self.of_root(CFG_ARGS)).collect()
     }
 }
 
-/// What of `cfg_args` matters here.
+/// Values of `cfg_args` that are used.
 #[derive(Debug, Clone, Default)]
 struct SpacetimeConfig {
     source_path: Option<String>,
     rgb_function: Option<String>,
-    /// Frames from 0 to 1.
+    /// Number of frames in the time span from 0 to 1.
     duration: Option<usize>,
 }
 
 impl SpacetimeConfig {
+    /// Reads the `Namespace(…)` of `cfg_args`.
     fn read(path: &Path) -> Result<SpacetimeConfig> {
         let text = read_text(path, 1 << 20)?;
         let arguments = parse_call(&text, "Namespace").map_err(|error| error.in_file(path, &text))?;
@@ -132,7 +140,7 @@ impl SpacetimeConfig {
     }
 }
 
-/// An open model.
+/// Open SpacetimeGaussians model.
 #[derive(Debug)]
 struct SpacetimeGaussians {
     files: Files,
@@ -144,6 +152,7 @@ struct SpacetimeGaussians {
 }
 
 impl SpacetimeGaussians {
+    /// Opens the model folder or PLY at `path`.
     fn open(path: &Path, options: &OpenOptions) -> Result<SpacetimeGaussians> {
         let files = Files::find(path, options)?;
         let cloud = Cloud::open(&files.cloud, &options.ply())?;
@@ -189,7 +198,7 @@ impl SpacetimeGaussians {
         Ok(SpacetimeGaussians { files, cloud, model, configuration, act, notes })
     }
 
-    /// Writes the model folder of what is left.
+    /// Writes the model folder of the compressed model.
     fn write_folder(&self, reduction: &CompressedModel, path: &Path) -> Result<()> {
         let number = self.files.folder.as_ref().map_or(0, |(_, number)| *number);
         let folder = path.join(CLOUDS).join(format!("iteration_{number}"));
@@ -203,7 +212,8 @@ impl SpacetimeGaussians {
     }
 }
 
-/// How many Gaussians have a color that the authors' renderer adds and that others cut.
+/// Returns a note with the number of Gaussians whose color is negative: the authors' renderer adds such colors, others
+/// clamp them to 0.
 fn dark(raw: &Raw) -> Option<String> {
     let is_dark = |row: usize| raw.gaussians.sh.row::<3>(row).iter().any(|&harmonic| color(harmonic) < 0.0);
     let count = (0..raw.len()).filter(|&row| is_dark(row)).count();
@@ -279,7 +289,7 @@ impl InputModel for SpacetimeGaussians {
         self.configuration.duration
     }
 
-    /// Whatever `white_background` of `cfg_args` says.
+    /// Returns black: training ignores `white_background` of `cfg_args`.
     fn background(&self) -> Option<[f32; 3]> {
         Some([0.0; 3])
     }
@@ -320,7 +330,7 @@ impl InputModel for SpacetimeGaussians {
             OutputKind::Ply => self.cloud.write(reduction, path)?,
             OutputKind::Splatv => {
                 let raw = left(self.model.raw(), reduction);
-                // Those that did not change, as they stand: there and back a last digit can be lost.
+                // Keep the stored color where it did not change: converting it to SH and back can lose the last digit.
                 let (own, colors) = (&self.model.raw().gaussians.sh, self.cloud.colors()?);
                 let known = |i: usize| {
                     let id = reduction.kept[i] as usize;

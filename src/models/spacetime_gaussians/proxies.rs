@@ -1,9 +1,10 @@
-//! Proxies in the family's own parameters.
+//! Proxies with raw parameters of SpacetimeGaussians.
 //!
-//! Members are told from the center of the proxy's window, exactly; weighted means of their coefficients then give the
-//! weighted mean of their states at every time. Where their windows differ, so that who is there changes with time, the path
-//! is the one nearest to the weighted mean of those that are. Size and shape: second moments over the window, in axes that turn
-//! with the proxy. Opacity: the amplitude of the window nearest to the opacity of the members' moment match.
+//! Members are re-expressed around the center of the proxy's window, which is exact. The weighted mean of their
+//! coefficients then gives the weighted mean of their states at every time. If their windows differ, so that different
+//! members are visible at different times, the path is a least-squares fit to the weighted mean of the visible members.
+//! Size and shape are second moments over the window, in axes that rotate with the proxy. Opacity is the amplitude of
+//! the window that best fits the opacity of the members' moment match.
 
 use glam::{DQuat, DVec3};
 use rayon::prelude::*;
@@ -20,19 +21,19 @@ use crate::models::motion_model::{MotionModel, MotionModelFrames};
 use crate::recipe::MergeParams;
 use crate::source::FrameSource;
 
-/// Windows differ where one is wider by this factor than another, or off its proxy's center by half its width.
+/// Windows are treated as different if one is wider than another by more than this factor, or off the proxy's center by
+/// more than half of its width.
 const MOST_WIDER: f64 = 1.5;
-/// Part of its full height below which a window holds nothing that counts.
+/// Fraction of its maximum below which a window is ignored.
 const OPEN: f64 = 0.05;
-/// Times at which shape and opacity are compared, at most.
+/// Maximum number of times at which shape and opacity are compared.
 const SAMPLED_TIMES: usize = 12;
-/// Opacities of proxies stay within [this, 1 − this].
+/// Margin of proxy opacities from 0 and 1.
 const OPACITY_MARGIN: f64 = 1e-6;
 
-/// A row for each of `clusters`; `act` makes colors of the full model's first features.
+/// Computes one proxy for each of `clusters`. `act` turns the first features of the full model into colors.
 ///
-/// # Errors
-/// States that cannot be evaluated.
+/// # Errors Fails if states cannot be evaluated.
 pub(super) fn propose(
     model: &MotionModelFrames<Spacetime>,
     clusters: &[Cluster],
@@ -46,19 +47,21 @@ pub(super) fn propose(
     Ok(raw)
 }
 
-/// The members of a cluster, with all that is asked of them again and again.
+/// Members of a cluster, with values that are used repeatedly.
 struct ClusterMembers<'a> {
     model: &'a MotionModelFrames<Spacetime>,
     raw: Raw,
     prepared: <Spacetime as MotionModel>::Prepared,
-    /// Weights, and motions as they are.
+    /// Weight and motion of each member.
     motions: Vec<(f64, SpacetimeMotion)>,
-    /// Rows and weights.
+    /// Row in `raw` and weight of each member.
     rows: Vec<(u32, f64)>,
+    /// Row of the leader in `raw`.
     leader: u32,
 }
 
 impl ClusterMembers<'_> {
+    /// Collects the members of `cluster`.
     fn new<'a>(model: &'a MotionModelFrames<Spacetime>, cluster: &Cluster) -> ClusterMembers<'a> {
         let ids: Vec<u32> = cluster.members.iter().map(|&(id, _)| id).collect();
         let raw = model.raw().pick(&ids);
@@ -69,13 +72,15 @@ impl ClusterMembers<'_> {
         ClusterMembers { prepared: model.law().prepare(&raw), model, raw, motions, rows, leader }
     }
 
+    /// Returns the states of all members at `time`.
     fn state(&self, time: f64) -> Result<Gaussians> {
         let mut state = Gaussians::zeros(self.raw.len(), self.raw.gaussians.sh_degree());
         self.model.law().state(time, &self.raw, &self.prepared, Columns::all(), &mut state)?;
         Ok(state)
     }
 
-    /// Times of frames at which `of` is open, evenly spread if they are many; its center where there are none.
+    /// Returns up to [`SAMPLED_TIMES`] frame times at which the window of `of` counts, evenly spread; its center if
+    /// there are none.
     fn times(&self, of: &SpacetimeMotion) -> Vec<f64> {
         let times = &self.model.info().times;
         let open: Vec<f64> = times.iter().copied().filter(|&time| of.window(time) >= OPEN).collect();
@@ -88,6 +93,7 @@ impl ClusterMembers<'_> {
     }
 }
 
+/// Computes the raw parameters of the proxy of `cluster`, in one row.
 fn proxy(model: &MotionModelFrames<Spacetime>, cluster: &Cluster, rule: &MergeParams, act: Act) -> Result<Raw> {
     let members = ClusterMembers::new(model, cluster);
     let (center, log_width) = merged_window(&members.motions);
@@ -122,13 +128,13 @@ fn proxy(model: &MotionModelFrames<Spacetime>, cluster: &Cluster, rule: &MergePa
     Ok(out)
 }
 
-/// Weighted mean; alike values stay as they are.
+/// Returns the weighted mean of a plane over the members. Equal values are returned exactly.
 fn average(members: &ClusterMembers<'_>, plane: &[f32]) -> f64 {
     let base = f64::from(plane[members.leader as usize]);
     base + members.rows.iter().map(|&(row, weight)| weight * (f64::from(plane[row as usize]) - base)).sum::<f64>()
 }
 
-/// Whether windows differ so much that who is there changes with time.
+/// Returns whether the windows differ so much that different members are visible at different times.
 fn differ(members: &[(f64, SpacetimeMotion)], proxy: &SpacetimeMotion) -> bool {
     members.iter().any(|(_, member)| {
         let wider = (member.log_width - proxy.log_width).abs() > MOST_WIDER.ln();
@@ -136,7 +142,8 @@ fn differ(members: &[(f64, SpacetimeMotion)], proxy: &SpacetimeMotion) -> bool {
     })
 }
 
-/// States that a motion should be near to, quaternions in the sign of the mean's; weights change as the members' windows do.
+/// Returns the states that the proxy should approximate at each frame: the mean of the members, weighted by their
+/// windows. Quaternions have the sign nearest to `mean`.
 fn wanted(members: &ClusterMembers<'_>, about: &[(f64, SpacetimeMotion)], mean: &SpacetimeMotion) -> Vec<TargetState> {
     let of_time = |&time: &f64| {
         let (mut total, mut position, mut rotation) = (0.0, [0.0; 3], [0.0; 4]);
@@ -159,7 +166,7 @@ fn wanted(members: &ClusterMembers<'_>, about: &[(f64, SpacetimeMotion)], mean: 
     members.model.info().times.iter().filter_map(of_time).collect()
 }
 
-/// Natural logs of the proxy's scales, and its axes turned to go with them.
+/// Returns the natural logarithms of the proxy's scales and rotates its axes accordingly.
 fn shape(members: &ClusterMembers<'_>, states: &[Gaussians], times: &[f64], motion: &mut SpacetimeMotion) -> [f64; 3] {
     let mut parts = Vec::with_capacity(members.rows.len() * times.len());
     for (state, &time) in states.iter().zip(times) {
@@ -181,18 +188,19 @@ fn shape(members: &ClusterMembers<'_>, states: &[Gaussians], times: &[f64], moti
     parts.iter_mut().for_each(|part| part.weight /= total);
     let found = align_axes(&moments(&parts, Some(DVec3::ZERO)), DQuat::IDENTITY);
     let turn = [found.rotation.w, found.rotation.x, found.rotation.y, found.rotation.z];
-    // A product is linear in either factor: a quaternion that is linear in time stays so.
+    // A quaternion product is linear in either factor, so the quaternion stays linear in time.
     (motion.rotation, motion.omega) = (product(motion.rotation, turn), product(motion.omega, turn));
     found.scales.to_array().map(|scale| scale.max(1e-7).ln())
 }
 
-/// Unit; the identity where there is no direction.
+/// Returns the normalized quaternion; the identity if it has no direction.
 fn quaternion([w, x, y, z]: [f64; 4]) -> DQuat {
     let found = DQuat::from_xyzw(x, y, z, w).normalize();
     if found.is_finite() { found } else { DQuat::IDENTITY }
 }
 
-/// The logit of what the window is multiplied by.
+/// Returns the logit of the amplitude that the window is multiplied by: the least-squares fit to the opacities of the
+/// moment match.
 fn amplitude(
     members: &ClusterMembers<'_>,
     states: &[Gaussians],

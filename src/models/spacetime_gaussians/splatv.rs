@@ -1,6 +1,6 @@
-//! `.splatv` as an input, and as a result of the lite model.
+//! `.splatv` as an input, and as an output of the lite model.
 //!
-//! The result of one keeps the words of what stays. Rows that no player draws are left out; an infinite width is a window
+//! Unchanged Gaussians keep their stored words. Rows that no player draws are left out. An infinite width is a window
 //! that is 1 at every time ([`rows`](crate::files::splatv::rows)).
 
 use std::fs;
@@ -34,15 +34,15 @@ use crate::progress::Events;
 use crate::recipe::MergeParams;
 use crate::source::FrameSource;
 
-/// Maximum number of bytes of a list of cameras that a result gets: some seven thousand cameras.
+/// Maximum bytes of a camera list that is copied to the output: about seven thousand cameras.
 const MAX_LISTED: u64 = 4 << 20;
-/// Scales and widths are no less: their logs are finite.
+/// Minimum scale and width, so that their logarithms are finite.
 const LEAST_LENGTH: f64 = 1e-7;
-/// Natural log of the width of a window without an end: finite, so that no inf·0 arises, and so wide that the window
-/// exp(−(dt/width)²) is exactly 1 in f64 for |dt| below 10⁹.
+/// Natural logarithm of the width of an unbounded window. It is finite, so that no inf·0 arises, and so wide that the
+/// window exp(−(dt/width)²) is exactly 1 in f64 for |dt| below 10⁹.
 const UNBOUNDED_LOG_WIDTH: f32 = 40.0;
 
-/// A `.splatv`.
+/// Compressed SpacetimeGaussians lite model for web players (`.splatv`).
 pub(in super::super) const SPLATV: ModelFormat = ModelFormat {
     expected: "a .splatv",
     recognizes: |found| found.is_file_of(&MAGIC.to_le_bytes(), "splatv"),
@@ -52,20 +52,22 @@ pub(in super::super) const SPLATV: ModelFormat = ModelFormat {
     },
 };
 
-/// An open file.
+/// Open `.splatv` file.
 #[derive(Debug)]
 struct SplatvModel {
     file: Splatv,
-    /// Row of each Gaussian, where some rows were left out.
+    /// Row in the file of each Gaussian; `None` if no row was left out.
     rows: Option<Vec<u32>>,
+    /// Rows that were repaired or left out.
     defects: Defects,
     model: MotionModelFrames<Spacetime>,
 }
 
 impl SplatvModel {
+    /// Reads the file at `path` and leaves out rows that no player draws.
     fn open(path: &Path, options: &OpenOptions) -> Result<SplatvModel> {
         let file = Splatv::open(path)?;
-        // Parameters and the number of the row.
+        // Parameters and the row number.
         let values = (Columns::all().width(0) + WIDTH + 1) as u64;
         options.memory.check(path, "its texture", "the Gaussians of the file", 4 * values * file.count() as u64)?;
         let zero_rotation = options.conventions.zero_rotation.unwrap_or_default();
@@ -85,12 +87,12 @@ fn file_row(rows: Option<&[u32]>, i: usize) -> usize {
     rows.map_or(i, |rows| rows[i] as usize)
 }
 
-/// Makes Gaussian `i` what `row` is.
+/// Sets Gaussian `i` to the values of `row`.
 fn set(raw: &mut Raw, i: usize, row: &SplatvGaussian) {
     let log = |length: f32| f64::from(length).max(LEAST_LENGTH).ln() as f32;
     raw.gaussians.position.set_row(i, row.position);
     raw.gaussians.rotation.set_row(i, if is_unturned(row) { [1.0, 0.0, 0.0, 0.0] } else { row.rotation });
-    // Players square scales: the sign is nothing.
+    // Players square the scales, so the sign has no effect.
     raw.gaussians.log_scale.set_row(i, row.scale.map(|scale| log(scale.abs())));
     raw.gaussians.opacity_logit.set_row(i, [logit(row.opacity).clamp(-MOST, MOST) as f32]);
     raw.gaussians.sh.set_row(i, row.rgb.map(harmonic));
@@ -101,7 +103,7 @@ fn set(raw: &mut Raw, i: usize, row: &SplatvGaussian) {
     row.omega.into_iter().enumerate().for_each(|(k, x)| own(OMEGA + k, x));
 }
 
-/// What Gaussian `i` is as a row.
+/// Returns Gaussian `i` as a row of a `.splatv`.
 fn row(raw: &Raw, i: usize) -> SplatvGaussian {
     let own = |plane: usize| raw.own.plane(plane)[i];
     SplatvGaussian {
@@ -117,15 +119,17 @@ fn row(raw: &Raw, i: usize) -> SplatvGaussian {
     }
 }
 
-/// Writes `raw` to `path`, in the colors that `known` has of it, with the cameras that the file `cameras` lists as 3DGS does,
-/// else one that sees most of it.
+/// Writes `raw` to `path`. `known` returns the exact color of a Gaussian if it has one. The cameras are those of the
+/// 3DGS file `cameras`, or else one camera that sees most of the Gaussians.
+///
+/// # Errors Fails if half precision cannot hold the values or a write fails.
 pub(super) fn write(
     raw: &Raw,
     known: impl Fn(usize) -> Option<[f32; 3]>,
     cameras: Option<&Path>,
     path: &Path,
 ) -> Result<()> {
-    // Of many cameras none is better than another one.
+    // A list above the limit is not used: no subset of its cameras would be better than another.
     let is_small = |path: &&Path| fs::metadata(path).is_ok_and(|found| found.len() <= MAX_LISTED);
     let listed = cameras.filter(is_small).map(|path| read_json(path, MAX_LISTED)).transpose()?;
     let listed = listed.filter(|cameras| !cameras[0]["rotation"].is_null());

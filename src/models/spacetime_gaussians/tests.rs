@@ -12,7 +12,7 @@ use crate::recipe::Recipe;
 
 const COUNT: usize = 7;
 
-/// Properties in the order in which training writes them.
+/// Returns the names of the properties in the order in which training writes them.
 fn properties(is_full: bool) -> Vec<String> {
     let numbered = |name: &str, count: usize| (0..count).map(|k| format!("{name}_{k}")).collect::<Vec<_>>();
     let mut names: Vec<String> =
@@ -24,7 +24,7 @@ fn properties(is_full: bool) -> Vec<String> {
     names
 }
 
-/// Values of Gaussian `i`, by property.
+/// Returns the value of a property of Gaussian `i`.
 fn value(name: &str, i: usize) -> f32 {
     let noise = |step: f32| {
         ((i as f32 + 1.0) * step + name.len() as f32 * 0.31 + name.as_bytes()[name.len() - 1] as f32 * 0.17).fract()
@@ -34,7 +34,7 @@ fn value(name: &str, i: usize) -> f32 {
         "trbf_scale" => -1.0 + 0.2 * i as f32,
         "nx" => 0.0,
         "opacity" => i as f32 - 3.0,
-        // Never without a direction.
+        // The quaternion always has a direction.
         "rot_0" => 1.5 + noise(0.2),
         _ if name.starts_with("scale") => -4.0 + noise(0.618_034),
         _ => 2.0 * noise(0.618_034) - 0.5,
@@ -61,7 +61,7 @@ fn write_decoder(path: &Path, tensors: &Tensors) {
 const ARGUMENTS: &str =
     "Namespace(model='ours', duration=50, white_background=True, source_path='data/x', rgbfunction='sandwich')";
 
-/// A folder as training leaves it.
+/// Writes a model folder as training does, with two iterations.
 fn folder(is_full: bool) -> tempfile::TempDir {
     let root = tempfile::tempdir().unwrap();
     for number in [7, 300] {
@@ -195,7 +195,7 @@ fn opacities_change_with_what_is_stored_as_the_jacobian_says() {
 fn what_stays_of_a_folder_keeps_its_bytes() {
     for is_full in [false, true] {
         let root = folder(is_full);
-        // A folder inside of it is no folder of frames.
+        // A folder inside a model folder is not taken for a folder of frames.
         for inner in ["point_cloud", "point_cloud/iteration_300"] {
             let message = said(&root.path().join(inner));
             assert!(message.contains("give the folder above"), "{message}");
@@ -219,7 +219,7 @@ fn what_stays_of_a_folder_keeps_its_bytes() {
         let size = model.size_written(OutputKind::Model, result.path()).unwrap();
         assert_eq!(size, open(result.path()).unwrap().size().unwrap());
         assert!(size.whole() < model.bytes().unwrap() && size.rest > 0);
-        // The PLY alone, which a viewer takes.
+        // The PLY alone, as viewers open it.
         let alone = result.path().join("alone.ply");
         model.write(&reduction, OutputKind::Ply, &alone, &Limits::NONE, &Events::IGNORED).unwrap();
         assert_eq!(fs::read(&alone).unwrap(), fs::read(iteration.join(CLOUD)).unwrap());
@@ -230,7 +230,7 @@ fn what_stays_of_a_folder_keeps_its_bytes() {
     }
 }
 
-/// Three left, one of them a proxy, two of them changed.
+/// Returns a compressed model of three Gaussians: one is a proxy, two have parameter deltas.
 fn reduction(model: &dyn InputModel) -> CompressedModel {
     let rule = MergeParams { max_drift: 1e6, ..Recipe::preset("default").unwrap().merge };
     let cluster = Cluster { output: 1, leader: 3, members: vec![(2, 0.25), (3, 0.75)] };
@@ -267,7 +267,7 @@ fn merged_and_changed_ones_read_back_as_they_were_shown() {
         assert_near(&states(read.source()), &shown, 2e-6);
         let file = fs::read(result.path().join("point_cloud/iteration_300").join(CLOUD)).unwrap();
         assert!(!String::from_utf8_lossy(&file).contains("f_rest"));
-        // Nobody else's values changed, and of those that did no others.
+        // Values of other Gaussians did not change, and neither did other values of the changed ones.
         let row = 4 * properties(is_full).len();
         let values = |i: usize| file[file.len() - (3 - i) * row..][..row].to_vec();
         let original = ply(&properties(is_full), COUNT, value);
@@ -280,7 +280,7 @@ fn merged_and_changed_ones_read_back_as_they_were_shown() {
 fn a_proxy_of_equals_is_their_mean_at_every_frame_and_of_copies_the_same_one() {
     let root = folder(false);
     let path = root.path().join("point_cloud/iteration_300/point_cloud.ply");
-    // 0 and 1 alike but for where they are and move; 2 and 3 copies.
+    // Gaussians 0 and 1 differ only in position and motion; 2 and 3 are copies.
     let alike = |name: &str, i: usize| match name {
         "x" | "motion_0" | "motion_4" => value(name, i.min(2)),
         _ if i < 2 => value(name, 0),
@@ -302,7 +302,7 @@ fn a_proxy_of_equals_is_their_mean_at_every_frame_and_of_copies_the_same_one() {
             let plane = all.position.plane(c);
             assert!((found.position.plane(c)[0] - 0.5 * (plane[0] + plane[1])).abs() < 1e-5);
             assert!((found.position.plane(c)[1] - plane[2]).abs() < 1e-5);
-            // Longer where they are apart.
+            // A proxy of members that are apart is longer, so only the copies are compared.
             assert!((found.log_scale.plane(c)[1] - all.log_scale.plane(c)[2]).abs() < 1e-5);
         }
         let unit = |state: &Gaussians, i: usize| {
@@ -330,7 +330,7 @@ fn a_lite_model_as_a_splatv_moves_as_it_did_and_what_stays_of_that_keeps_its_wor
         (read.kind(), read.source().info().count, read.own_output()),
         ("splaTV model", COUNT, OutputKind::Splatv)
     );
-    // Colors and opacities are bytes there, and colors below 0 or above 1 none.
+    // Colors and opacities are stored as bytes, and colors outside 0 … 1 are clamped, so they are not compared.
     for (found, expected) in states(read.source()).iter().zip(states(model.source())) {
         let pairs = |column: Columns| {
             found.column(column).planes().iter().zip(expected.column(column).planes()).collect::<Vec<_>>()
@@ -355,7 +355,7 @@ fn a_lite_model_as_a_splatv_moves_as_it_did_and_what_stays_of_that_keeps_its_wor
     assert_eq!(moved.words(0), file.words(2));
     let (to, from) = (SplatvGaussian::of_words(&moved.words(1)), SplatvGaussian::of_words(&file.words(5)));
     assert_eq!(to, SplatvGaussian { position: [from.position[0] + 1.0, from.position[1], from.position[2]], ..from });
-    // Without cameras of its own there is one that a viewer can start at.
+    // Without cameras of the model, the file gets one that a viewer can start at.
     fs::remove_file(root.path().join(CAMERAS)).unwrap();
     opened(root.path()).write(&all, OutputKind::Splatv, &kept, &Limits::NONE, &Events::IGNORED).unwrap();
     assert_eq!(Splatv::open(&kept).unwrap().cameras()[0]["rotation"].as_array().map(Vec::len), Some(3));
@@ -397,7 +397,8 @@ fn properties_that_are_missing_or_too_many_and_values_that_are_none_are_named() 
         let message = said(&path);
         assert!(message.contains(&format!("Gaussian 1, {name}")) && message.contains("finite"), "{message}");
     }
-    // Without a folder nothing says what the network is, and the model opens; none has no frames to show.
+    // Without a folder, nothing names the last function of the network and the model opens with a note. A model without
+    // Gaussians opens too.
     fs::write(&path, ply(&properties(true), 3, value)).unwrap();
     assert!(open(&path).unwrap().notes().iter().any(|note| note.contains("sandwich")));
     fs::write(&path, ply(&properties(false), 0, value)).unwrap();
