@@ -1,6 +1,6 @@
-//! Models whose Gaussians are rows of a checkpoint's tensors: what their families share.
+//! Models whose Gaussians are rows of the tensors of a checkpoint: shared by several formats.
 //!
-//! A result is the same checkpoint with fewer rows, and the small files that lay beside it.
+//! The output is the same checkpoint with fewer rows, and copies of the small files beside it.
 
 pub(super) mod linear;
 mod rows;
@@ -30,23 +30,22 @@ use crate::recipe::MergeParams;
 use crate::source::FrameSource;
 pub(super) use rows::{Reading, RowElement, RowTensors, count_of};
 
-/// Most bytes of a file beside the checkpoint that a result has too.
+/// Maximum bytes of a file beside the checkpoint that is copied to the output.
 const SMALL: u64 = 1 << 20;
 
-/// A law by which several Gaussians become one.
+/// Motion model that can compute the raw parameters of proxies.
 pub(super) trait ProxyRule: MotionModel {
-    /// Raw parameters of the proxies of `clusters`, before they are held to what their members do.
+    /// Returns the raw parameters of the proxies of `clusters`, before they are checked against their members.
     ///
-    /// # Errors
-    /// Frames that cannot be evaluated.
+    /// # Errors Fails if frames cannot be evaluated.
     fn proposed(model: &MotionModelFrames<Self>, clusters: &[Cluster], rule: &MergeParams) -> Result<Raw>
     where
         Self: Sized;
 
-    /// Adds to `hash` what states follow from that the file does not say.
+    /// Adds to `hash` the settings that determine frame states but are not in the file.
     fn follow(&self, hash: &mut Xxh3);
 
-    /// The law for frames at `times`, if it depends on them.
+    /// Returns the motion model for frames at `times` if it depends on them.
     fn at(&self, times: &[f64]) -> Option<Self>
     where
         Self: Sized,
@@ -55,35 +54,37 @@ pub(super) trait ProxyRule: MotionModel {
         None
     }
 
-    /// Things a person should know of it.
+    /// Returns notes for the user.
     fn notes(&self) -> Vec<String> {
         Vec::new()
     }
 
-    /// How long it lasts in its own time.
+    /// Returns the duration of the model in its own time unit.
     fn span(&self) -> f64 {
         1.0
     }
 }
 
-/// What is known of a model beside its Gaussians.
+/// Description of a model other than its Gaussians.
 #[derive(Debug, Default)]
 pub(super) struct About {
-    /// What it is, for people.
+    /// Name of the model format, shown to users.
     pub(super) kind: &'static str,
-    /// The folder that was given; none: the file itself was.
+    /// Folder that the user gave; `None` if the user gave the file.
     pub(super) root: Option<PathBuf>,
-    /// The checkpoint.
+    /// Path of the checkpoint.
     pub(super) file: PathBuf,
-    /// Things a person should know.
+    /// Notes for the user.
     pub(super) notes: Vec<String>,
+    /// Folder of the training data.
     pub(super) data_folder: Option<String>,
+    /// Whether the training background is white.
     pub(super) white_background: bool,
-    /// Seconds of one processor that a state takes (`benches/families.rs`).
+    /// CPU seconds on one core to read one state (`benches/families.rs`).
     pub(super) seconds_per_state: f64,
 }
 
-/// A model in a checkpoint.
+/// Open model whose Gaussians are rows of the tensors of a checkpoint.
 #[derive(Debug)]
 pub(super) struct InCheckpoint<L: MotionModel> {
     table: RowTensors,
@@ -92,7 +93,8 @@ pub(super) struct InCheckpoint<L: MotionModel> {
 }
 
 impl<L: ProxyRule> InCheckpoint<L> {
-    /// What was read, whose states follow by `law`.
+    /// Creates a model from the read parameters. Its states are computed by `law`. A model that does not vary with time
+    /// gets one frame at time 0.
     pub(super) fn new(reading: Reading, law: L, about: About) -> Result<InCheckpoint<L>> {
         let sh_degree = reading.raw.gaussians.sh_degree();
         let model = MotionModelFrames::new(law, reading.raw, sh_degree);
@@ -101,7 +103,7 @@ impl<L: ProxyRule> InCheckpoint<L> {
         Ok(InCheckpoint { table: reading.table, model, about })
     }
 
-    /// Files that a result has too, from the root.
+    /// Returns the files of the model folder that are copied to the output.
     fn beside(&self) -> Vec<PathBuf> {
         const NAMES: [&str; 2] = ["cfg_args", "cameras.json"];
         let Some(root) = &self.about.root else { return Vec::new() };
@@ -111,12 +113,13 @@ impl<L: ProxyRule> InCheckpoint<L> {
         found
     }
 
-    /// Where in a result the checkpoint is.
+    /// Returns the path of the checkpoint relative to the output folder.
     fn place(&self) -> PathBuf {
         let root = self.about.root.as_deref().or(self.about.file.parent()).unwrap_or(Path::new(""));
         self.about.file.strip_prefix(root).unwrap_or(&self.about.file).to_owned()
     }
 
+    /// Writes the compressed checkpoint and copies the files beside it.
     fn write_model(&self, reduction: &CompressedModel, path: &Path) -> Result<()> {
         for file in self.beside() {
             copy(&file, &path.join(file.file_name().unwrap_or_default()))?;
@@ -168,13 +171,13 @@ impl<L: ProxyRule + 'static> InputModel for InCheckpoint<L> {
         let whole = state_bytes(raw.gaussians.sh_degree(), Columns::all()) + 4 * raw.own.width() as u64;
         MemoryProfile {
             per_gaussian: whole,
-            // The widest tensor, as it is stored and as f32.
+            // The widest tensor, as stored and as f32.
             opening: 2 * whole,
-            // The parameters again, and what is prepared of them.
+            // A copy of the parameters with the prepared values.
             reader: whole + 128,
             reduced: 2 * whole,
             jacobian: Jacobian::BYTES_PER_GAUSSIAN as u64,
-            // Training keeps two values more for each.
+            // Training stores two optimizer values per parameter.
             file: 3 * whole,
             fixed: 0,
             frame_block: 0,
@@ -260,11 +263,12 @@ impl<L: ProxyRule + 'static> InputModel for InCheckpoint<L> {
     }
 }
 
+/// Returns whether `path` is a file of at most [`SMALL`] bytes.
 fn is_small(path: &Path) -> bool {
     fs::metadata(path).is_ok_and(|found| found.is_file() && found.len() <= SMALL)
 }
 
-/// Small YAML files of a folder, by name.
+/// Returns the small YAML files in a folder, sorted by name.
 pub(super) fn texts_in(root: &Path) -> Vec<PathBuf> {
     let is_one = |path: &Path| {
         path.extension().is_some_and(|found| ["yaml", "yml"].iter().any(|ending| found == *ending)) && is_small(path)
@@ -275,7 +279,7 @@ pub(super) fn texts_in(root: &Path) -> Vec<PathBuf> {
     found
 }
 
-/// The files of a folder called `<prefix><number><suffix>`, by number.
+/// Returns the files of a folder named `<prefix><number><suffix>`, sorted by number.
 pub(super) fn numbered(folder: &Path, prefix: &str, suffix: &str) -> Vec<(u32, PathBuf)> {
     let entries = fs::read_dir(folder).into_iter().flatten().flatten();
     let number = |name: &str| name.strip_prefix(prefix)?.strip_suffix(suffix)?.parse::<u32>().ok();

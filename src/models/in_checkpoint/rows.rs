@@ -1,7 +1,7 @@
-//! Gaussians as rows of a checkpoint's tensors.
+//! Gaussians as rows of the tensors of a checkpoint.
 //!
-//! In: an open checkpoint, and which of its tensors hold what. Out: raw parameters; and the checkpoint with fewer rows. Memory:
-//! the raw parameters, and one tensor at a time.
+//! Input: an open checkpoint and the meaning of its tensors. Output: raw parameters, and the checkpoint with fewer
+//! rows. Memory: the raw parameters, and one tensor at a time.
 
 use std::path::Path;
 
@@ -12,28 +12,29 @@ use crate::files::checkpoint::{Checkpoint, NodeId, TensorView};
 use crate::model::{Column, Columns, Gaussians, Raw};
 use crate::models::trajectories::state_bytes;
 
-/// What an element of a tensor's row is.
+/// Meaning of one element of a tensor's row.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(in crate::models) enum RowElement {
-    /// A plane of a column.
+    /// Plane of an attribute column.
     Of(Columns, usize),
-    /// A plane of [`Raw::own`].
+    /// Plane of [`Raw::own`].
     Own(usize),
-    /// Nothing that a state follows from.
+    /// Value that frame states do not depend on.
     Unread,
 }
 
 impl RowElement {
-    /// All planes of a column but the first `skipped`, so many.
+    /// Returns `count` consecutive planes of a column, after the first `skipped`.
     pub(in crate::models) fn all_of(column: Columns, skipped: usize, count: usize) -> Vec<RowElement> {
         (skipped..skipped + count).map(|c| RowElement::Of(column, c)).collect()
     }
 
-    /// So many planes of one's own, from `first` on.
+    /// Returns `count` consecutive planes of [`Raw::own`], from `first` on.
     pub(in crate::models) fn own(first: usize, count: usize) -> Vec<RowElement> {
         (first..first + count).map(RowElement::Own).collect()
     }
 
+    /// Returns the plane of `raw` that holds this element; `None` for values that are not read.
     fn get(self, raw: &Raw) -> Option<&[f32]> {
         match self {
             RowElement::Of(column, c) => Some(raw.gaussians.column(column).plane(c)),
@@ -43,37 +44,39 @@ impl RowElement {
     }
 }
 
-/// A tensor whose rows are read.
+/// Tensor whose rows are parameters of Gaussians.
 #[derive(Debug)]
 struct Param {
     name: String,
     tensor: TensorView,
-    /// What the elements of a row are.
+    /// Meaning of the elements of a row.
     planes: Vec<RowElement>,
 }
 
-/// Which tensors of a checkpoint have a row per Gaussian.
+/// Tensors of a checkpoint that have one row per Gaussian.
 #[derive(Debug)]
 pub(in crate::models) struct RowTensors {
     checkpoint: Checkpoint,
+    /// Number of Gaussians.
     count: usize,
     params: Vec<Param>,
-    /// Those that only training reads.
+    /// Tensors that only training reads.
     beside: Vec<TensorView>,
 }
 
-/// A checkpoint that is being read.
+/// Checkpoint that is being read.
 #[derive(Debug)]
 pub(in crate::models) struct Reading {
+    /// Tensors read so far.
     pub(in crate::models) table: RowTensors,
+    /// Parameters read so far.
     pub(in crate::models) raw: Raw,
 }
 
 impl Reading {
-    /// Makes room for `count` Gaussians with `own` planes beside the usual columns; all values are zero.
+    /// Allocates `count` Gaussians with `own` format-specific planes, all values zero.
     ///
-    /// # Errors
-    /// More memory than allowed.
+    /// # Errors Fails if this needs more memory than allowed.
     pub(in crate::models) fn new(
         checkpoint: Checkpoint,
         count: usize,
@@ -86,10 +89,10 @@ impl Reading {
         Ok(Reading { table: RowTensors { checkpoint, count, params: Vec::new(), beside: Vec::new() }, raw })
     }
 
-    /// Reads the tensor at `id`, called `name`, whose rows have the shape `row` and are `planes`.
+    /// Reads the tensor at `id`. `name` is its name in messages, `row` the expected shape of a row, `planes` the
+    /// meaning of its elements.
     ///
-    /// # Errors
-    /// No tensor of floating-point numbers of that shape; values that are not there or not finite.
+    /// # Errors Fails if there is no floating-point tensor of that shape, or if values are missing or not finite.
     pub(in crate::models) fn read(
         &mut self,
         id: NodeId,
@@ -117,17 +120,16 @@ impl Reading {
         Ok(())
     }
 
-    /// Counts the tensor at `id`, if it is one with a row per Gaussian, among those that only training reads.
+    /// Adds the tensor at `id` to those that only training reads, if it has a row per Gaussian.
     pub(in crate::models) fn beside(&mut self, id: NodeId) {
         let tensor = self.table.checkpoint.tensor(id).filter(|tensor| tensor.shape.first() == Some(&self.table.count));
         self.table.beside.extend(tensor);
     }
 }
 
-/// How many rows the tensor at `id`, called `name`, has.
+/// Returns the number of rows of the tensor at `id`, called `name` in messages.
 ///
-/// # Errors
-/// No tensor with rows.
+/// # Errors Fails if there is no tensor with rows.
 pub(in crate::models) fn count_of(checkpoint: &Checkpoint, id: NodeId, name: &str) -> Result<usize> {
     let tensor = checkpoint.float_tensor(id, name)?;
     let rows = tensor.shape.first().copied();
@@ -135,11 +137,11 @@ pub(in crate::models) fn count_of(checkpoint: &Checkpoint, id: NodeId, name: &st
 }
 
 impl RowTensors {
-    /// Writes the rows that `reduction` leaves of the tensors to `path`: those of `left` where they differ from `before`; what
-    /// training keeps of merged ones is zero.
+    /// Writes the checkpoint of the compressed model to `path`. Rows of parameters are copied byte for byte unless
+    /// `left` (the compressed parameters) differs from `before`. Rows of merged Gaussians in tensors that only training
+    /// reads become zero.
     ///
-    /// # Errors
-    /// Those of the writer.
+    /// # Errors Fails if a tensor cannot be read or a write fails.
     pub(in crate::models) fn write(
         &self,
         before: &Raw,

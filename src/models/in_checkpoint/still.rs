@@ -1,4 +1,4 @@
-//! Gaussians that do not change.
+//! Static Gaussians of a checkpoint.
 
 use xxhash_rust::xxh3::Xxh3;
 
@@ -11,7 +11,7 @@ use crate::models::motion_model::{MotionModel, MotionModelFrames, copy_stored};
 use crate::passes::gather_all;
 use crate::recipe::MergeParams;
 
-/// States are what is stored.
+/// Motion model of static Gaussians: states are the stored values.
 #[derive(Debug)]
 pub(in crate::models) struct Still;
 

@@ -1,8 +1,9 @@
-//! Proxies of Gaussians of four dimensions: a slice for all times and a window make one again.
+//! Proxies of four-dimensional Gaussians: combines the matched slice and temporal window into one 4D Gaussian.
 //!
-//! From the match of the slices (a line, Σ, a window of deviation s): Σ₄ = [[Σ + vvᵀs², vs²], [vᵀs², s²]], whose axes are two
-//! quaternions. Harmonics refer to the proxy's own center: what its members show at frames is fitted by 1, cos and cos of the
-//! double (least squares, with a ridge on the waves).
+//! With the match of the slices (a line with velocity v, Σ, a window of standard deviation s): Σ₄ = [[Σ + vvᵀs², vs²],
+//! [vᵀs², s²]], whose axes give two quaternions. SH coefficients refer to the proxy's own center: the values of the
+//! moment match at the sampled frames are fitted by 1, cos and cos of the double angle (least squares, with a ridge
+//! term on the waves).
 
 use super::law::{Native, ROTATION_R, SCALING_T, TERM, TERMS, TIME};
 use super::rotation::{decomposed, quaternions};
@@ -13,13 +14,13 @@ use crate::models::in_checkpoint::linear::{LinearPath, match_all};
 use crate::models::motion_model::MotionModelFrames;
 use crate::recipe::MergeParams;
 
-/// Part of the frames' weight that holds waves near 0 where frames do not tell them from the constant.
+/// Ridge as a fraction of the total frame weight. Keeps waves near 0 if the frames do not distinguish them from the
+/// constant.
 const RIDGE: f64 = 1e-3;
 
-/// Raw parameters of the proxies of `clusters`.
+/// Returns the raw parameters of the proxies of `clusters`.
 ///
-/// # Errors
-/// Frames that cannot be evaluated.
+/// # Errors Fails if frames cannot be evaluated.
 pub(super) fn proposed(model: &MotionModelFrames<Native>, clusters: &[Cluster], rule: &MergeParams) -> Result<Raw> {
     let (raw, law) = (model.raw(), model.law());
     let line = |id: u32| {
@@ -79,11 +80,14 @@ pub(super) fn proposed(model: &MotionModelFrames<Native>, clusters: &[Cluster], 
 /// Sums of a least-squares fit of many values by the same three functions.
 #[derive(Debug, Clone, Default)]
 struct ThreeFunctionFit {
+    /// Weighted products of the functions, summed over samples.
     normal: [[f64; 3]; 3],
+    /// Weighted products of the functions with each value.
     by_value: Vec<[f64; 3]>,
 }
 
 impl ThreeFunctionFit {
+    /// Adds a sample: the functions `basis` and all values at one time.
     fn add(&mut self, weight: f64, basis: [f64; 3], values: impl ExactSizeIterator<Item = f64>) {
         self.by_value.resize(values.len(), [0.0; 3]);
         for (i, row) in self.normal.iter_mut().enumerate() {
@@ -94,7 +98,7 @@ impl ThreeFunctionFit {
         }
     }
 
-    /// Coefficients of each value, of the constant and of the first `terms` waves.
+    /// Returns the coefficients of each value: of the constant and of the first `terms` waves; the others are 0.
     fn solve(&self, terms: usize) -> impl Iterator<Item = [f64; 3]> {
         let mut normal = self.normal;
         let ridge = RIDGE * normal[0][0];
@@ -133,11 +137,11 @@ mod tests {
         for (got, expected) in found[0].iter().zip([0.7, -0.4, 0.2]) {
             assert!((got - expected).abs() < 2e-3, "{found:?}");
         }
-        // A single frame: the constant is all that it says.
+        // A single frame determines the constant only.
         short.add(0.5, wave(6, 0.3), [0.7].into_iter());
         let [[constant, first, second]] = short.solve(2).collect::<Vec<_>>()[..] else { panic!("one value") };
         assert!((constant + first + second - 0.7).abs() < 1e-9 && first.abs() < 1e-2 && second.abs() < 1e-2);
-        // Terms that the model has not are not made.
+        // Terms beyond those of the model stay 0.
         let [got, _] = whole.solve(0).collect::<Vec<_>>()[..] else { panic!("two values") };
         assert_eq!(got[1..], [0.0, 0.0]);
     }

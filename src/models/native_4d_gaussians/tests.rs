@@ -21,12 +21,12 @@ use crate::recipe::Recipe;
 const COUNT: usize = 6;
 const TIMES: [f64; 5] = [0.0, 0.3, 0.5, 1.1, 1.9];
 
-/// As good as noise, from -½ to ½.
+/// Returns pseudo-random values from -½ to ½.
 fn noise(n: usize, seed: f64) -> Vec<f32> {
     (0..n).map(|i| ((i as f64 * 0.754_877 + seed * 0.569_84).fract() - 0.5) as f32).collect()
 }
 
-/// The parameters of a made model, in the capture's order.
+/// Returns the parameters of a test model, with their indices in the capture.
 fn parameters(turns: bool) -> Vec<(usize, MadeTensor)> {
     let add = |values: Vec<f32>, by: f32| values.into_iter().map(|x| x + by).collect::<Vec<f32>>();
     let (n, shape) = (COUNT, |row: &[usize]| [&[COUNT], row].concat());
@@ -45,6 +45,7 @@ fn parameters(turns: bool) -> Vec<(usize, MadeTensor)> {
     of.into_iter().enumerate().map(|(k, (i, row, values))| (i, tensor(k, &shape(row), &values))).collect()
 }
 
+/// Returns the parts of the capture tuple of a test model.
 fn capture(turns: bool) -> Vec<Made> {
     let mut parts = vec![Made::None; MOVING];
     let mut state = Vec::new();
@@ -83,7 +84,7 @@ impl Place {
         self.0.path().join(name)
     }
 
-    /// A folder with these parts as its checkpoint.
+    /// Writes a model folder with these parts as its checkpoint.
     fn put(&self, parts: Vec<Made>) -> PathBuf {
         let root = self.path("model");
         fs::create_dir_all(&root).unwrap();
@@ -125,8 +126,8 @@ fn rule() -> crate::recipe::MergeParams {
     Recipe::preset("default").unwrap().merge
 }
 
-/// A row, by way of the inverse: the covariance of a slice is that of the block of the inverse of Σ₄ for space. The rotation by
-/// what it does to the axes as quaternions.
+/// Checks a row against an independent computation. The covariance of a slice is the inverse of the spatial block of
+/// the inverse of Σ₄. The rotation is computed by applying the quaternions to each axis.
 fn check(parameters: &[(usize, MadeTensor)], flipped: bool, row: usize, time: f64, state: &Gaussians) {
     let of = |i: usize| floats(&parameters.iter().find(|part| part.0 == i).unwrap().1, row);
     let unit = |q: Vec<f64>| DVec4::from_slice(&q).normalize().to_array();
@@ -188,7 +189,7 @@ fn states_are_slices_of_four_dimensions_in_both_conventions() {
             (0..COUNT).for_each(|row| check(&parameters(true), !unflipped, row, time, state));
         }
     }
-    // Some are cut off, and some are not.
+    // Some states are below the cutoff and some are not.
     let cut = |x: &&f32| **x == -40.0;
     let of = states(&*open(&root));
     let cuts: usize = of.iter().map(|state| state.opacity_logit.planes().iter().filter(cut).count()).sum();
@@ -224,7 +225,7 @@ fn what_is_left_keeps_its_bytes_in_every_tensor_with_rows() {
     let checkpoints = [place.path("model"), result]
         .map(|root| Checkpoint::open(&root.join("chkpnt30000.pth"), ReadLimit::NONE).unwrap());
     let [before, after] = checkpoints.each_ref().map(|checkpoint| checkpoint.tensors().collect::<Vec<_>>());
-    // Nine parameters, two values that training keeps of each, four of its statistics.
+    // Nine parameters with two optimizer values each, and four training statistics.
     assert_eq!((before.len(), after.len()), (31, 31));
     for (b, a) in before.iter().zip(&after) {
         assert_eq!(a.shape, [&[3], &b.shape[1..]].concat());
@@ -238,7 +239,7 @@ fn what_is_left_keeps_its_bytes_in_every_tensor_with_rows() {
 #[test]
 fn merged_and_changed_ones_read_back_as_they_were_shown() {
     let place = Place::new();
-    // The second is the first again, but for its opacity.
+    // Gaussian 1 is a copy of Gaussian 0.
     let mut parts = capture(true);
     for (i, mut tensor) in parameters(true) {
         let width = tensor.bytes.len() / COUNT;
@@ -261,13 +262,13 @@ fn merged_and_changed_ones_read_back_as_they_were_shown() {
     let whole = states(&*model);
     for (frame, state) in states(&*open(&result)).iter().enumerate() {
         assert_eq!(*state, gather_all(&*shown, frame, Columns::all()).unwrap());
-        // Two alike move as one of them.
+        // A proxy of two equal Gaussians moves as they do.
         let [got, expected] = [(state, 0), (&whole[frame], 1)].map(|(state, row)| state.position.row::<3>(row));
         (0..3).for_each(|c| assert!((got[c] - expected[c]).abs() < 2e-6, "{got:?} {expected:?}"));
         let moved = state.position.row::<1>(2)[0] - whole[frame].position.row::<1>(4)[0];
         assert!((moved - 0.5).abs() < 1e-6, "{moved}");
     }
-    // What training kept of it does not belong to it any more.
+    // Optimizer state of merged Gaussians is reset.
     let checkpoint = Checkpoint::open(&result.join("chkpnt30000.pth"), ReadLimit::NONE).unwrap();
     let average = checkpoint.tensors().find(|tensor| tensor.storage == "20").unwrap();
     let values = checkpoint.floats(&average, "").unwrap();
@@ -303,7 +304,7 @@ fn the_best_checkpoint_is_read_or_the_one_that_is_named() {
     assert!(of(30_000).unwrap().notes().iter().all(|note| !note.contains("best")));
     let error = of(7).err().unwrap().to_string();
     assert!(error.contains("chkpnt7.pth") && error.contains("chkpnt30000.pth"), "{error}");
-    // The period that is guessed follows from the times.
+    // The guessed period depends on the times.
     let at = |times: Vec<f64>| models::open(&root, &OpenOptions::default()).unwrap().with_times(times).unwrap().notes();
     assert!(at(vec![0.0, 1.0]).iter().any(|note| note.contains("every 1 ")), "{:?}", at(vec![0.0]));
     assert!(at(vec![0.0, 1.5]).iter().any(|note| note.contains("every 10 ")));
