@@ -13,9 +13,9 @@ use crate::source::ReadPlan;
 const COUNT: usize = 2 * GAUSSIAN_BLOCK + 77;
 const FRAMES: usize = 2 * FRAME_BLOCK + 5;
 
-/// Every way of storing a tile: positions are noise in the first block of Gaussians (no zstd shrinks it) and curves
-/// in the others; opacities move in the second frame block alone; rotations stand still in the last block of
-/// Gaussians; scales and colors never change.
+/// Source that covers every encoding of a tile: positions are noise in the first Gaussian block (zstd cannot compress
+/// it) and curves in the others; opacities change only in the second frame block; rotations are constant in the last
+/// Gaussian block; scales and colors never change.
 struct Made(SequenceInfo);
 
 impl Made {
@@ -45,7 +45,7 @@ impl Made {
         (noise(key) as f32 * 1e-9 + if moves { 0.05 * frame as f32 } else { 0.0 }).sin()
     }
 
-    /// What reading `want` of `ids` at `frame` must give, by the formula.
+    /// Returns the values of the columns `want` of `ids` at `frame`, computed from the formula.
     fn expected(&self, ids: &Ids<'_>, frame: usize, want: Columns) -> Gaussians {
         let mut out = Gaussians::zeros(0, 1);
         for column in want.iter() {
@@ -79,7 +79,7 @@ impl BlockReader for MadeReader<'_> {
     }
 }
 
-/// A tile, the short last one, a part of one, parts of two, and Gaussians from everywhere in no order.
+/// Returns a tile, the short last tile, a part of a tile, parts of two tiles, and scattered Gaussians in no order.
 fn blocks(scattered: &[u32]) -> [Ids<'_>; 5] {
     let tile = GAUSSIAN_BLOCK;
     [
@@ -92,7 +92,7 @@ fn blocks(scattered: &[u32]) -> [Ids<'_>; 5] {
 }
 
 #[test]
-fn frames_read_the_same_whatever_a_reader_holds_and_in_whatever_order() {
+fn frames_are_independent_of_order_and_of_held_frames() {
     let made = Made::new();
     let scattered = [COUNT as u32 - 1, 5, 6, 7, 2000, 4, 1024, 1023];
     for compression in [Compression::Zstd(1), Compression::Raw] {
@@ -115,7 +115,7 @@ fn frames_read_the_same_whatever_a_reader_holds_and_in_whatever_order() {
 }
 
 #[test]
-fn a_reader_keeps_no_more_than_it_may_and_nothing_that_is_read_once() {
+fn a_reader_keeps_no_more_than_allowed() {
     let made = Made::new();
     let varying = made.info().varying.width(1);
     let scattered: Vec<u32> = (0..COUNT as u32).step_by(3).collect();
@@ -145,7 +145,7 @@ fn a_reader_keeps_no_more_than_it_may_and_nothing_that_is_read_once() {
     }
 }
 
-/// Tiles of the model's columns that reading every frame takes, and their stored bytes.
+/// Returns the number of tiles that a pass over every frame takes, and their stored bytes.
 fn all_tiles(container: &Container) -> (u64, u64) {
     let (reader, mut found) = (container.reader(), (0, 0));
     for &(column, place) in &container.places {
@@ -160,7 +160,7 @@ fn all_tiles(container: &Container) -> (u64, u64) {
     found
 }
 
-/// Reads every frame block by block, as a scan does, and compares.
+/// Reads every frame in Gaussian blocks, as a scan does, and compares positions.
 fn scan(made: &Made, container: &Container) {
     (0..COUNT.div_ceil(GAUSSIAN_BLOCK)).into_par_iter().for_each(|block| {
         let ids = Ids::Range(block * GAUSSIAN_BLOCK..COUNT.min((block + 1) * GAUSSIAN_BLOCK));
@@ -175,7 +175,7 @@ fn scan(made: &Made, container: &Container) {
 }
 
 #[test]
-fn a_scan_reads_each_stored_byte_of_its_tiles_once_and_what_never_changes_once_per_block() {
+fn a_scan_reads_each_stored_byte_once() {
     let made = Made::new();
     for compression in [Compression::Zstd(1), Compression::Raw] {
         let (_folder, container) = made.pack(compression);
@@ -184,21 +184,22 @@ fn a_scan_reads_each_stored_byte_of_its_tiles_once_and_what_never_changes_once_p
         let once = Reads { bytes, tiles, states: (COUNT * FRAMES) as u64 };
         scan(&made, &container);
         assert_eq!(container.reads(), once, "{compression:?}");
-        // Now that raw tiles have been verified, too.
+        // Raw tiles have been verified by the first scan.
         scan(&made, &container);
         assert_eq!(container.reads() - once, once, "{compression:?}, again");
     }
 }
 
 #[test]
-fn of_wanted_frames_those_of_a_frame_block_take_its_tiles_once_unless_memory_forces_more() {
+fn each_tile_is_read_once_for_all_planned_frames() {
     let made = Made::new();
     let scattered = [COUNT as u32 - 1, 5, 6, 7, 2000, 4, 1024, 1023];
     let wanted = [0, 3, 9, 30, 31, 33, 64, 65, 68];
     for compression in [Compression::Zstd(1), Compression::Raw] {
         for ids in blocks(&scattered) {
             let blocks: std::collections::BTreeSet<usize> = ids.iter().map(|id| id / GAUSSIAN_BLOCK).collect();
-            // Frames of the three frame blocks: 5, 1, 3; decoded together 2 at most, 3 + 1 + 2 times.
+            // The three frame blocks have 5, 1 and 3 of these frames. With at most 2 frames decoded together they are
+            // read 3 + 1 + 2 times.
             for (held, times) in [(usize::MAX, 3), (5, 3), (2, 6)] {
                 let (_folder, container) = made.pack(compression);
                 let mut reader = container.open(ids.clone()).unwrap();
@@ -220,7 +221,7 @@ fn of_wanted_frames_those_of_a_frame_block_take_its_tiles_once_unless_memory_for
 }
 
 #[test]
-fn tiles_that_are_held_are_read_once_by_whomever_and_hold_the_same_values() {
+fn held_tiles_are_read_once_and_have_the_same_values() {
     let made = Made::new();
     let scattered = [COUNT as u32 - 1, 5, 6, 7, 2000, 4, 1024, 1023];
     for compression in [Compression::Zstd(1), Compression::Raw] {
