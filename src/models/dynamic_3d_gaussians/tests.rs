@@ -14,10 +14,10 @@ use crate::passes::gather_all;
 use crate::progress::Events;
 use crate::recipe::Recipe;
 
-/// Arrays of a model, by name: shape and values.
+/// Name, shape and values of each array of a model.
 type Arrays = Vec<(&'static str, Vec<u64>, Vec<f32>)>;
 
-/// Three frames of five Gaussians, the last two in the foreground.
+/// Returns three frames of five Gaussians; the last two are in the foreground.
 fn arrays() -> Arrays {
     let ramp = |n: usize, from: f32, by: f32| (0..n).map(|i| from + by * (i % 17) as f32).collect::<Vec<f32>>();
     vec![
@@ -120,7 +120,7 @@ fn what_stays_keeps_its_bytes_and_everything_else_its_place() {
             let bits = |values: &[f32]| values.iter().map(|x| x.to_bits()).collect::<Vec<_>>();
             assert_eq!(bits(&found), bits(&expected), "{name}");
         }
-        // All of them: the bytes of every array, and the same file each time.
+        // Writing all Gaussians keeps the values of every array and gives the same file each time.
         let all = CompressedModel::pruned((0..5).collect(), &rule);
         assert_eq!(written(&all), written(&all));
         assert_eq!(states(&*open(&result).unwrap()), states(&*model));
@@ -152,7 +152,7 @@ fn merged_and_changed_ones_read_back_as_they_were_shown() {
             let pairs = state.column(column).planes().iter().zip(expected.column(column).planes());
             pairs.for_each(|(a, b)| assert!((a - b).abs() < 1e-6, "{} {a} {b}", column.name()));
         }
-        // The weighted mean of where its members are.
+        // A proxy is at the weighted mean of its members.
         let at = |id: usize| gather_all(model.source(), frame, Columns::all()).unwrap().position.row::<3>(id);
         let mean: [f32; 3] = std::array::from_fn(|c| 0.75 * at(3)[c] + 0.25 * at(4)[c]);
         let found = state.position.row::<3>(1);
