@@ -574,9 +574,9 @@ fn lives_of_a_container_and_of_its_stream_are_joined_where_asked() {
         workplace.done(&format!("compress lives.gseq -o {to} --target-count 200 --no-refine --verbose --link {link}"))
     };
     let said = compress("apart.gseq", "auto");
-    assert!(said.contains(" of 40 frames in the median: --link always makes one of lives that are one"), "{said}");
+    assert!(said.contains(" of 40 frames (median): --link always joins Gaussians that continue one another"), "{said}");
     let said = compress("joined.gseq", "always");
-    assert!(said.contains("were joined to these tracks") && !said.contains("--link always makes"), "{said}");
+    assert!(said.contains("were joined to these tracks") && !said.contains("--link always joins"), "{said}");
     // In each frame what was there is there once.
     for t in (0..frames).step_by(13) {
         let mut whole = Gaussians::zeros(count, 1);
