@@ -10,7 +10,7 @@ use std::process::{Child, ChildStdin, Command, Stdio};
 use std::thread::JoinHandle;
 
 use crate::error::{Error, Result, ShowPath};
-use crate::files::image::write::{of_png, rgb};
+use crate::files::image::write::{png_error_to_io, rgb};
 use crate::render::Image;
 
 /// Program that encodes what this one does not.
@@ -112,8 +112,8 @@ impl FilmOutput {
                     encoder.set_animated(frames, 0)?;
                     encoder.set_frame_delay(1, fps.try_into().unwrap_or(u16::MAX))
                 };
-                begin().map_err(|error| failed(of_png(error)))?;
-                FilmWriter::Apng(Box::new(encoder.write_header().map_err(|error| failed(of_png(error)))?))
+                begin().map_err(|error| failed(png_error_to_io(error)))?;
+                FilmWriter::Apng(Box::new(encoder.write_header().map_err(|error| failed(png_error_to_io(error)))?))
             }
             FilmFormat::Gif => {
                 let [width, height] = gif_size(size).map_err(failed)?;
@@ -151,7 +151,7 @@ impl FilmOutput {
     fn write(&mut self, image: &Image) -> io::Result<()> {
         let bytes = rgb(image);
         match &mut self.writer {
-            FilmWriter::Apng(writer) => writer.write_image_data(&bytes).map_err(of_png),
+            FilmWriter::Apng(writer) => writer.write_image_data(&bytes).map_err(png_error_to_io),
             FilmWriter::Gif(encoder) => {
                 let [width, height] = gif_size(self.size)?;
                 let mut frame = gif::Frame::from_rgb_speed(width, height, &bytes, GIF_SPEED);
@@ -174,7 +174,7 @@ impl FilmOutput {
             return Err(Error::io("write", &self.shown)(few));
         }
         let finished = match self.writer {
-            FilmWriter::Apng(writer) => writer.finish().map_err(of_png),
+            FilmWriter::Apng(writer) => writer.finish().map_err(png_error_to_io),
             FilmWriter::Gif(encoder) => encoder.into_inner().map_err(of_gif).and_then(|mut file| file.flush()),
             FilmWriter::Encoder(encoder) => encoder.finish(),
         };
