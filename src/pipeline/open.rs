@@ -1,11 +1,11 @@
-//! Opening a scene that is to be measured; a stream is measured as it arrives, so that it is read once.
+//! Opens a scene for measuring. A stream is measured while it arrives, so that it is read only once.
 //!
-//! Memory of a stream: what packing it takes ([`crate::models::stream`]) and, when measuring, the accumulators of all
-//! Gaussians ([`crate::statistics::BYTES_PER_GAUSSIAN`] each) and what [`RunningContribution`] needs.
+//! Memory of a stream: packing ([`crate::models::stream`]) and, when measuring, the accumulators of all Gaussians
+//! ([`crate::statistics::BYTES_PER_GAUSSIAN`] each) and the memory of [`RunningContribution`].
 //!
-//! What only the end of the stream tells (time span, number of frames) is assumed meanwhile: even frames, and
-//! pictures taken at exactly the times that arrive. Where that proves wrong the packed frames are
-//! measured instead: the result is the same either way.
+//! The time span and the number of frames are known only at the end of the stream. Until then evenly spaced frames are
+//! assumed, and views whose times equal those of the frames. If an assumption proves wrong, the packed frames are
+//! measured instead; the result is the same in both cases.
 
 use std::cell::OnceCell;
 use std::io::Stdin;
@@ -38,11 +38,13 @@ use crate::source::{FrameSource, Reads};
 use crate::statistics::ScanPlan;
 use crate::statistics::pass::RunningScan;
 
-/// Opens a scene to be measured, with the limits of its budget; `plan` says what is to be done with such a scene. A
-/// stream is measured as it arrives, see [`receive_measured`]; the statistics come back then.
+/// Opens a scene for measuring and sets its limits within the memory budget. `plan` makes the plan of the run from
+/// facts about the scene. A stream is measured while it arrives, see [`receive_measured`]; then the statistics are
+/// returned, too.
 ///
 /// # Errors
-/// Whatever is wrong with input, cameras or budget; those of `plan`, before any frame of a stream is read.
+/// Fails if the input, the cameras or the budget is invalid, and if `plan` fails, which happens before any frame of a
+/// stream is read.
 pub fn open_to_measure(
     options: &InputOptions,
     plan: impl FnOnce(InputMeta, &Workload) -> Result<RunPlan>,
@@ -66,14 +68,14 @@ pub fn open_to_measure(
     let plan =
         Plan::fit(scene.workload(), options.memory, &options.events, |work, limits| stages.estimates(work, limits))?;
     scene.follow(&plan);
-    // What measuring beforehand reads is no part of the plan.
+    // Reads of the calibration are not part of the plan, so they are counted before it.
     let reads = scene.source().reads();
     foretell(&mut scene, &plan, &stages, MeasuredOnArrival::default(), options, journal)?;
     journal.opened("read", start, scene.source().info().count, reads);
     Ok((scene, stages, None))
 }
 
-/// Says what is to come, if anybody asked.
+/// Sends the plan and the time forecast as messages, if the user asked for them.
 fn foretell(
     scene: &mut Scene,
     plan: &Plan,
@@ -83,7 +85,7 @@ fn foretell(
     journal: &mut Journal,
 ) -> Result<()> {
     let tell = options.memory.tell;
-    // Of a part nobody knows how much of the run it is.
+    // A shard cannot tell which fraction of the run it does, so it has no forecast.
     let is_part = options.work.as_ref().is_some_and(|work| work.part.is_some());
     if tell == Verbosity::Plan && stages.output.is_some() {
         options.events.send(Message::Plan(&stages.text()));
@@ -96,8 +98,8 @@ fn foretell(
     Ok(())
 }
 
-/// Packs a stream that `loaded` looks at into a scratch container and measures it meanwhile, if there is memory for that
-/// beside the frames held. Gives the statistics if what was assumed held.
+/// Packs a stream into a scratch container. Measures it meanwhile if memory suffices beside the frames held. `loaded`
+/// is the rig of the user's cameras, if any. Returns the statistics if the assumptions about the stream proved right.
 fn receive_measured(
     stream: FrameStream<Stdin>,
     loaded: Option<Rig>,
@@ -145,7 +147,7 @@ fn receive_measured(
             format!("frames: at most {most} fit the memory limit; up to {to_measure} are measured while they arrive");
         options.events.send(Message::Plan(&text));
     }
-    // Without cameras the rig stands around the first frame, and everything else around the rig.
+    // Without cameras the virtual rig is placed around the first frame; the plan of the scan follows from the rig.
     let (rig, plan_of_scan) = (OnceCell::new(), OnceCell::new());
     if let Some(loaded) = loaded {
         let _ = rig.set(loaded);
@@ -172,7 +174,7 @@ fn receive_measured(
     let rig_given = has_cameras.then(|| rig.get().cloned()).flatten();
     let opened = Opened { rig: rig_given, input: Box::new(streamed), notes: Vec::new() };
     let mut scene = scene_of(opened, options)?;
-    // Now that the frames are counted.
+    // The number of frames is known now.
     let counted = Budget { tell: Verbosity::Nothing, ..options.memory };
     let later = Plan::fit(scene.workload(), counted, &options.events, |work, limits| stages.estimates(work, limits))?;
     scene.follow(&later);
@@ -188,7 +190,7 @@ fn receive_measured(
         let found = match measuring.wrong(&complete, &scene) {
             None => {
                 let found = measuring.finish(&complete);
-                // Frames were looked at with them before they turned out not to be finite.
+                // The frames were measured with these Gaussians before they proved not to be finite.
                 match stages.measure.score.absent(&found.scanned.rows).is_empty() {
                     true => Ok(found),
                     false => Err("Gaussians with NaN or infinity are dropped from all frames"),
@@ -209,18 +211,18 @@ fn receive_measured(
     Ok((scene, stages, arrived))
 }
 
-/// A virtual rig around the first of the frames.
+/// Returns a virtual rig around the first of the held frames.
 fn rig_around(held: &HeldFrames) -> Rig {
     let bounds = RobustBox::from_positions(held.position(0));
     cameras::virtual_rig(bounds.middle, bounds.extent())
 }
 
-/// Statistics of the frames so far.
+/// Running statistics of the frames received so far.
 struct Measuring<'a> {
     plan: &'a ScanPlan,
     cameras: &'a [Camera],
     assumed: AssumedTimes<'a>,
-    /// Which cameras see the frames so far, as assumed.
+    /// Assignment of cameras to the frames so far, as assumed.
     schedule: Schedule,
     scan: RunningScan<'a>,
     seen: Option<(Sampler, RunningContribution)>,
@@ -259,7 +261,7 @@ impl<'a> Measuring<'a> {
         Ok(())
     }
 
-    /// What was assumed wrongly, if anything was.
+    /// Returns which assumption proved wrong, if any.
     fn wrong(&self, complete: &ScanPlan, scene: &Scene) -> Option<&'static str> {
         if !complete.finishes(self.plan) {
             return Some("the frames are not evenly spaced in time");
@@ -272,11 +274,11 @@ impl<'a> Measuring<'a> {
     }
 }
 
-/// Which cameras see a frame, while the other frames are unknown: those whose pictures were taken at its very
-/// time, and those without a time.
+/// Cameras that see a frame, assigned while the other frames are still unknown: views taken at exactly the time of the
+/// frame, and views without a time.
 struct AssumedTimes<'a> {
     rig: &'a Rig,
-    /// Places in the rig of the pictures of the split, by time, then place.
+    /// (Time, index in the rig) of the views of the split that have a time, sorted by time, then index.
     timed: Vec<(f64, usize)>,
     timeless: Vec<usize>,
     tolerance: f64,
@@ -297,7 +299,7 @@ impl<'a> AssumedTimes<'a> {
         AssumedTimes { rig, timed, timeless, tolerance: rig.time_tolerance() }
     }
 
-    /// (View number, camera index) of the cameras that see a frame at `time`, in the order of the rig.
+    /// Returns (view number, camera index) of the cameras that see a frame at `time`, in the order of the rig.
     fn at(&self, time: f64) -> Vec<(u32, u32)> {
         let near = self.timed.partition_point(|&(other, _)| other < time - self.tolerance);
         let near = self.timed[near..].iter().take_while(|&&(other, _)| other <= time + self.tolerance);

@@ -1,5 +1,5 @@
-//! The plan of a run: its stages with their parameters, what is left out and why, and how many Gaussians ranking and
-//! refinement leave. Made in one place, before any work.
+//! The plan of a run: its stages with their parameters, the omitted stages and their reasons, and the numbers of
+//! Gaussians that ranking and refinement leave. It is made in one place, before any work.
 
 use std::path::Path;
 
@@ -20,17 +20,17 @@ use crate::pruning::visible::Visible;
 use crate::refinement::RefineStage;
 use crate::scene::Scene;
 
-/// The plan of a run.
+/// Plan of a run.
 pub struct RunPlan {
-    /// The stages in their order.
+    /// Stages in their order.
     pub(super) stages: StageList,
-    /// The stages that measure, by which a stream is measured as it arrives.
+    /// Stages that measure; a stream is measured by them while it arrives.
     pub measure: Measure,
-    /// What is written; none where only statistics are asked for.
+    /// Stage that writes the result; `None` if only statistics are wanted.
     pub output: Option<Emit>,
-    /// Repeats the stages of [`Phase::Reduce`] until a quality is reached.
+    /// Search that repeats the stages of [`Phase::Reduce`] until a quality is reached.
     pub search: Option<SearchStage>,
-    /// Exact number of Gaussians in the output, where it is asked for.
+    /// Exact number of Gaussians in the output, if requested.
     pub target: Option<usize>,
     gaussians: usize,
     merges: bool,
@@ -39,27 +39,29 @@ pub struct RunPlan {
 }
 
 impl RunPlan {
-    /// Returns the plan of a run that compresses as `request` says, whatever memory it takes.
+    /// Returns the plan of a compression by `request`, regardless of memory.
     ///
     /// # Errors
-    /// A recipe out of range; a target or ids that such an input does not have; options that exclude each other.
+    /// Fails if the recipe is out of range, if the input does not have the target count or the ids, or if options
+    /// exclude each other.
     pub fn new(request: &Request, input: InputMeta) -> Result<RunPlan> {
         RunPlan::with_fallback(request, input, MemoryFallback::Nothing)
     }
 
-    /// Returns the plan of a run that measures and scores.
+    /// Returns the plan of a run that only measures and scores.
     pub fn to_measure(measure: Measure, input: InputMeta) -> RunPlan {
         let mut plan = RunPlan::empty(measure.clone(), input.gaussians);
         plan.stages.add(Phase::Rank, measure);
         plan
     }
 
-    /// Returns the plan of a run within the memory limit of `request`. Where refinement does not fit, parameter deltas are
-    /// constant in time; else SH coefficients above degree 0 are not refined either; else nothing is refined. Where not even
-    /// that fits, the plan is the whole one, which is then refused with the smallest sufficient limit.
+    /// Returns the plan of a run within the memory limit of `request`. If full refinement does not fit, parameter
+    /// deltas are constant in time; if that does not fit, SH coefficients above degree 0 are not refined either; if
+    /// that does not fit, nothing is refined. If even this exceeds the limit, the full plan is returned; it is refused
+    /// later with the smallest sufficient limit.
     ///
     /// # Errors
-    /// Those of [`RunPlan::new`].
+    /// Fails where [`RunPlan::new`] fails.
     pub fn within_memory(request: &Request, input: InputMeta, work: &Workload) -> Result<RunPlan> {
         let with = |fallback| RunPlan::with_fallback(request, input, fallback);
         let fits =
@@ -116,7 +118,8 @@ impl RunPlan {
             MemoryFallback::WithoutHarmonics { .. } => Some(refine.without_course().without_bands()),
             MemoryFallback::WithoutRefinement { .. } => None,
         });
-        // Refinement gains more at a count than merging ever did; prune steps rank anew, whatever ranked before.
+        // At the same count refinement gains more quality than merging. Prune steps rank anew, so the order does not
+        // matter.
         let prunes_alone = *only == Only::Prune || request.goal.is_some() || (planning.refine.is_some() && prunes);
         planning.merges = !prunes_alone && !recipe.merge.passes.is_empty();
 
@@ -133,13 +136,13 @@ impl RunPlan {
         Ok(plan)
     }
 
-    /// Returns the estimates of all stages.
+    /// Returns the resource estimates of all stages.
     pub fn estimates(&self, work: &Workload, limits: &Limits) -> Vec<ResourceEstimate> {
         self.remaining_estimates(work, limits, MeasuredOnArrival::default())
     }
 
-    /// Returns the estimates of the stages that are still to run: those of a stream need not measure what was measured while it
-    /// arrived.
+    /// Returns the resource estimates of the stages that are still to run. They exclude statistics that were taken
+    /// while a stream arrived.
     pub fn remaining_estimates(
         &self,
         work: &Workload,
@@ -149,8 +152,8 @@ impl RunPlan {
         self.estimates_of(self.estimate_input(work, limits, measured), |_| true)
     }
 
-    /// Returns the estimates of the stages that are still to run, without those that may turn out to be unnecessary because
-    /// views hardly differ without a part `hardly_seen` of the Gaussians.
+    /// Returns the resource estimates of the stages that are still to run, without stages that may turn out to be
+    /// unnecessary because views hardly change when the fraction `hardly_seen` of the Gaussians is removed.
     pub fn shortest_estimates(
         &self,
         work: &Workload,
@@ -183,22 +186,23 @@ impl RunPlan {
         [of(Phase::Rank), reduce, of(Phase::Write)].concat()
     }
 
-    /// Returns whether the amount of work depends on what stages find, so that time estimates are wide.
+    /// Returns whether the amount of work depends on results of stages, which makes time estimates imprecise.
     pub fn is_open_ended(&self) -> bool {
         self.search.is_some() || self.stages.is_open_ended()
     }
 
-    /// Returns the stages that several processes can divide among themselves, as a work folder names them, with their units.
+    /// Returns the stages that several processes can divide among themselves, with their units of work. Stages have the
+    /// names under which the cache keeps them.
     pub fn shardable_units(&self, scene: &Scene) -> Vec<String> {
         self.stages.all().flat_map(|stage| stage.shardable_units(scene, &self.stages.counts)).collect()
     }
 
-    /// Returns how many Gaussians ranking and refinement leave, for a person.
+    /// Returns the numbers of Gaussians that ranking and refinement leave, as text for display.
     pub fn counts_text(&self) -> String {
         self.stages.counts.text(self.target, self.gaussians, self.merges)
     }
 
-    /// Returns the plan for a person: counts, parameters of the stages, and what is left out.
+    /// Returns the plan as text for display: counts, parameters of the stages, and omitted stages.
     pub fn text(&self) -> String {
         let parameters = self.stages.all().map(|stage| stage.parameters()).filter(|text| !text.is_empty());
         let search = self.search.as_ref().map(SearchStage::parameters);
@@ -207,18 +211,18 @@ impl RunPlan {
         self.counts_text() + &lines.collect::<String>()
     }
 
-    /// Confirms, before the input is opened, that a run which reads `input` may write its result.
+    /// Checks, before the input is opened, that a run which reads `input` may write its output.
     ///
     /// # Errors
-    /// Outputs that are there already, or cannot be.
+    /// Fails if the output exists already or cannot be created.
     pub fn check_target(&self, input: &Path) -> Result<()> {
         self.output.as_ref().map_or(Ok(()), |output| output.check_target(&[input]))
     }
 
-    /// Confirms, before any work, that the scene has what the stages need.
+    /// Checks, before any work, that the scene has the files that the stages need.
     ///
     /// # Errors
-    /// Those of the stages.
+    /// Fails if the check of a stage fails.
     pub fn check(&self, scene: &Scene) -> Result<()> {
         if let Some(search) = &self.search {
             search.check(scene)?;
@@ -227,10 +231,10 @@ impl RunPlan {
     }
 }
 
-/// Returns the kind of result that `request` asks for, of an input whose own kind of result is `own`.
+/// Returns the kind of output that `request` asks for. `own` is the default kind of the input.
 ///
 /// # Errors
-/// A name that says nothing; options of which an output or a goal allows one only.
+/// Fails if the name of the output does not tell its kind, or if options exclude each other.
 fn checked_output(request: &Request, own: OutputKind) -> Result<OutputKind> {
     let Request { goal, archive_psnr, .. } = request;
     if goal.is_some() && (request.only == Only::Merge || request.target.is_some()) {
@@ -283,7 +287,7 @@ mod tests {
         Budget { bytes: Some(bytes), ..Budget::default() }
     }
 
-    /// Everything compressing does under `preset`.
+    /// Returns a function that estimates all stages of a compression with the recipe `preset`.
     fn everything(preset: &str) -> impl Fn(&Workload, &Limits) -> Vec<ResourceEstimate> {
         let recipe = Recipe::preset(preset).unwrap();
         let plan = RunPlan::new(&request(recipe), OUTLOOK).unwrap();
@@ -354,7 +358,7 @@ mod tests {
         let (spared, refine, _, named) = within(bands - 1);
         assert_eq!((spared, refine), (MemoryFallback::WithoutRefinement { required_bytes: bands }, None));
         assert!(named.unwrap().contains(&format!("{}MiB", bands.div_ceil(1 << 20))));
-        // What nothing can be done about is refused as it was asked for.
+        // A limit below every fallback returns the full plan, which is refused later.
         assert_eq!(within(1 << 20).0, MemoryFallback::Nothing);
     }
 
@@ -402,7 +406,7 @@ mod tests {
         let (unrefined, text) = counts(default().unrefined(), Some(0.1), None);
         assert_eq!(unrefined, [100, 100]);
         assert!(text.contains("leave 100 of 1000 Gaussians (10%); refinement removes none"), "{text}");
-        // A search ranks once for all of its sizes.
+        // A search ranks once, down to the smallest size that it may try.
         let psnr = || Some(Goal::Quality(Quality::Psnr(30.0)));
         assert_eq!(counts(default(), None, psnr()).0, [400, 400]);
         assert_eq!(counts(default().unrefined(), None, psnr()).0, [20, 100]);

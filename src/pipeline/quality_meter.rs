@@ -1,4 +1,4 @@
-//! What the quality of a reduction is measured by, and what of it is held back.
+//! Quality of a compressed model, measured on views for the search and on views held back for the report.
 
 use rayon::prelude::*;
 
@@ -12,28 +12,28 @@ use crate::scene::Scene;
 use crate::scene::photographs::Photographs;
 use crate::source::FrameSource;
 
-/// What pictures are compared with.
+/// Images that renders of a model are compared with.
 pub(super) enum With<'a> {
-    /// The original's own, by their numbers.
+    /// Renders of the original: targets, and the indices of the views among them.
     Original(&'a Targets, Vec<usize>),
-    /// Photographs.
+    /// Photographs of the scene.
     Photographs(Photographs),
 }
 
-/// Pictures that models are measured on.
+/// Set of views on which models are measured.
 pub(super) struct QualityMeter<'a> {
     scene: &'a Scene,
     cameras: &'a [Camera],
-    /// By frame, and whether each is held back.
+    /// Views in order of frames; the flag tells whether a view is held back.
     pictures: Vec<(Picture, bool)>,
     with: With<'a>,
 }
 
 impl<'a> QualityMeter<'a> {
-    /// By `pictures`, by frame, of which some are held back.
+    /// Returns a meter for `pictures`, in order of frames, each with a flag that tells whether it is held back.
     ///
     /// # Errors
-    /// None that is held back, or none that is not.
+    /// Fails if no view is held back, or all are.
     pub(super) fn new(
         scene: &'a Scene,
         cameras: &'a [Camera],
@@ -50,10 +50,11 @@ impl<'a> QualityMeter<'a> {
         Ok(QualityMeter { scene, cameras, pictures, with })
     }
 
-    /// Mean PSNR, dB, of what `source` shows, by the pictures that are searched on or by those held back.
+    /// Returns the mean PSNR of renders of `source`, dB: on the views held back if `held`, otherwise on the views for
+    /// the search.
     ///
     /// # Errors
-    /// Frames or photographs that cannot be read.
+    /// Fails if frames or photographs cannot be read.
     pub(super) fn measure(&self, source: &dyn FrameSource, held: bool) -> Result<f64> {
         let background = self.scene.background;
         let places: Vec<usize> = (0..self.pictures.len()).filter(|&k| self.pictures[k].1 == held).collect();
@@ -68,7 +69,7 @@ impl<'a> QualityMeter<'a> {
                         Ok(psnr(&picture, &photographs.read(view.picture, view.camera, background)?))
                     }
                     With::Original(targets, numbers) => {
-                        // As the targets are made.
+                        // Rendered like the targets.
                         let picture = render(view.states[0], view.camera, background);
                         Ok(decibels(mean_square(&picture, &targets.values(numbers[places[first + place]])?)))
                     }
@@ -81,12 +82,13 @@ impl<'a> QualityMeter<'a> {
         Ok(found.iter().sum::<f64>() / found.len() as f64)
     }
 
-    /// How many pictures are searched on.
+    /// Returns the number of views for the search.
     pub(super) fn searched(&self) -> usize {
         self.pictures.iter().filter(|picture| !picture.1).count()
     }
 
-    /// Names of the pictures held back: frame and view; of those in between the scene's cameras the frame.
+    /// Returns the names of the views held back, made of frame and view. A view between the cameras of the scene is
+    /// named by its frame.
     pub(super) fn held(&self) -> Vec<String> {
         let name = |picture: &Picture| match picture.view {
             u32::MAX => format!("t{:03}_between", picture.frame),

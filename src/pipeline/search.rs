@@ -1,9 +1,9 @@
-//! The search for the smallest model that is as good as asked for: a loop around the stages that reduce the model.
+//! Search for the smallest model that has the requested quality: a loop around the stages that reduce the model.
 //!
-//! Sizes are tried one after the other, each refined as if it had been asked for; the next one follows from how much
-//! quality the last ones had to spare, and lies between the largest that did not do and the smallest that did. Cuts on the
-//! way down are kept, so that a smaller size goes on from there. A quarter of the pictures is never searched on and gives
-//! the figure that is reported (method.md, section 6.3).
+//! Sizes are tried one after the other, each refined as if it had been requested. The next size follows from the
+//! surplus of quality at the last sizes, and lies between the largest size that failed and the smallest that passed.
+//! Refinement states after prune steps are kept, so that a smaller size continues from there. A quarter of the views is
+//! never used by the search and gives the reported figure (method.md, section 6.3).
 
 use super::planning::Planning;
 use super::quality_meter::{QualityMeter, With};
@@ -34,44 +34,45 @@ use crate::scene::pictures::{PictureSet, pictures};
 use crate::scene::stamps;
 use crate::source::FrameSource;
 
-/// What the stage is called.
+/// Name of the stage.
 const NAME: &str = "search";
-/// Part of the Gaussians that is tried first.
+/// Fraction of the Gaussians that is tried first.
 const FIRST: f64 = 0.2;
-/// Sizes that are usually tried, for estimates.
+/// Usual number of sizes that are tried, for estimates.
 const SIZES_USUALLY_TRIED: f64 = 4.0;
-/// Sizes that are tried at most.
+/// Maximum number of sizes that are tried.
 const MOST_TRIED: usize = 8;
-/// Neighboring sizes whose ratio is this or less are not told apart.
+/// Ratio of two sizes up to which they count as equal, so that the search ends.
 const SAME_SIZE: f64 = 1.04;
-/// What a halving of the number of Gaussians costs, about: dB, and the factor of a loss. Guesses follow from it.
+/// Approximate cost of halving the number of Gaussians: PSNR in dB, and the factor by which a loss grows. The search
+/// derives its guesses from it.
 const HALVING: (f64, f64) = (4.5, 3.0);
-/// Halvings that a size may have to spare and still be the one.
+/// Maximum surplus of quality of an accepted size, in halvings of the number of Gaussians.
 const CLOSE: f64 = 0.03;
-/// Losses are not told apart below this, dB.
+/// Smallest loss that the search distinguishes, dB.
 const LEAST_LOSS: f64 = 1e-3;
-/// Of the photographs every fourth is held back.
+/// Interval of held-back views among those with photographs: every fourth is held back.
 const HELD_EVERY: usize = 4;
 
-/// The search of a run: repeats the stages that reduce the model, once for every size it tries.
+/// Search of a run: repeats the stages that reduce the model, once for every size it tries.
 #[derive(Debug, Clone)]
 pub struct SearchStage {
-    /// What is asked for.
+    /// Quality that the user requested.
     quality: Quality,
-    /// What is searched for: an archive takes some of the quality that is found.
+    /// Quality that is searched for. For an archive it is higher than requested, because quantization costs quality.
     searched: Quality,
-    /// Pictures of the original that sizes are compared and refined by.
+    /// Number of views of the original by which sizes are refined and compared.
     pictures: usize,
-    /// How a size is refined.
+    /// Refinement of each size; `None` if nothing is refined.
     refine: Option<RefineStage>,
-    /// Margins, dB, by which the field of a size is rounded and bands of its harmonics are dropped; none: they stay.
+    /// Margins, dB, of the half-precision field and of dropped SH degrees; `None`: the field or the degree stays.
     margins: [Option<f64>; 2],
 }
 
-/// A size that was tried.
+/// Size that was tried, with its result.
 struct TriedSize {
     result: CompressedModel,
-    /// dB or dB lost, by the pictures that are searched on.
+    /// PSNR or loss of PSNR, dB, on the views of the search.
     value: f64,
     journal: Journal,
 }
@@ -96,13 +97,14 @@ impl SearchStage {
         })
     }
 
-    /// Returns what is searched for, for a person.
+    /// Returns the parameters of the search as text for display.
     pub(super) fn parameters(&self) -> String {
         format!("search: {} sizes at most, for {} {}", MOST_TRIED, self.name(), self.goal())
     }
 
-    /// Returns the estimate of the search. `repeated` are those of the stages that every size goes through: memory is that of
-    /// the largest of them and of the models that the search keeps, time and reads are those of all, for each size.
+    /// Returns the estimate of the search. `repeated` are the estimates of the stages that run for every size. Memory
+    /// is that of the largest of them plus the models that the search keeps; time and reads are the sums over all, for
+    /// each size.
     pub fn estimate(&self, input: EstimateInput<'_>, repeated: &[ResourceEstimate]) -> ResourceEstimate {
         let EstimateInput { work, limits, .. } = input;
         let whole = work.state(Columns::all());
@@ -126,18 +128,18 @@ impl SearchStage {
         need.stage = NAME;
         need.seconds = SIZES_USUALLY_TRIED * seconds.max(measured.seconds);
         need.reads = SIZES_USUALLY_TRIED * reads.max(measured.reads);
-        // A picture, what it is compared with as it is read, and as it is used.
+        // A rendered view, and its comparison image as it is read and as it is used.
         need.fixed.push(("compared", work.threads * (render::STRIP_BYTES as u64 + 28 * work.pixels)));
         need.fixed.push(("field", work.input.fixed));
-        // Prune steps of a fifth from two fifths: twice the Gaussians.
+        // Prune steps remove a fifth each, starting from two fifths: together twice the Gaussians.
         need.per_gaussian.extend([("ways", 3 * (whole + 8)), ("result", work.input.reduced), ("kept", CLUSTERED)]);
         need
     }
 
-    /// Finds the smallest result that is as good as asked for, and leaves it and what it was found by in `run`.
+    /// Finds the smallest result with the requested quality. Stores the result and the summary of the search in `run`.
     ///
     /// # Errors
-    /// Frames or photographs that cannot be read; too few pictures.
+    /// Fails if frames or photographs cannot be read, or if there are too few views.
     pub fn run(&self, run: &mut RunState<'_>) -> Result<()> {
         let (scene, scored, ranking) = (run.scene, run.scored()?, run.ranking()?);
         let key = self.key(scene, &scored, &ranking, &run.template)?;
@@ -179,7 +181,7 @@ impl SearchStage {
         Ok(())
     }
 
-    /// Returns what sizes are compared by: photographs, or pictures of the original.
+    /// Returns the meter by which sizes are compared: against photographs, or against renders of the original.
     fn meter<'a>(
         &self,
         scene: &'a Scene,
@@ -204,7 +206,7 @@ impl SearchStage {
         }
     }
 
-    /// What the search follows from.
+    /// Returns the cache key of everything that the search depends on.
     fn key(&self, scene: &Scene, scored: &Scored, ranked: &Ranking, like: &CompressedModel) -> Result<CacheKey> {
         let (asked, folder) = match &self.searched {
             Quality::Psnr(least) => (*least, None),
@@ -223,15 +225,16 @@ impl SearchStage {
         )))
     }
 
-    /// Confirms, before any work, that there are photographs, where a loss is asked for.
+    /// Checks, before any work, that there are enough photographs if a maximum loss is requested.
     ///
     /// # Errors
-    /// Photographs that are not there, or too few.
+    /// Fails if photographs are missing or too few.
     pub fn check(&self, scene: &Scene) -> Result<()> {
         self.photographs(scene).map(|_| ())
     }
 
-    /// The held-out pictures that have a photograph, and these, where a loss is asked for.
+    /// Returns the test views that have a photograph, with their photographs; `None` unless a maximum loss is
+    /// requested.
     fn photographs(&self, scene: &Scene) -> Result<Option<(Vec<Picture>, Photographs)>> {
         let Quality::Loss { photographs, .. } = &self.searched else { return Ok(None) };
         let times = &scene.source().info().times;
@@ -246,13 +249,14 @@ impl SearchStage {
         Ok(Some(found))
     }
 
-    /// Tries sizes from all protected Gaussians to all that may stay. Returns the smallest that does, or everything, and every
-    /// size tried with what it has.
+    /// Tries sizes between the number of protected Gaussians and the number that may stay. Returns the smallest size
+    /// that has the requested quality, or the model with all Gaussians that may stay if none has. Also returns every
+    /// tried size with its value in dB.
     fn bracket(&self, trial: &mut RunState<'_>, meter: &QualityMeter<'_>) -> Result<(TriedSize, Vec<(usize, f64)>)> {
         let (least, all) = (trial.scored()?.protected.len().max(1), trial.ranking()?.order().len());
         let mut tried: Vec<(usize, f64)> = Vec::new();
         let mut best: Option<TriedSize> = None;
-        // Sizes, and halvings that each has to spare: below what does not do, above what does.
+        // Sizes, each with its surplus in halvings: `low` fails, `high` passes. `None`: not tried.
         let (mut low, mut high) = ((least.saturating_sub(1), None), (all, None));
         let mut next = FIRST * all as f64;
         while tried.len() < MOST_TRIED && high.0 - low.0 > 1 && high.0 as f64 > SAME_SIZE * low.0 as f64 {
@@ -270,7 +274,7 @@ impl SearchStage {
             }
             next = match (low, high) {
                 ((low, Some(below)), (high, Some(above))) => {
-                    // A little above where the line between both crosses zero.
+                    // Slightly above the size at which the line between both surpluses crosses zero.
                     let part = ((0.5 * CLOSE - below) / (above - below)).clamp(0.1, 0.9);
                     low as f64 * (high as f64 / low as f64).powf(part)
                 }
@@ -288,7 +292,7 @@ impl SearchStage {
         Ok((best, tried))
     }
 
-    /// Runs the stages that reduce the model to `size` Gaussians and measures what comes out.
+    /// Runs the stages that reduce the model to `size` Gaussians and measures the result.
     fn try_size(&self, trial: &mut RunState<'_>, meter: &QualityMeter<'_>, size: usize) -> Result<TriedSize> {
         (trial.journal, trial.target) = (Journal::default(), Some(size));
         trial.stages.run(Phase::Reduce, trial)?;
@@ -299,7 +303,8 @@ impl SearchStage {
         Ok(TriedSize { result, value, journal })
     }
 
-    /// What the goal is about, dB or dB lost, of `result`, by the pictures that are searched on or by those held back.
+    /// Returns the value that the goal limits, PSNR or loss of PSNR in dB, of `result`: on the views held back if
+    /// `held`, otherwise on the views of the search.
     fn value(&self, meter: &QualityMeter<'_>, result: &dyn FrameSource, scene: &Scene, held: bool) -> Result<f64> {
         let found = meter.measure(result, held)?;
         match self.searched {
@@ -308,17 +313,18 @@ impl SearchStage {
         }
     }
 
-    /// Halvings of the number of Gaussians that `value` has to spare, about.
+    /// Returns the surplus of quality of `value` over the goal, in approximate halvings of the number of Gaussians.
+    /// Negative if the goal is missed.
     fn spare(&self, value: f64) -> f64 {
         match self.searched {
-            // Of pictures that are not finite.
+            // Renders that are not finite never pass.
             _ if value.is_nan() => f64::NEG_INFINITY,
             Quality::Loss { most, .. } => (most / value.max(LEAST_LOSS)).ln() / HALVING.1.ln(),
             Quality::Psnr(least) => (value - least) / HALVING.0,
         }
     }
 
-    /// Returns what is searched for, dB.
+    /// Returns the PSNR or the loss that is searched for, dB.
     fn goal(&self) -> f64 {
         match self.searched {
             Quality::Psnr(least) => least,
@@ -326,7 +332,7 @@ impl SearchStage {
         }
     }
 
-    /// Name of what is asked for, as a recipe has it.
+    /// Returns the name of the goal as in a recipe file.
     fn name(&self) -> &'static str {
         match self.quality {
             Quality::Psnr(_) => "min_psnr",
@@ -346,7 +352,8 @@ impl SearchStage {
     }
 }
 
-/// What was found, for a person: of `gaussians`, by so many pictures searched on, and whether it `does`.
+/// Returns a note about the result of the search for display. `searched` is the number of views of the search, `does`
+/// tells whether the result has the requested quality.
 fn note(summary: &GoalSummary, searched: usize, gaussians: usize, does: bool) -> String {
     let GoalSummary { name, asked, searched: by_searched, held, held_pictures, tried } = summary;
     let (sizes, others) = (tried.len(), held_pictures.len());

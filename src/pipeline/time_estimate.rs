@@ -1,4 +1,4 @@
-//! What a run will take, with ranges, before it begins.
+//! Forecast of a run: expected time with a range, and memory, before the run begins.
 
 use std::fmt::Write as _;
 
@@ -6,20 +6,21 @@ use crate::journal::records::{Forecast, Range, StageForecast};
 use crate::memory_plan::{ResourceEstimate, Verbosity, Workload, size};
 use crate::progress::duration;
 
-/// How far off core-seconds were on three trained models at several sizes after a calibration (`scripts/estimate.py`), as
-/// parts of what was expected, and somewhat more.
+/// Range of measured core-seconds relative to expected ones after a calibration: lowest and highest ratio on three
+/// trained models at several sizes (`scripts/estimate.py`), slightly widened.
 const OFF: [f64; 2] = [0.5, 1.6];
-/// The same where nothing was measured.
+/// Range of the same ratio without a calibration.
 const OFF_UNMEASURED: [f64; 2] = [0.25, 4.0];
-/// The same where the size itself is searched for: how often pictures are refined is found on the way.
+/// Range of the same ratio for a search, whose number of refinements is not known in advance.
 const OFF_SEARCHING: [f64; 2] = [0.15, 2.5];
-/// Part of the processors that stages keep at work, at least: not everything is divided among threads.
+/// Minimum fraction of the processors that stages keep busy; some work is not divided among threads.
 const TOGETHER: f64 = 0.6;
-/// Seconds that starting, opening and writing take, whatever is done.
+/// Time for starting, opening and writing in every run, seconds.
 const AT_LEAST: f64 = 0.5;
 
 impl Forecast {
-    /// Of stages that need what `needs` says, or at best take `least` core-seconds.
+    /// Returns the forecast of stages with the estimates `needs`. `least` is the number of core-seconds if all stages
+    /// are skipped that may be. `searches` tells whether the amount of work depends on results of stages.
     pub(super) fn new(
         work: &Workload,
         needs: &[ResourceEstimate],
@@ -52,7 +53,8 @@ impl Forecast {
         }
     }
 
-    /// For a person: time and memory, a line each; stage by stage too where everything is to be explained.
+    /// Returns the forecast as text for display: time and memory, one line each; with [`Verbosity::Plan`] also the
+    /// core-seconds of every stage.
     pub fn text(&self, tell: Verbosity) -> String {
         let Forecast { seconds, core_seconds: core, threads, stages, .. } = self;
         let mut out = String::new();
@@ -78,12 +80,12 @@ impl Forecast {
     }
 }
 
-/// Seconds of all processors together that stages take, about.
+/// Returns the expected core-seconds of all stages together.
 pub(super) fn core_seconds(needs: &[ResourceEstimate]) -> f64 {
     needs.iter().map(|need| need.seconds).sum()
 }
 
-/// Two digits: more would claim what nobody knows.
+/// Formats `value` with two significant digits; more would suggest a precision that a forecast does not have.
 fn digits(value: f64) -> String {
     match value {
         ..0.95 => format!("{value:.1}"),
@@ -95,7 +97,7 @@ fn digits(value: f64) -> String {
     }
 }
 
-/// A time that is about known.
+/// Formats an approximate time in seconds with about two significant digits.
 fn rounded(seconds: f64) -> String {
     match seconds {
         ..60.0 => format!("{} s", digits(seconds)),
@@ -115,7 +117,7 @@ mod tests {
     }
 
     #[test]
-    fn a_range_holds_what_is_likely_and_is_wider_where_less_is_known() {
+    fn range_contains_expected_value_and_widens_if_uncertain() {
         let unmeasured = work(1000);
         let measured = crate::memory_plan::Workload {
             pace: Throughput { processors: Some(1.5), ..Throughput::UNKNOWN },
@@ -137,7 +139,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_about_known_has_two_digits() {
+    fn approximate_values_are_formatted_with_two_digits() {
         for (value, text) in [(0.44, "0.4"), (9.6, "10"), (47.4, "47"), (1234.0, "1200"), (99.7, "100")] {
             assert_eq!(digits(value), text);
         }

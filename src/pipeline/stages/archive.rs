@@ -1,10 +1,11 @@
-//! Stage `archive`: on which grids the values of an archive lie.
+//! Stage `archive`: chooses the quantization steps of the values of an archive.
 //!
-//! Noise adds up: each attribute and tensor, a group, put on its grid alone adds a squared error to the pictures that
-//! goes with the square of its step, and takes bits that go down by about one a value with every octave of it. Bits are
-//! fewest for an error where every group's error goes by how many bits an octave saves there (reverse water-filling;
-//! Cover & Thomas, "Elements of Information Theory", 10.3.3). Both are measured, the errors on pictures; then all steps
-//! together are as coarse as the pictures of the archive itself allow.
+//! Quantization noise adds up. A group of values, an attribute or a tensor, that alone is quantized adds a squared
+//! error to renders proportional to the square of its step; the bits per value fall by about one for each octave of the
+//! step. For a given total error the bits are fewest if the error of every group is proportional to the bits that one
+//! octave saves there (reverse water-filling; Cover & Thomas, "Elements of Information Theory", 10.3.3). The stage
+//! measures both, the errors on renders. Then it makes all steps together as coarse as renders of the archive itself
+//! allow.
 
 use std::collections::BTreeMap;
 
@@ -29,18 +30,19 @@ use crate::pipeline::summary::ArchiveSummary;
 use crate::render;
 use crate::scene::Scene;
 
-/// What the stage is called.
+/// Name of the stage.
 const NAME: &str = "archive";
-/// Steps are at most so many deviations of their values: beyond that nothing is left of these.
+/// Maximum step in standard deviations of a group's values; a coarser one would erase the values.
 const COARSEST: f64 = 4.0;
-/// Octaves by which grids that no picture was looked at for are taken to be coarser in the end: with this the count that
-/// fits leaves .5 and 1.2 dB to the grids of two trained models.
+/// Octaves added to the initial steps to estimate the size of an archive without rendering. With this value, the number
+/// of Gaussians that fits leaves 0.5 and 1.2 dB for quantization on two trained models.
 const GUESSED: f64 = 3.3;
 
-/// The making of an archive.
+/// Stage that makes an archive.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ArchiveStage {
-    /// PSNR of its pictures against those of the result before, dB; none: by what it costs against the original's.
+    /// Required PSNR of its renders against the result before quantization, dB. `None`: derived from the loss against
+    /// the original.
     pub psnr: Option<f64>,
 }
 
@@ -76,7 +78,7 @@ impl Stage for ArchiveStage {
     }
 }
 
-/// A group of values with one step.
+/// Group of values with one quantization step.
 #[derive(Debug, Clone)]
 enum ValueGroup {
     Attribute(usize),
@@ -91,7 +93,8 @@ impl ValueGroup {
         }
     }
 
-    /// Steps that a deviation of its values is at first, finer than most end: where measuring begins.
+    /// Returns the initial number of steps per standard deviation of the values. These steps are finer than most final
+    /// ones.
     fn first(&self) -> f64 {
         match self {
             ValueGroup::Attribute(0) => 512.0,
@@ -103,11 +106,11 @@ impl ValueGroup {
 }
 
 impl ArchiveStage {
-    /// What is left, its pictures, the archive and what it decodes to.
+    /// Returns the estimate: the result, its renders, the archive and the decoded archive.
     pub fn need(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
         let whole = work.state(Columns::all());
         let count = pictures(work.pixels);
-        // Of some forty groups in every round, and of all together.
+        // About forty groups are quantized in every round, and all together in each halving.
         let looked = count as f64 * (2.0 * HALVINGS as f64 + ROUNDS as f64 * 40.0);
         ResourceEstimate {
             stage: NAME,
@@ -124,16 +127,17 @@ impl ArchiveStage {
                 ("pictures", PIXEL * (2 * count + work.threads) * work.pixels),
                 ("strips", work.threads * render::STRIP_BYTES as u64),
                 ("fields", 4 * work.input.fixed),
-                // Of frames a few blocks.
+                // Archives of frames also encode a few blocks.
                 ("blocks", bounds::storing(work).iter().map(|part| part.1).sum()),
             ],
         }
     }
 
-    /// Makes of `reduction` what it is `asked` for.
+    /// Makes an archive of `reduction` that meets `asked`.
     ///
     /// # Errors
-    /// An input that no archive holds, values or pictures that are not finite, frames that cannot be read, too few bytes.
+    /// Fails if the input cannot be archived, if values or renders are not finite, if frames cannot be read, or if the
+    /// byte limit is too low.
     pub fn archive(
         &self,
         scene: &Scene,
@@ -184,7 +188,7 @@ impl ArchiveStage {
         };
         let (encoded, [psnr, loss]) = match aim {
             QualityTarget::Bytes(most) => {
-                // The finest that fits.
+                // Take the finest steps that fit.
                 let fits = |finer: f64| Ok(Some(encoded(-finer)?).filter(|found| found.bytes.len() as u64 <= most));
                 looked_at(match bisected(BYTES_ADDED.map(|added| -added), BYTES_HALVINGS, fits)? {
                     Some(best) => best,
@@ -204,10 +208,10 @@ impl ArchiveStage {
     }
 }
 
-/// Bytes of an archive of `reduction`, about: on grids, or within bounds, as they are before any picture is looked at.
+/// Returns the estimated bytes of an archive of `reduction`, with steps or bounds that do not depend on renders.
 ///
 /// # Errors
-/// An input that no archive holds, values that are not finite.
+/// Fails if the input cannot be archived or values are not finite.
 pub fn bytes(scene: &Scene, reduction: &CompressedModel) -> Result<u64> {
     if scene.input.archives_frames() {
         return bounds::bytes(scene, &*scene.input.reduced(reduction)?);
@@ -216,7 +220,7 @@ pub fn bytes(scene: &Scene, reduction: &CompressedModel) -> Result<u64> {
     Ok(archive::encode(&content, &Grids::from_content(&content).steps(GUESSED))?.bytes.len() as u64)
 }
 
-/// The coarsest archive of `gaussians` Gaussians, if it has no more than `most` bytes.
+/// Returns the coarsest archive of `gaussians` Gaussians if it has at most `most` bytes, otherwise an error.
 fn coarsest(encoded: Encoded, most: u64, gaussians: usize) -> Result<Encoded> {
     let least = encoded.bytes.len();
     if least as u64 > most {
@@ -228,14 +232,14 @@ fn coarsest(encoded: Encoded, most: u64, gaussians: usize) -> Result<Encoded> {
     Ok(encoded)
 }
 
-/// The grids of all groups of a content.
+/// Quantization steps of all groups of a content.
 struct Grids {
     groups: Vec<ValueGroup>,
-    /// Standard deviation of each group's values.
+    /// Standard deviation of the values of each group.
     deviations: Vec<f64>,
-    /// Log2 of each group's step.
+    /// Log2 of the step of each group.
     octaves: Vec<f64>,
-    /// What is added to steps within each tensor, by name.
+    /// Offsets of the steps within each tensor, by name of the tensor.
     offsets: BTreeMap<String, Vec<i8>>,
 }
 
@@ -250,7 +254,7 @@ impl Grids {
         Grids { groups, deviations, octaves, offsets }
     }
 
-    /// The steps, all so many octaves coarser.
+    /// Returns the steps, all coarser by `added` octaves.
     fn steps(&self, added: f64) -> Steps {
         let mut steps = Steps::default();
         for (group, octave) in self.groups.iter().zip(&self.octaves) {
@@ -266,8 +270,9 @@ impl Grids {
         TensorSteps { step: eighths(octave), channels: self.offsets.get(name).cloned().unwrap_or_default() }
     }
 
-    /// Measures every group's squared error and bits, and has the errors go by what an octave saves, `error` all together.
-    /// Gives what was measured: name, log2 of the step, error, bits.
+    /// Measures the squared error and the bits of every group. Sets the steps so that the error of each group is
+    /// proportional to the bits that one octave saves, with a total error of `error`. Returns the measurements: name,
+    /// log2 of the step, error, bits.
     fn balance(
         &mut self,
         scene: &Scene,
@@ -279,7 +284,7 @@ impl Grids {
         let fine = archive::encode(content, &self.steps(0.0))?.bits;
         let coarse = archive::encode(content, &self.steps(0.5))?.bits;
         let bits = |of: &BTreeMap<String, f64>, group: &ValueGroup| of.get(group.name()).copied().unwrap_or(0.0);
-        // Never nothing: a group that has no bits left could become coarser without end.
+        // At least 1: a group without bits left could become coarser without end.
         let saved = |group: &ValueGroup| {
             (2.0 * (bits(&fine, group) - bits(&coarse, group))).max(1.0 + 0.05 * bits(&fine, group))
         };
@@ -295,7 +300,7 @@ impl Grids {
         Ok(measured)
     }
 
-    /// Squared errors of pictures where one group lies on its grid and all others do not. `content` is as it was after.
+    /// Returns the squared errors of renders with one group quantized and all others exact. Leaves `content` unchanged.
     fn errors(&self, scene: &Scene, looks: &ReferenceViews<'_>, content: &mut Content) -> Result<Vec<f64>> {
         let space = archive::space(content);
         let one = |(group, &octave): (&ValueGroup, &f64)| -> Result<f64> {
@@ -333,7 +338,7 @@ fn groups(content: &Content) -> Vec<ValueGroup> {
         .collect()
 }
 
-/// Standard deviation of a group's values.
+/// Returns the standard deviation of the values of a group, at least 1e-9.
 fn deviation(content: &Content, group: &ValueGroup) -> f64 {
     let of = |values: &mut dyn Iterator<Item = f32>| {
         let (mut count, mut sum, mut squares) = (0.0, 0.0, 0.0);
@@ -352,7 +357,7 @@ fn deviation(content: &Content, group: &ValueGroup) -> f64 {
     found.max(1e-9)
 }
 
-/// The grid whose step is nearest.
+/// Returns the nearest step on the grid of eighths of octaves.
 fn eighths(octave: f64) -> i32 {
     ((8.0 * octave).round() as i32).clamp(*STEPS.start(), *STEPS.end())
 }

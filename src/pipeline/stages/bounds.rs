@@ -1,10 +1,10 @@
-//! Within which bounds the values of an archive of frames lie, which is a container (`format/SPEC.md`).
+//! Error bounds of the values in an archive of frames. Such an archive is a container (`format/SPEC.md`).
 //!
-//! A column that is off by at most its bound adds a squared error to the pictures that goes with the square of the bound, and
-//! an octave of it saves a bit of every value that says anything new. As with the grids of a model's archive bits are fewest
-//! for an error where every column's goes by how many bits an octave saves: both are measured, errors on pictures of values
-//! rounded to twice their bound, bits on some blocks as they are encoded. Then all bounds together are as wide as pictures
-//! allow.
+//! An attribute with an error bound adds a squared error to renders proportional to the square of the bound; one octave
+//! of the bound saves one bit of every value that carries information. As for the steps of a model's archive, the bits
+//! are fewest for a given total error if the error of each attribute is proportional to the bits that one octave saves.
+//! Both are measured: errors on renders of values rounded to multiples of twice the bound, bits by encoding some
+//! blocks. Then all bounds together are made as wide as renders allow.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -23,23 +23,25 @@ use crate::pipeline::summary::ArchiveSummary;
 use crate::scene::{Scene, first_box};
 use crate::source::{BlockReader, FrameSource, Ids, ReadPlan, Reads};
 
-/// zstd's level.
+/// Compression level of zstd.
 const LEVEL: i32 = 15;
-/// Bounds that measuring begins with, finer than most end, in the columns' units, of positions in extents of the scene.
+/// Initial bounds, finer than most final ones, in the units of the attributes; for positions, fractions of the scene
+/// extent.
 const FIRST: [f64; 5] = [1e-4, 2e-3, 5e-3, 1e-2, 5e-3];
-/// Bounds are at most so many of these: of a wider one nothing is left that moves or shines.
+/// Maximum factor on the initial bounds; with wider bounds no motion and no color would remain.
 const WIDEST: f64 = 64.0;
-/// Blocks of Gaussians whose bits are counted.
+/// Number of blocks of Gaussians whose bits are counted.
 const BLOCKS: usize = 4;
-/// How much wider bounds that no picture was looked at for are taken to be in the end, octaves.
+/// Octaves added to the initial bounds to estimate the size of an archive without rendering.
 const GUESSED: f64 = 2.0;
 
-/// How a container within `bounds` is stored.
+/// Returns the storage options of a container within `bounds`.
 pub(crate) fn packing(bounds: Bounds) -> Packing {
     Packing::within(bounds, LEVEL)
 }
 
-/// What it takes to store frames of such an input within bounds; nothing of a model or a cloud, whose archive is another.
+/// Returns the memory for storing the frames of an input within bounds. Empty for models and point clouds, which have
+/// another kind of archive.
 pub(crate) fn storing(work: &Workload) -> Vec<MemoryPart> {
     if work.input.reduced > 0 || work.frames == 1 {
         return Vec::new();
@@ -47,10 +49,10 @@ pub(crate) fn storing(work: &Workload) -> Vec<MemoryPart> {
     [work.writing_together(BOUNDED_FRAME_BLOCK), vec![work.compressing(LEVEL, BOUNDED_FRAME_BLOCK)]].concat()
 }
 
-/// The bounds within which `source`, a result of `scene`, is what it is `asked` for, or `psnr` close.
+/// Finds error bounds with which `source`, a result of `scene`, meets `asked`, or has the PSNR `psnr` against itself.
 ///
 /// # Errors
-/// Frames that cannot be read; pictures that are not finite; too few bytes.
+/// Fails if frames cannot be read, if renders are not finite, or if the byte limit is too low.
 pub(crate) fn find(
     scene: &Scene,
     source: &dyn FrameSource,
@@ -84,7 +86,7 @@ pub(crate) fn find(
     };
     let (widths, [psnr, loss]) = match aim {
         QualityTarget::Bytes(most) => {
-            // The finest that fits.
+            // Take the finest bounds that fit.
             let size = |widths| stored(scene, source, widths);
             let fits = |finer: f64| {
                 let found = wider(&widths, -finer);
@@ -121,15 +123,15 @@ pub(crate) fn find(
     Ok((Bounds::new(widths), summary))
 }
 
-/// Bytes of an archive of `source`, about: within bounds as they are before any picture is looked at.
+/// Returns the estimated bytes of an archive of `source`, with bounds that do not depend on renders.
 ///
 /// # Errors
-/// Frames that cannot be read; a failed write.
+/// Fails if frames cannot be read or a write fails.
 pub(crate) fn bytes(scene: &Scene, source: &dyn FrameSource) -> Result<u64> {
     stored(scene, source, wider(&first(source)?, GUESSED))
 }
 
-/// Writes `source` within such bounds to a scratch file; gives its bytes.
+/// Writes `source` within bounds of the given widths to a scratch file. Returns its bytes.
 fn stored(scene: &Scene, source: &dyn FrameSource, widths: [f64; 5]) -> Result<u64> {
     let folder = ScratchFolder::new(&scene.scratch)?;
     let path = folder.path().join("result");
@@ -137,7 +139,7 @@ fn stored(scene: &Scene, source: &dyn FrameSource, widths: [f64; 5]) -> Result<u
     Ok(fs::metadata(&path).map_err(Error::io("read", &path))?.len())
 }
 
-/// [`FIRST`] of a scene.
+/// Returns the initial bounds [`FIRST`] in the units of a scene.
 fn first(source: &dyn FrameSource) -> Result<[f64; 5]> {
     let extent = first_box(source)?.map_or(1.0, |found| found.extent());
     let [position, others @ ..] = FIRST;
@@ -150,13 +152,13 @@ fn wider(widths: &[f64; 5], octaves: f64) -> [f64; 5] {
     widths.map(|width| width * octaves.exp2())
 }
 
-/// Squared errors of pictures where one column is off and all others are not.
+/// Returns the squared errors of renders with one attribute rounded and all others exact.
 fn errors(looks: &ReferenceViews<'_>, source: &dyn FrameSource, widths: &[f64; 5]) -> Result<Vec<f64>> {
     let alone = |k: usize| std::array::from_fn(|other| if other == k { widths[k] } else { 0.0 });
     (0..5).map(|k| looks.error(&Rounded { source, bounds: Bounds::new(alone(k)) })).collect()
 }
 
-/// Bits of every column in some blocks of Gaussians, over the frames in the middle.
+/// Returns the bits of every attribute in some blocks of Gaussians, over one block of frames in the middle.
 fn bits(source: &dyn FrameSource, widths: [f64; 5]) -> Result<Vec<f64>> {
     let (info, packing) = (source.info(), packing(Bounds::new(widths)));
     let blocks = info.count.div_ceil(GAUSSIAN_BLOCK);
@@ -168,7 +170,7 @@ fn bits(source: &dyn FrameSource, widths: [f64; 5]) -> Result<Vec<f64>> {
     Ok(bytes.into_iter().map(|bytes| 8.0 * bytes as f64).collect())
 }
 
-/// A source whose values are rounded to multiples of twice their bounds.
+/// Frame source whose values are rounded to multiples of twice their bounds.
 struct Rounded<'a> {
     source: &'a dyn FrameSource,
     bounds: Bounds,

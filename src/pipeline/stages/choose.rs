@@ -1,7 +1,7 @@
-//! Stage `choose`: letting pictures choose whether to merge or to prune to one count, rendered beside the original.
+//! Stage `choose`: compares merging with pruning to the same count by renders, and keeps the better result.
 //!
-//! Merging pays on some scenes only (method.md, section 6.1).
-//! Memory: two states of one frame, the original's and an alternative's, and [`AT_ONCE`] pictures.
+//! Merging improves quality on some scenes only (method.md, section 6.1). Memory: two states of one frame, of the
+//! original and of an alternative, and [`AT_ONCE`] rendered views.
 
 use super::merge::Outcome;
 use crate::compressed_model::CompressedModel;
@@ -20,23 +20,23 @@ use crate::pruning::score::{Scored, scored_memory};
 use crate::render::{self, Image};
 use crate::scene::Scene;
 
-/// What the stage is called.
+/// Name of the stage.
 const NAME: &str = "choose";
 
-/// Scoring pictures that are compared: their mean PSNR differs from that of all by less than the
-/// alternatives usually do from one another.
+/// Number of scored views that are compared. The mean PSNR over them differs from that over all views by less than the
+/// alternatives usually differ from one another.
 const PICTURES: usize = 24;
 
-/// Pictures of a frame that are compared at a time.
+/// Number of views of a frame that are rendered at a time.
 const AT_ONCE: usize = 4;
 
-/// Per Gaussian what is known of clusters, twice while alternatives are compared, and what reading members takes.
+/// Bytes per Gaussian for clusters, twice while alternatives are compared, and for reading members.
 pub(crate) const CLUSTERED: u64 = 125;
 
-/// The choice of a run.
+/// Stage that chooses between merging and pruning.
 #[derive(Debug, Clone)]
 pub(crate) struct Choose {
-    /// Whether the size of the output is asked for.
+    /// Whether the number of Gaussians in the output was requested.
     pub has_target: bool,
 }
 
@@ -63,10 +63,11 @@ impl Stage for Choose {
 }
 
 impl Choose {
-    /// Both alternatives, two states of a frame, and pictures. A part `left` of the Gaussians stays.
+    /// Returns the estimate: both alternatives, two states of a frame, and rendered views. The fraction `left` of the
+    /// Gaussians stays.
     pub(crate) fn need(&self, work: &Workload, limits: &Limits, left: f64) -> ResourceEstimate {
         let whole = work.state(Columns::all());
-        // Merged trajectories are read of all that merge.
+        // The trajectories of proxies are computed from all members.
         let merging = if work.input.reduced > 0 { left } else { 1.0 };
         let (reader, held) = (work.input.reader, work.held(limits, Columns::all()));
         let per_gaussian = vec![
@@ -81,7 +82,7 @@ impl Choose {
         let together = AT_ONCE.min(limits.pictures_together) as u64;
         let pictures = render::STRIP_BYTES as u64 + 12 * work.pixels * (1 + together);
         let frames = (PICTURES as u64).min(work.pictures);
-        // The original, and two of about half as many Gaussians.
+        // The original, and two alternatives of about half as many Gaussians.
         let made = work.picturing(frames as f64, 2.0 * work.count(), RENDER)
             + work.picturing(2.0 * frames as f64, 0.0, RENDER);
         ResourceEstimate {
@@ -93,12 +94,12 @@ impl Choose {
         }
     }
 
-    /// Compares `merged` with the first Gaussians of the ranking, as many as it has, by mean PSNR against the original on
-    /// scoring pictures; keeps the better, of equals the one without merging. Where merging loses and no target asks for
-    /// that count, the run's own number of survivors stays.
+    /// Compares `merged` with the same number of Gaussians from the top of the ranking, by mean PSNR against the
+    /// original on scored views. Returns the better result; in a tie the one without merging. If merging loses and no
+    /// target requires this count, the result has as many survivors as selection kept.
     ///
     /// # Errors
-    /// Frames that cannot be read.
+    /// Fails if frames cannot be read.
     pub(crate) fn choose(
         &self,
         scene: &Scene,
@@ -131,7 +132,7 @@ impl Choose {
     }
 }
 
-/// Mean PSNR of the Gaussians `pruned` and of `merged` against the original over `pictures`, dB.
+/// Returns the mean PSNR over `pictures` of the Gaussians `pruned` and of `merged`, each against the original, dB.
 fn mean_psnr(scene: &Scene, pruned: &[u32], merged: &CompressedModel, pictures: &[Picture]) -> Result<[f64; 2]> {
     let result = scene.input.reduced(merged)?;
     let progress = scene.events.task(NAME, "pictures", pictures.len() as u64);
@@ -142,7 +143,7 @@ fn mean_psnr(scene: &Scene, pruned: &[u32], merged: &CompressedModel, pictures: 
     show(subjects, &scene.schedule.cameras, pictures, batch, |views| {
         let picture = |subject: usize, view: &ViewStates<'_, 2>| view.render(subject, scene.background);
         let expected: Vec<Image> = views.iter().map(|view| picture(0, view)).collect();
-        // All of one frame.
+        // All views of a batch show one frame.
         let state = views[0].states[0].pick(pruned);
         let features = views[0].features(0).map(|features| features.pick(pruned));
         for (view, expected) in views.iter().zip(&expected) {
@@ -163,12 +164,12 @@ mod tests {
     use crate::pruning::score::UserOverrides;
     use crate::recipe::Recipe;
 
-    /// Mean PSNR over the pictures that decide.
+    /// Returns the mean PSNR over the views by which the stage chooses.
     fn quality(scene: &Scene, reduction: &CompressedModel) -> f64 {
         mean_psnr(scene, &[], reduction, &spread(&scene.schedule, PICTURES, VIEWS_AT_ONCE)).unwrap()[1]
     }
 
-    /// What merging leaves of a scene, and what is chosen then.
+    /// Returns the merged model of a scene, the result of the choice, and the journal.
     fn chosen(
         scene: &Scene,
         scored: &Scored,
@@ -186,7 +187,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_chosen_has_the_same_count_and_is_never_worse_than_any_alternative() {
+    fn choice_has_same_count_and_best_quality() {
         let folder = tempfile::tempdir().unwrap();
         let scene = scene(folder.path());
         let recipe = Recipe::preset("default").unwrap();
@@ -206,10 +207,10 @@ mod tests {
     }
 
     #[test]
-    fn without_a_target_merging_that_does_not_pay_leaves_every_survivor_of_pruning() {
+    fn losing_merge_without_target_keeps_all_survivors() {
         let folder = tempfile::tempdir().unwrap();
         let scene = scene(folder.path());
-        // Nothing is pruned, so that what is never seen is there to be dropped instead of merging the rest.
+        // Nothing is pruned, so that dropping invisible Gaussians competes with merging.
         let mut recipe = Recipe::preset("default").unwrap();
         recipe.select.tau_static = 0.0;
         recipe.merge.max_color_difference = f64::INFINITY;

@@ -1,10 +1,9 @@
-//! Stage `rounds`: ranking by what the pictures would lose, scored anew as the model shrinks.
+//! Stage `rounds`: ranks by removal error in pruning rounds, measured anew as the model shrinks.
 //!
-//! One look at the whole model cannot rank for strong reductions: when a Gaussian goes, those behind it show
-//! and those that it made superfluous are needed. So each round looks at what is left, ranks it by
-//! [`RemovalError`](crate::render::RemovalError) and lets the worst go. Which Gaussians the next round sees
-//! does not depend on how many are wanted in the end: a smaller target keeps a subset of a larger one.
-//! Memory: see [`removal_error`].
+//! One measurement on the full model cannot rank for strong reductions: when a Gaussian is removed, the ones behind it
+//! become visible, and others that it made redundant are needed. So each round measures the survivors, ranks them by
+//! [`RemovalError`](crate::render::RemovalError) and removes the lowest. The survivors of a round do not depend on the
+//! final count, so a smaller target keeps a subset of a larger one. Memory: see [`removal_error`].
 
 use std::ops::Range;
 use std::sync::Arc;
@@ -27,29 +26,30 @@ use crate::pruning::score::{Scored, scored_memory};
 use crate::recipe;
 use crate::scene::Scene;
 
-/// What the stage is called.
+/// Name of the stage.
 const NAME: &str = "rounds";
 
-/// The rounds of a run.
+/// Stage that ranks in pruning rounds.
 #[derive(Debug, Clone)]
 pub(crate) struct Rounds {
-    /// Part of the Gaussians that a round leaves.
+    /// Fraction of the Gaussians that survives a round.
     pub fraction: f64,
-    /// Pictures that a round looks at, the same for a longer sequence.
+    /// Number of views by which Gaussians are ranked; does not grow with the number of frames.
     pub pictures: usize,
-    /// Turns that they take: a round looks at one part of so many, and goes by what the others showed in theirs.
+    /// Number of groups (turns) into which the views are divided. A round renders one group; for the others it uses the
+    /// errors that were measured in earlier rounds.
     pub turns: usize,
-    /// Contrast that every Gaussian is taken to have at least with what it hides.
+    /// Minimum contrast assumed between a Gaussian and the content behind it.
     pub contrast_floor: f64,
-    /// Part of the Gaussians that the last round is taken to leave at least, to say how many rounds there are at most.
+    /// Assumed smallest fraction of the Gaussians after the last round, which bounds the number of rounds in estimates.
     pub fewest: f64,
-    /// Part of them that it usually leaves, to say about how long rounds take.
+    /// Usual fraction of the Gaussians after the last round, for time estimates.
     pub usual: f64,
 }
 
-/// Where no size is asked for, rounds are taken to leave this part of the Gaussians at least.
+/// Value of [`Rounds::fewest`] if no size is requested.
 const FEWEST: f64 = 0.05;
-/// And usually this one.
+/// Value of [`Rounds::usual`] if no size is requested.
 const USUAL: f64 = 0.5;
 
 /// Adds the stage if Gaussians are ranked by views.
@@ -88,8 +88,8 @@ impl Stage for Rounds {
 }
 
 impl Rounds {
-    /// The stage, unless `recipe` ranks once; `target`: the part of the Gaussians that is asked for. Takes visible
-    /// contributions.
+    /// Returns the stage, or `None` if `recipe` ranks only once. `target` is the requested fraction of the Gaussians.
+    /// The stage needs visible contributions.
     pub(crate) fn from_recipe(recipe: &recipe::Select, target: Option<f64>) -> Option<Rounds> {
         let recipe::Select {
             round_fraction: fraction,
@@ -102,7 +102,7 @@ impl Rounds {
         (fraction < 1.0).then_some(Rounds { fraction, pictures, turns, contrast_floor, fewest, usual })
     }
 
-    /// The ranking, and pictures of all that is left.
+    /// Returns the estimate: the ranking, and renders of all survivors.
     pub(crate) fn need(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
         let (looking, fixed) = work.looking(limits, Columns::all(), 8);
         let all = (self.pictures as u64).min(work.pictures);
@@ -115,28 +115,29 @@ impl Rounds {
             let pictures = all as f64 / if round == 0 { 1.0 } else { turns as f64 };
             work.reading(left, pictures.min(work.frames as f64)) + work.picturing(pictures, left, REMOVE)
         });
-        // The first round takes all turns, each of its own frames.
+        // The first round renders all groups, each with its own frames.
         let frames = all.min(work.frames).div_ceil(turns);
         let later = f64::from(self.rounds(self.fewest).saturating_sub(1));
         let reads = work.scattered_reads(frames * turns, limits) + later * work.scattered_reads(frames, limits);
         ResourceEstimate { stage: NAME, reads, seconds: seconds.sum(), per_gaussian, fixed }
     }
 
-    /// Returns the number of rounds after which at most a part `fewest` is left. At most 2207, for a recipe's fraction is
-    /// at most [`MOST_LEFT_BY_ROUND`](recipe::MOST_LEFT_BY_ROUND) and there are at most `u32::MAX` Gaussians.
+    /// Returns the number of rounds until at most the fraction `fewest` is left. It is at most 2207, because the
+    /// fraction of a recipe is at most [`MOST_LEFT_BY_ROUND`](recipe::MOST_LEFT_BY_ROUND) and there are at most
+    /// `u32::MAX` Gaussians.
     fn rounds(&self, fewest: f64) -> u32 {
         let fewest = fewest.max(1.0 / f64::from(u32::MAX));
         (fewest.ln() / self.fraction.ln()).ceil().max(0.0) as u32
     }
 
-    /// The rounds that leave `fewest` of `count` Gaussians, for people.
+    /// Returns the rounds that leave `fewest` of `count` Gaussians, one line each for display.
     pub(crate) fn divided(&self, count: usize, fewest: usize) -> Vec<String> {
         let of = |round: usize| self.pictures.div_ceil(if round == 0 { 1 } else { self.turns.max(1) });
         let rounds = 0..self.sizes(count, 0, fewest).len();
         rounds.map(|round| format!("{}: {} pictures at most", name(round), of(round))).collect()
     }
 
-    /// The pictures in as many parts as there are turns, each of frames of its own where there are as many.
+    /// Divides the views into groups (turns), by frames if there are enough frames, otherwise one by one.
     fn turns(&self, scene: &Scene, scored: &Scored) -> Vec<Vec<Picture>> {
         let pictures = spread_over(&scene.schedule, self.pictures, scored.frames_to_see);
         let by_frame: Vec<&[Picture]> = pictures.chunk_by(|a, b| a.frame == b.frame).collect();
@@ -147,12 +148,12 @@ impl Rounds {
         turns
     }
 
-    /// Ranks all but the dropped Gaussians in rounds, until a round leaves at most `fewest`; those that go in one
-    /// round, and those that stay after the last, by error, ties by the order there was. Protected Gaussians come
-    /// first.
+    /// Ranks all Gaussians that are not dropped in rounds, until a round leaves at most `fewest`. Gaussians removed in
+    /// one round, and the survivors of the last, are ordered by error; ties keep the order of `before`. Protected
+    /// Gaussians come first.
     ///
     /// # Errors
-    /// Frames that cannot be read.
+    /// Fails if frames cannot be read.
     pub(crate) fn rank(
         &self,
         scene: &Scene,
@@ -175,7 +176,7 @@ impl Rounds {
         }
         let turns = self.turns(scene, scored);
         state.errors = vec![vec![0; scored.count()]; turns.len()];
-        // What a round leaves does not depend on how many are wanted in the end.
+        // The key does not contain `fewest`: the survivors of a round do not depend on it.
         let key = scene.work.key(&(self.fraction, self.contrast_floor, &turns, &before, protected));
         let mut done = 0;
         for round in (0..sizes.len()).rev().filter(|_| scene.work.keeps()) {
@@ -197,8 +198,8 @@ impl Rounds {
         Ok(Ranking::new(protected.iter().copied().chain(free).chain(gone).collect()))
     }
 
-    /// Returns how many of so many free Gaussians each round leaves, until a round leaves at most `fewest` with those
-    /// protected. Every round removes at least one.
+    /// Returns how many of `free` Gaussians each round leaves, until at most `fewest` are left including the
+    /// `protected` ones. Every round removes at least one.
     fn sizes(&self, mut free: usize, protected: usize, fewest: usize) -> Vec<usize> {
         let mut sizes = Vec::new();
         while free > 0 && free + protected > fewest {
@@ -209,7 +210,7 @@ impl Rounds {
         sizes
     }
 
-    /// One round, which leaves `left` free Gaussians. It can be divided by pictures.
+    /// Runs one round, which leaves `left` free Gaussians. The views can be divided among shards.
     fn round(
         &self,
         scene: &Scene,
@@ -224,7 +225,8 @@ impl Rounds {
         let looking: Vec<usize> = looking(turns, round).collect();
         let (background, floor) = (scene.background, self.contrast_floor as f32);
         let units = looking.iter().map(|&turn| turns[turn].len()).sum();
-        // Of every turn that looks, what those of its pictures show that are among `some`; nothing, if none is.
+        // Removal errors of each active group, summed over the views of that group that are in `some`; empty if there
+        // are none.
         let compute = |some: Range<usize>| -> Result<Vec<Vec<u64>>> {
             let mut start = 0;
             let of_turn = |&turn: &usize| {
@@ -254,7 +256,7 @@ impl Rounds {
                 }
             }
             let error = |id: &u32| state.errors.iter().fold(0u64, |sum, of| sum.saturating_add(of[*id as usize]));
-            // Stable: ties keep the order there was.
+            // The sort is stable: ties keep the earlier order.
             state.free.sort_by_cached_key(|id| std::cmp::Reverse(error(id)));
             let mut worst = state.free.split_off(left);
             worst.append(&mut state.gone);
@@ -264,23 +266,23 @@ impl Rounds {
     }
 }
 
-/// What a round leaves.
+/// State after a round.
 #[derive(Serialize, Deserialize)]
 struct RoundState {
-    /// Neither protected nor gone, best first.
+    /// Survivors that are not protected, best first.
     free: Vec<u32>,
-    /// Worst last.
+    /// Removed Gaussians, worst last.
     gone: Vec<u32>,
-    /// By turn, what its pictures showed of every Gaussian when it last looked.
+    /// Removal error of every Gaussian by group of views, when the group was last rendered.
     errors: Vec<Vec<u64>>,
 }
 
-/// What a round is called in a work folder.
+/// Returns the name of a round in the cache.
 fn name(round: usize) -> String {
     format!("{NAME}-{:02}", round + 1)
 }
 
-/// Which turns look in a round: first all, then one after the other.
+/// Returns the groups of views that a round renders: all in the first round, then one after the other.
 fn looking(turns: &[Vec<Picture>], round: usize) -> impl Iterator<Item = usize> {
     let count = turns.len().max(1);
     let looking = if round == 0 { turns.len() } else { 1.min(turns.len()) };
@@ -297,7 +299,7 @@ mod tests {
     use crate::recipe::Recipe;
     use crate::render::render;
 
-    /// The order of scoring, and that of the rounds.
+    /// Returns the ranking by score and the ranking of the rounds.
     fn ranked(scene: &Scene, user: &UserOverrides, fewest: usize) -> (Ranking, Ranking) {
         let recipe = Recipe::preset("default").unwrap();
         let scored = score_scene(scene, &recipe, user);
@@ -319,7 +321,7 @@ mod tests {
     }
 
     #[test]
-    fn rounds_keep_more_of_the_pictures_than_one_ranking_by_coverage() {
+    fn rounds_keep_more_quality_than_ranking_once() {
         let folder = tempfile::tempdir().unwrap();
         let scene = scene(folder.path());
         let (once, rounds) = ranked(&scene, &UserOverrides::default(), 150);
@@ -340,7 +342,7 @@ mod tests {
     }
 
     #[test]
-    fn what_the_user_keeps_comes_first_and_what_he_drops_does_not_come() {
+    fn kept_ids_rank_first_and_dropped_ids_do_not_rank() {
         let folder = tempfile::tempdir().unwrap();
         let scene = scene(folder.path());
         let worst = ranked(&scene, &UserOverrides::default(), 100).1.order()[1490..].to_vec();
@@ -354,7 +356,7 @@ mod tests {
     }
 
     #[test]
-    fn turns_part_the_pictures_by_frames_or_one_by_one_where_frames_are_few() {
+    fn views_are_grouped_by_frame_or_singly_if_frames_are_few() {
         let folder = tempfile::tempdir().unwrap();
         let scene = scene(folder.path());
         let recipe = Recipe::preset("default").unwrap();
@@ -393,7 +395,7 @@ mod tests {
     }
 
     #[test]
-    fn the_number_of_rounds_is_bounded_for_no_gaussians_at_all() {
+    fn number_of_rounds_is_bounded_even_for_a_zero_target() {
         let recipe = Recipe::preset("default").unwrap();
         let rounds =
             Rounds { fraction: recipe::MOST_LEFT_BY_ROUND, ..Rounds::from_recipe(&recipe.select, Some(0.0)).unwrap() };
@@ -401,7 +403,7 @@ mod tests {
     }
 
     #[test]
-    fn a_model_that_is_small_enough_keeps_its_order() {
+    fn small_enough_model_keeps_its_order() {
         let folder = tempfile::tempdir().unwrap();
         let scene = scene(folder.path());
         let (once, rounds) = ranked(&scene, &UserOverrides::default(), 1500);

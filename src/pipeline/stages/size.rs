@@ -1,5 +1,5 @@
-//! Stages of a run that is asked for a size on disk: `size` finds how many Gaussians fit before anything is ranked, and
-//! shrinks the result at the end where its values take more bytes than those that the count was found by.
+//! Stages `size` of a run with a byte limit. The first finds how many Gaussians fit before anything is ranked. The
+//! second shrinks the result at the end if its values take more bytes than those by which the count was found.
 
 use crate::cache::CacheKey;
 use crate::compressed_model::CompressedModel;
@@ -19,13 +19,13 @@ use crate::pruning::score::Scored;
 use crate::recipe::Precision;
 use crate::scene::Scene;
 
-/// What the stage is called.
+/// Name of the stages.
 const NAME: &str = "size";
-/// Part of the bytes that may stay free.
+/// Fraction of the byte limit that may remain unused.
 const FREE: f64 = 0.01;
-/// Sizes that are written at most, to see their bytes.
+/// Maximum number of sizes that are written to measure their bytes.
 const MOST_TRIED: usize = 8;
-/// Pictures that say who goes, where the values of the best turn out larger than those of any.
+/// Number of views used to rank removals if the result exceeds the byte limit.
 const PICTURES: usize = 48;
 
 /// Adds the stage that finds how many Gaussians fit.
@@ -35,14 +35,15 @@ pub(super) fn plan_count(planning: &Planning<'_>, stages: &mut StageList) {
     }
 }
 
-/// Adds the stage that shrinks what does not fit. An archive of any number fits on some grids.
+/// Adds the stage that shrinks a result that does not fit. An archive needs no such stage: its quantization steps
+/// adapt.
 pub(super) fn plan_shrink(planning: &Planning<'_>, stages: &mut StageList) {
     if let Some(limit) = ByteLimit::from_planning(planning).filter(|_| planning.output != OutputKind::Archive) {
         stages.add(Phase::Reduce, ShrinkToBytes { limit });
     }
 }
 
-/// The stage that finds how many Gaussians fit.
+/// Stage that finds how many Gaussians fit.
 #[derive(Debug)]
 struct CountByBytes {
     limit: ByteLimit,
@@ -64,7 +65,7 @@ impl Stage for CountByBytes {
     }
 }
 
-/// The stage that shrinks what does not fit.
+/// Stage that shrinks a result that does not fit.
 #[derive(Debug)]
 struct ShrinkToBytes {
     limit: ByteLimit,
@@ -82,14 +83,14 @@ impl Stage for ShrinkToBytes {
     }
 }
 
-/// So many bytes for everything that is written.
+/// Byte limit of all files that are written.
 #[derive(Debug, Clone)]
 struct ByteLimit {
-    /// What writes.
+    /// Stage that writes the files.
     emit: Emit,
-    /// Bytes at most.
+    /// Maximum number of bytes.
     most: u64,
-    /// Precision of the field that takes its room: one that may be rounded is taken in half precision.
+    /// Assumed precision of the field: half precision if the field may be rounded.
     field: Precision,
 }
 
@@ -101,10 +102,11 @@ impl ByteLimit {
         Some(ByteLimit { emit: Emit::from_planning(planning), most, field })
     }
 
-    /// [`ByteLimit::count`] of the Gaussians `ids` for the SH degree of `like` and, where bands may go, every lower one, until everything fits.
+    /// Returns the numbers of Gaussians `ids` that fit for the SH degree of `like` and, if degrees may be dropped, for
+    /// every lower one, until all Gaussians fit. See [`ByteLimit::count`].
     ///
     /// # Errors
-    /// Those of [`ByteLimit::count`].
+    /// Fails where [`ByteLimit::count`] fails.
     fn fits(
         &self,
         scene: &Scene,
@@ -127,15 +129,16 @@ impl ByteLimit {
         Ok(fits)
     }
 
-    /// What bytes follow from, with a recipe of so many bytes beside the result.
+    /// Returns the cache key of everything that the bytes depend on, with a recipe of `recipe` bytes beside the result.
     fn key(&self, scene: &Scene, recipe: u64, reduction: &CompressedModel) -> CacheKey {
         scene.work.key(&(self.emit.kind, self.emit.merges, self.most, recipe, reduction))
     }
 
-    /// As many of the Gaussians `ids` as fit, of any of them, with the rule and the field of `like`.
+    /// Returns how many of the Gaussians `ids`, evenly sampled, fit the limit, with the merge parameters and the field
+    /// of `like`.
     ///
     /// # Errors
-    /// Not even one fits; frames that cannot be read, a failed write.
+    /// Fails if not even one fits, if frames cannot be read, or if a write fails.
     fn count(
         &self,
         scene: &Scene,
@@ -149,7 +152,7 @@ impl ByteLimit {
                 let kept = (0..count).map(|k| ids[k * all / count]).collect();
                 let some = like.with(kept);
                 match self.emit.kind {
-                    // What lies beside it is neither stored nor sent.
+                    // The files beside an archive are neither stored nor sent with it, so they do not count.
                     OutputKind::Archive => archive::bytes(scene, &some),
                     _ => self.emit.bytes(scene, &some, recipe),
                 }
@@ -162,7 +165,8 @@ impl ByteLimit {
                      expected at least that, found {most}"
                 )));
             }
-            // Sizes and their bytes: the largest that fits, and the smallest that does not.
+            // Numbers of Gaussians with their bytes: `fits` is the largest that fits, `over` the smallest that does
+            // not.
             let (mut fits, mut over) = ((one, least), None);
             let (mut next, mut overs) = (all, 0);
             for _ in 0..MOST_TRIED {
@@ -177,7 +181,8 @@ impl ByteLimit {
                     break;
                 }
                 let part = (most - fits.1) as f64 / (over.1 - fits.1).max(1) as f64;
-                // A line between both leads no further where the first few take most bytes, as those of an archive do.
+                // Linear interpolation makes slow progress if the first few Gaussians take most bytes, as in an
+                // archive.
                 let part = if overs > 1 { part.min(0.5) } else { part };
                 next = fits.0 + ((0.998 * part * (over.0 - fits.0) as f64) as usize).clamp(1, over.0 - fits.0 - 1);
             }
@@ -185,11 +190,12 @@ impl ByteLimit {
         })
     }
 
-    /// `reduction`, less those that pictures lose least with as long as it does not fit: refined values may pack worse
-    /// than those that the count was found by. Protected Gaussians stay.
+    /// Removes the Gaussians of `reduction` with the lowest removal error until the result fits. This is needed because
+    /// refined values may compress worse than those by which the count was found. Protected Gaussians stay.
     ///
     /// # Errors
-    /// What is protected does not fit; frames that cannot be read, a failed write.
+    /// Fails if the protected Gaussians alone do not fit, if frames cannot be read, or if a write fails. What is
+    /// protected does not fit; frames that cannot be read, a failed write.
     fn shrink(
         &self,
         scene: &Scene,
@@ -226,7 +232,7 @@ impl ByteLimit {
         })
     }
 
-    /// Places of the `count` that are protected or that pictures would lose most with.
+    /// Returns the indices of the `count` Gaussians that are protected or have the highest removal errors.
     fn best(&self, scene: &Scene, scored: &Scored, reduction: &CompressedModel, count: usize) -> Result<Vec<u32>> {
         let result = scene.input.reduced(reduction)?;
         let places: Vec<u32> = (0..reduction.len() as u32).collect();
@@ -237,9 +243,10 @@ impl ByteLimit {
     }
 }
 
-/// Returns how many of `count` Gaussians to try next where a `part` of their bytes is expected to fit, after so many sizes
-/// were `tried`. `protected` ones stay, fewer than `count`. Always fewer than `count`; after [`MOST_TRIED`] sizes at most
-/// half as many, so that bytes which follow no line end the search after at most 32 more.
+/// Returns how many of `count` Gaussians to try next if the fraction `part` of their bytes is expected to fit, after
+/// `tried` sizes. `protected` Gaussians, fewer than `count`, stay. The result is less than `count`, and after
+/// [`MOST_TRIED`] sizes at most half of it, so that the search ends after at most 32 more sizes even if bytes follow no
+/// line.
 fn next_size(count: usize, protected: usize, part: f64, tried: usize) -> usize {
     let most = if tried < MOST_TRIED { count - 1 } else { count / 2 };
     ((0.998 * part * count as f64) as usize).min(most).max(protected)
@@ -250,7 +257,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn shrinking_to_a_size_ends_whatever_the_bytes_are() {
+    fn shrinking_ends_whatever_the_bytes_are() {
         for (count, part) in
             (1..=50).chain([4_000_000_000]).flat_map(|n| [0.0, 0.5, 1.0, 1e9, f64::NAN].map(|p| (n, p)))
         {
