@@ -1,9 +1,9 @@
-//! Model folders with a `deform` folder in them: a canonical cloud, and a network that deforms it.
+//! Model folders with a subfolder `deform`: canonical Gaussians and a network that deforms them.
 //!
-//! `cfg_args`, `cameras.json`, `point_cloud/iteration_K/point_cloud.ply`, `deform/iteration_K/deform.pth`. A family of
-//! such folders gives the law by which the network's outputs become states ([`Deforming`]); files, proxies and writing are
-//! the same. The result is a folder of the same layout with a smaller cloud: the network stays byte for byte as it was, and
-//! so does the configuration, but for the SH degree where that is lower.
+//! Files: `cfg_args`, `cameras.json`, `point_cloud/iteration_K/point_cloud.ply`, `deform/iteration_K/deform.pth`. A
+//! model format provides the computation of states from the network's outputs ([`Deforming`]); reading files, proxies
+//! and writing are shared. The output is a folder of the same layout with a smaller point cloud file. The network is
+//! copied byte for byte, and so is the configuration, except for the SH degree if that is lowered.
 
 mod arguments;
 mod paths;
@@ -38,41 +38,43 @@ use crate::progress::Events;
 use crate::recipe::MergeParams;
 use crate::source::FrameSource;
 
-/// Smallest scale that has a logarithm here.
+/// Minimum scale, so that its logarithm is finite.
 pub(super) const LEAST_SCALE: f64 = 1e-7;
 
-/// A law by which what a network says becomes states.
+/// Motion model that computes states from the outputs of a network.
 pub(super) trait Deforming: MotionModel {
-    /// What the family is called.
+    /// Name of the model format, shown to users.
     const KIND: &'static str;
-    /// Whether a rotation is made unit before what the network says is added to it.
+    /// Whether a quaternion is normalized before the network's output is added to it.
     const NORMALISES: bool;
 
-    /// Bytes that one Gaussian takes once it is prepared.
+    /// Returns the bytes per Gaussian of the values prepared by [`MotionModel::prepare`].
     fn bytes_per_gaussian(&self) -> usize;
 
-    /// Bytes that it holds however many Gaussians there are, beside the network.
+    /// Returns the bytes that do not depend on the number of Gaussians, in addition to the network.
     fn bytes(&self) -> usize {
         0
     }
 
-    /// Seconds of one processor that a state takes, about.
+    /// Returns the approximate CPU seconds on one core to compute one state.
     fn seconds_per_state(&self) -> f64;
 }
 
-/// What a family is made from.
+/// Parts from which a model format creates its motion model.
 pub(super) struct Parts<'a> {
+    /// Training arguments of `cfg_args`.
     pub(super) arguments: &'a Arguments,
+    /// Tensors of the network.
     pub(super) tensors: &'a Tensors,
-    /// The file that `tensors` are of.
+    /// Path of the file of `tensors`.
     pub(super) file: &'a Path,
-    /// Planes `fea_*` of the cloud.
+    /// Number of properties `fea_*` in the point cloud file.
     pub(super) features: usize,
-    /// The cloud.
+    /// Path of the point cloud file.
     pub(super) cloud: &'a Path,
 }
 
-/// An open model folder.
+/// Open model folder.
 pub(super) struct Folder<L> {
     paths: Paths,
     model: MotionModelFrames<L>,
@@ -83,10 +85,9 @@ pub(super) struct Folder<L> {
 }
 
 impl<L: Deforming + 'static> Folder<L> {
-    /// Opens the model at `root`; `make` gives its law, and what a person should know of it.
+    /// Opens the model at `root`. `make` returns its motion model and notes for the user.
     ///
-    /// # Errors
-    /// Files that are missing; what is wrong with one of them.
+    /// # Errors Fails if files are missing or damaged, or if `make` refuses the model.
     pub(super) fn open(
         root: &Path,
         options: &OpenOptions,
@@ -107,12 +108,12 @@ impl<L: Deforming + 'static> Folder<L> {
         Ok(Box::new(Folder { paths, model, source_path, white_background, tensor_bytes: 4 * values as u64, notes }))
     }
 
-    /// Returns the text of `cfg_args` with the SH degree up to `sh_degree`.
+    /// Returns the text of `cfg_args` with the SH degree limited to `sh_degree`.
     fn cfg_args(&self, sh_degree: usize) -> Result<String> {
         read_for_degree(&self.paths.cfg_args, self.model.info().sh_degree, sh_degree)
     }
 
-    /// Writes what is left as a folder at `path`.
+    /// Writes the compressed model as a folder at `path`.
     fn write_folder(&self, reduction: &CompressedModel, path: &Path) -> Result<()> {
         let to = Paths::new(path, self.paths.iteration);
         for file in [&to.point_cloud, &to.network] {
@@ -129,7 +130,7 @@ impl<L: Deforming + 'static> Folder<L> {
         let proxies = reduction.proxies.raw.as_ref().map_or(&none, |raw| &raw.gaussians);
         let mut rows = out_rows(reduction);
         for cluster in &reduction.clusters {
-            // A proxy has the features of its heaviest member.
+            // A proxy gets the features of its heaviest member.
             rows[cluster.output as usize].source = heaviest(cluster);
         }
         let template = Ply::open(&self.paths.point_cloud)?;
@@ -137,13 +138,14 @@ impl<L: Deforming + 'static> Folder<L> {
     }
 }
 
-/// The member of most weight, the first of several.
+/// Returns the member with the largest weight, the first of several.
 fn heaviest(cluster: &Cluster) -> u32 {
     let first = (cluster.leader, f64::NEG_INFINITY);
     cluster.members.iter().fold(first, |most, &member| if member.1 > most.1 { member } else { most }).0
 }
 
-/// The parameters of a cloud, with its planes `fea_0`, `fea_1`, ….
+/// Reads the parameters of all Gaussians, with the properties `fea_0`, `fea_1`, … as format-specific planes. Fails if
+/// values that the network reads or that are decomposed are not finite.
 fn raw(ply: &Ply) -> Result<Raw> {
     let count = ply.count();
     let gaussians = ply.whole()?;
@@ -157,7 +159,7 @@ fn raw(ply: &Ply) -> Result<Raw> {
             read_plane(ply.row(row), &[0], property, big_endian, std::slice::from_mut(value));
         }
     }
-    // What a network reads, or what is decomposed.
+    // Check the columns that the network reads or that are decomposed.
     let read = [&gaussians.position, &gaussians.rotation, &gaussians.log_scale, &own];
     for (column, name) in read.into_iter().zip(["x y z", "rot", "scale", "fea"]) {
         if let Some(at) = column.planes().iter().position(|value| !value.is_finite()) {
@@ -174,7 +176,7 @@ fn raw(ply: &Ply) -> Result<Raw> {
     Ok(Raw { gaussians, own })
 }
 
-/// Of a model's files that a renderer opens.
+/// Returns the sizes of the files that a renderer opens.
 fn size_of(paths: &Paths) -> Result<Size> {
     let (cloud, field) = (bytes_of([&*paths.point_cloud])?, bytes_of([&*paths.network])?);
     Ok(Size { cloud, field, rest: bytes_of([&*paths.cfg_args])?, ..Size::default() })
@@ -214,14 +216,14 @@ impl<L: Deforming + 'static> InputModel for Folder<L> {
         let whole = state_bytes(self.model.info().sh_degree, Columns::all()) + features;
         MemoryProfile {
             per_gaussian: whole,
-            // Normals and the like stand beside the values.
+            // Normals and other extra properties are stored beside the attributes.
             opening: whole + 24,
-            // A copy of the parameters, what is prepared of them, and what a block adds to them.
+            // A copy of the parameters, values prepared from them, and the deltas of a block.
             reader: 2 * whole + law.bytes_per_gaussian() as u64 + 128,
             reduced: 2 * whole,
             jacobian: Jacobian::BYTES_PER_GAUSSIAN as u64 + 36,
             file: whole + 24,
-            // Tensors as they are read and as they are used.
+            // Tensors as read and as used.
             fixed: 2 * self.tensor_bytes + law.bytes() as u64,
             frame_block: 0,
             gaussian_block: GAUSSIAN_BLOCK as u64,
@@ -235,7 +237,7 @@ impl<L: Deforming + 'static> InputModel for Folder<L> {
         Timing::Continuous
     }
 
-    /// The network was trained with times as cameras give them.
+    /// Uses camera times unchanged, since the network was trained with them.
     fn clock(&self) -> Clock {
         Clock::Given
     }

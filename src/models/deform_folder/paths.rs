@@ -1,4 +1,4 @@
-//! The files of a model folder with a `deform` folder in it.
+//! Files of a model folder with a subfolder `deform`.
 
 use std::path::{Path, PathBuf};
 
@@ -11,11 +11,14 @@ use crate::files::state_dict::{is_pair, names, read_state_dict};
 use crate::limits::ReadLimit;
 use crate::models::iterations::numbers;
 
+/// Name of the folder of point cloud files.
 const CLOUDS: &str = "point_cloud";
+/// Name of the folder of networks.
 const NETWORKS: &str = "deform";
+/// Name of the network file in an iteration folder.
 const NETWORK: &str = "deform.pth";
 
-/// The files.
+/// Paths of the files of a model folder.
 #[derive(Debug, Clone)]
 pub(in crate::models) struct Paths {
     pub(super) root: PathBuf,
@@ -23,22 +26,23 @@ pub(in crate::models) struct Paths {
     pub(super) iteration: u32,
     pub(super) cfg_args: PathBuf,
     pub(super) point_cloud: PathBuf,
-    /// The network's state dict.
+    /// State dict of the network.
     pub(super) network: PathBuf,
 }
 
-/// Whether a folder has a network of this kind.
+/// Returns whether a folder contains a network `deform/iteration_K/deform.pth`.
 pub(in crate::models) fn has_network(root: &Path) -> bool {
     iterations(&root.join(NETWORKS), NETWORK).is_ok_and(|found| !found.is_empty())
 }
 
-/// Names of the tensors of the last network of a folder; none of what cannot be read, which is for its reader to say.
+/// Returns the tensor names of the last network of a folder; empty if the file cannot be read. Opening the model then
+/// reports the error.
 pub(in crate::models) fn names_of_network(root: &Path, memory: ReadLimit) -> Vec<String> {
     let last = iterations(&root.join(NETWORKS), NETWORK).ok().and_then(|found| found.last().copied());
     last.and_then(|k| names(&Paths::new(root, k).network, memory).ok()).unwrap_or_default()
 }
 
-/// K of the folders `iteration_K` in `within` that hold `file`, increasing.
+/// Returns the number K of each folder `iteration_K` in `within` that contains `file`, in increasing order.
 fn iterations(within: &Path, file: &str) -> Result<Vec<u32>> {
     let mut found = numbers(within)?;
     found.retain(|k| within.join(format!("iteration_{k}")).join(file).is_file());
@@ -46,10 +50,10 @@ fn iterations(within: &Path, file: &str) -> Result<Vec<u32>> {
 }
 
 impl Paths {
-    /// Finds the files at `root`: of `iteration`, or of the largest that both folders have, as they were saved together.
+    /// Finds the files of the model at `root`: of `iteration`, or of the largest iteration that has both a point cloud
+    /// and a network.
     ///
-    /// # Errors
-    /// A folder or file that is missing.
+    /// # Errors Fails if a folder or file is missing.
     pub(super) fn locate(root: &Path, iteration: Option<u32>) -> Result<Paths> {
         let (clouds, networks) = (root.join(CLOUDS), root.join(NETWORKS));
         let (of_cloud, of_network) = (iterations(&clouds, "point_cloud.ply")?, iterations(&networks, NETWORK)?);
@@ -72,7 +76,7 @@ impl Paths {
         }
     }
 
-    /// Those of training iteration `k` in `root`.
+    /// Returns the paths of training iteration `k` in `root`.
     pub(super) fn new(root: &Path, k: u32) -> Paths {
         let within = |folder: &str| root.join(folder).join(format!("iteration_{k}"));
         Paths {
@@ -84,10 +88,9 @@ impl Paths {
         }
     }
 
-    /// The network's tensors.
+    /// Reads the tensors of the network.
     ///
-    /// # Errors
-    /// A file that is no state dict; one of Grid4D.
+    /// # Errors Fails if the file is not a state dict, or belongs to Grid4D.
     pub(super) fn tensors(&self, memory: ReadLimit) -> Result<Tensors> {
         let pair = "its hash grids are not read here; write what it renders from as a PLY for each time, and give the folder of \
                     them";
@@ -99,7 +102,8 @@ impl Paths {
         })
     }
 
-    /// xxh3-128 over the bytes of cloud, network and `cfg_args`, as 32 hex digits.
+    /// Returns the xxh3-128 hash of the bytes of point cloud, network and `cfg_args`, as 32 hex digits. Fails if a file
+    /// cannot be read.
     pub(super) fn digest(&self) -> Result<String> {
         let mut hash = Xxh3::new();
         [&self.point_cloud, &self.network, &self.cfg_args]

@@ -1,8 +1,9 @@
 //! Proxies of Gaussians that a network deforms.
 //!
-//! What the network adds depends on where a Gaussian is, so a place is chosen and not averaged: of the places of the heaviest
-//! members and their mean the one that moves most like the members' moment match, improved by Gauss-Newton steps. Size and
-//! rotation are then what is wanted less what the network makes of them there, on average.
+//! The network's output depends on the canonical position of a Gaussian, so the position of a proxy is searched for and
+//! not averaged. Candidates are the positions of the heaviest members and their mean. The candidate whose path is
+//! nearest to the moment match of the members is improved by Gauss-Newton steps. Scale and rotation are then the target
+//! values minus the network's output at that position, on average over sampled frames.
 
 use glam::{DMat3, DVec3};
 use rayon::prelude::*;
@@ -17,19 +18,21 @@ use crate::passes::gather_all;
 use crate::recipe::MergeParams;
 use crate::source::{Deformation, FrameSource};
 
-/// Frames at which places are compared, and over which sizes and rotations are averaged.
+/// Maximum number of frames at which positions are compared, and over which scales and rotations are averaged.
 const SAMPLED_FRAMES: usize = 16;
-/// Members whose places are tried.
+/// Maximum number of members whose positions are candidates.
 const TRIED: usize = 4;
-/// Steps towards a better place.
+/// Number of Gauss-Newton steps of the position.
 const STEPS: usize = 2;
-/// Turns towards a better size and rotation.
+/// Number of corrections of scale and rotation.
 const TURNS: usize = 3;
-/// What a step adds to the diagonal, of its mean: where all frames move alike the matrix is well behaved, and elsewhere a
-/// shorter step is a better one.
+/// Damping of a Gauss-Newton step: added to the diagonal, relative to its mean. If all frames move alike the matrix is
+/// well conditioned; otherwise a shorter step is better.
 const DAMPING: f64 = 1e-3;
 
-/// Parameters that move most like the members of each of `clusters`, a row for each.
+/// Returns the parameters of the proxies of `clusters`, one row each, that approximate the motion of their members.
+///
+/// # Errors Fails if frames cannot be evaluated.
 pub(super) fn propose<L: Deforming>(
     model: &MotionModelFrames<L>,
     clusters: &[Cluster],
@@ -56,7 +59,7 @@ pub(super) fn propose<L: Deforming>(
         by_weight.sort_by(|a, b| b.1.total_cmp(&a.1).then(a.0.cmp(&b.0)));
         by_weight.truncate(TRIED);
         tried.extend(by_weight.into_iter().map(|(id, _)| id));
-        // The last one is moved to the mean.
+        // The last candidate is moved to the mean below.
         tried.push(cluster.leader);
         of_cluster.push(first..tried.len());
         features.resize(tried.len(), heaviest(cluster));
@@ -93,12 +96,12 @@ pub(super) fn propose<L: Deforming>(
     Ok(made)
 }
 
-/// Where a Gaussian is.
+/// Returns the position of a Gaussian.
 fn place(state: &Gaussians, row: usize) -> DVec3 {
     DVec3::from(state.position.row::<3>(row).map(f64::from))
 }
 
-/// For every row of `raw` the sum of its squared distances from where it is wanted.
+/// Returns for every row of `raw` the sum over frames of its squared distance from the position that `wanted` returns.
 fn off<L: Deforming>(
     model: &MotionModelFrames<L>,
     raw: &Raw,
@@ -115,7 +118,7 @@ fn off<L: Deforming>(
     Ok(off)
 }
 
-/// One Gauss-Newton step of every place.
+/// Returns `raw` with every position improved by one Gauss-Newton step.
 fn step<L: Deforming>(model: &MotionModelFrames<L>, raw: &Raw, frames: &[usize], wanted: &[Gaussians]) -> Result<Raw> {
     let mut sums = vec![(DMat3::ZERO, DVec3::ZERO); raw.len()];
     let mut state = Gaussians::zeros(0, 0);
@@ -124,7 +127,7 @@ fn step<L: Deforming>(model: &MotionModelFrames<L>, raw: &Raw, frames: &[usize],
         let slopes = Deformation::jacobian(model, frame, raw, Columns::POSITION)?;
         let slopes = slopes.column(Columns::POSITION);
         for (row, (matrix, vector)) in sums.iter_mut().enumerate() {
-            // Plane 3·i + j is component i by j: rows of the matrix, columns of its transpose.
+            // Plane 3·i + j is the derivative of component i by component j, so reading columns gives the transpose.
             let transposed = DMat3::from_cols_array(&slopes.row::<9>(row).map(f64::from));
             *matrix += transposed * transposed.transpose();
             *vector += transposed * (place(wanted, row) - place(&state, row));
@@ -142,9 +145,9 @@ fn step<L: Deforming>(model: &MotionModelFrames<L>, raw: &Raw, frames: &[usize],
     Ok(better)
 }
 
-/// Sets everything but the place: from the leader's on, by what is wanted less what is there, on average. Where what the
-/// network says is added that is what is wanted less that, at once; where more comes of it, as of quaternions that are not
-/// unit, it takes some turns. The best turn stays.
+/// Sets all parameters except the position. Starts from the leader and adds the mean difference between target and
+/// state, [`TURNS`] times. One correction suffices if the network's output is simply added; quaternions that are not
+/// normalized need several. Keeps the best scale and rotation.
 fn shape<L: Deforming>(
     model: &MotionModelFrames<L>,
     made: &mut Raw,
@@ -164,7 +167,7 @@ fn shape<L: Deforming>(
             Deformation::state(model, frame, made, Columns::all(), &mut state)?;
             all.par_iter_mut().enumerate().for_each(|(row, sum)| sum.add(wanted, &state, row));
             if wanted.sh.len() == made.len() {
-                // Harmonics are wanted at one frame: they change at all others as they do there.
+                // SH coefficients are compared at one frame: their change over time is the same at all frames.
                 for c in 0..state.sh.width() {
                     let more = wanted.sh.plane(c).iter().zip(state.sh.plane(c)).map(|(to, from)| to - from);
                     made.gaussians.sh.plane_mut(c).iter_mut().zip(more).for_each(|(of, more)| *of += more);
@@ -181,23 +184,23 @@ fn shape<L: Deforming>(
             }
         }
     }
-    // Opacities and harmonics are right from the first turn on.
+    // Opacities and SH coefficients are right after the first correction.
     (made.gaussians.rotation, made.gaussians.log_scale) = (best.gaussians.rotation, best.gaussians.log_scale);
     Ok(())
 }
 
-/// What one row lacks, summed over frames.
+/// Difference between target and state of one row, summed over frames.
 #[derive(Clone, Copy, Default)]
 struct Wanting {
     scale: [f64; 3],
     rotation: [f64; 4],
     opacity: f64,
-    /// Squares of what is lacking, of logarithms of scales and of unit quaternions.
+    /// Sum of squared differences of log scales and of unit quaternions.
     off: f64,
 }
 
 impl Wanting {
-    /// Adds what `state` lacks of `wanted`.
+    /// Adds the difference between `wanted` and `state` at one frame.
     fn add(&mut self, wanted: &Gaussians, state: &Gaussians, row: usize) {
         let [to, from] = [wanted, state].map(|state| state.log_scale.row::<3>(row).map(f64::from));
         for c in 0..3 {
@@ -216,20 +219,20 @@ impl Wanting {
         self.opacity += to - from;
     }
 
-    /// Gives it, on average, to parameters.
+    /// Adds the mean difference to the parameters of a row. `share` is 1 / number of frames.
     fn give<L: Deforming>(&self, share: f64, to: &mut Gaussians, row: usize) {
         let scale = to.log_scale.row::<3>(row).map(|x| f64::from(x).exp());
         let scale = [0, 1, 2].map(|c| (scale[c] + share * self.scale[c]).max(LEAST_SCALE).ln() as f32);
         to.log_scale.set_row(row, scale);
         let own = to.rotation.row::<4>(row).map(f64::from);
-        // What is added to a quaternion that is made unit first counts by its length.
+        // If quaternions are normalized first, the correction is scaled by their length.
         let long = if L::NORMALISES { own.iter().map(|x| x * x).sum::<f64>().sqrt() } else { 1.0 };
         let rotation = [0, 1, 2, 3].map(|c| (own[c] + long * share * self.rotation[c]) as f32);
         if rotation.iter().all(|x| x.is_finite()) {
             to.rotation.set_row(row, rotation);
         }
         let alpha = (opacity(to.opacity_logit.plane(0)[row]) + share * self.opacity).clamp(1e-6, 1.0 - 1e-6);
-        // An opacity that is right keeps its bits.
+        // An opacity without difference keeps its bits.
         if self.opacity != 0.0 {
             to.opacity_logit.set_row(row, [logit(alpha) as f32]);
         }

@@ -1,4 +1,4 @@
-//! Models of both families, made of noise: states against the formulas in f64, results read back, and what is refused.
+//! Tests of both formats with random models: states against the formulas in f64, outputs read back, and refused inputs.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -25,17 +25,17 @@ use crate::source::FrameSource;
 const COUNT: usize = 40;
 const TIMES: [f64; 5] = [0.0, 0.25, 0.5, 0.75, 1.0];
 
-/// A folder to be, and what is written into it.
+/// Content of a model folder to be written.
 struct Made {
     folder: TempDir,
     cfg_args: String,
     tensors: Tensors,
-    /// Names and values of the cloud's properties.
+    /// Name and values of each property of the point cloud file.
     cloud: Vec<(String, Vec<f32>)>,
 }
 
 impl Made {
-    /// Of Deformable-3D-Gaussians.
+    /// Creates a model of Deformable-3D-Gaussians.
     fn plain(kind: DeepVariant) -> Made {
         let stripped = |(name, tensor): (String, Tensor)| (name.replace("network.", ""), small(tensor));
         Made {
@@ -50,7 +50,7 @@ impl Made {
         }
     }
 
-    /// Of SC-GS, with 12 nodes, 2 hyper dimensions and a mask.
+    /// Creates a model of SC-GS with 12 nodes, 2 hyper dimensions and a mask.
     fn sparse(kind: DeepVariant) -> Made {
         let mut noise = Noise(23);
         let mut add = |shape: &[usize]| Tensor {
@@ -78,7 +78,7 @@ impl Made {
         self.path().join(folder).join(format!("iteration_{k}")).join(name)
     }
 
-    /// Writes all of it as training iteration `k`.
+    /// Writes all files as training iteration `k`.
     fn write(&self, k: u32) {
         let [network, cloud] = ["deform", "point_cloud"].map(|folder| self.file(folder, k));
         for file in [&network, &cloud] {
@@ -98,7 +98,7 @@ impl Made {
         fs::write(cloud, bytes).unwrap();
     }
 
-    /// Written and open, with frames.
+    /// Writes the model, opens it and sets frame times.
     fn open(&self) -> Box<dyn InputModel> {
         self.write(7);
         open(&self.path()).unwrap()
@@ -116,9 +116,9 @@ impl Made {
     }
 }
 
-/// Weights that move Gaussians by some tenths.
+/// Scales the weights of the last layers so that Gaussians move by some tenths of a unit.
 fn small(mut tensor: Tensor) -> Tensor {
-    // Only of heads: those have few outputs.
+    // Heads are recognized by their few outputs.
     if tensor.shape[0] < 5 {
         tensor.data.iter_mut().for_each(|x| *x *= 0.1);
     }
@@ -149,7 +149,7 @@ fn states(source: &dyn FrameSource) -> Vec<Gaussians> {
     (0..TIMES.len()).map(|frame| gather_all(source, frame, Columns::all()).unwrap()).collect()
 }
 
-/// R·S²·Rᵀ by the rasteriser's formula, of any quaternion.
+/// Returns R·S²·Rᵀ by the formula of the rasterizer, which accepts any quaternion.
 fn covariance(scales: [f64; 3], [w, x, y, z]: [f64; 4]) -> DMat3 {
     let rows = [
         [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
@@ -175,7 +175,7 @@ fn off(a: DMat3, b: DMat3) -> f64 {
     most(a - b) / most(b)
 }
 
-/// What the network says of places at a time.
+/// Returns the network's output for canonical positions at a time.
 fn motion(tensors: &Tensors, prefix: &str, places: &[[f64; 3]], time: f64) -> PredictedMotion {
     let network = Network::new(tensors, prefix, Path::new("made")).unwrap();
     let planes = (0..3).flat_map(|c| places.iter().map(move |place| place[c] as f32)).collect();
@@ -302,7 +302,7 @@ fn derivatives_are_those_of_finite_differences() {
             deformation.state(3, raw, want, &mut out).unwrap();
             out
         };
-        // Small beside 1/512, large beside what f32 leaves of a difference.
+        // Small compared to 1/512, large compared to the f32 error of a difference.
         let step = 3e-5f32;
         let (mut wrong, mut all) = (0, 0);
         for column in want.difference(Columns::SH).iter() {
@@ -328,13 +328,14 @@ fn derivatives_are_those_of_finite_differences() {
                 }
             }
         }
-        // In the step a ReLU may switch, or another node come near: of noise, that some sines repeat 512 times, many do.
-        // A wrong formula is wrong nearly everywhere; the network's own test is exact.
+        // Within a step a ReLU may switch or another node may become nearest. This happens often, since the network is
+        // random and some of its sines repeat 512 times. A wrong formula would be wrong nearly everywhere; the
+        // network's own test is exact.
         assert!(6 * wrong < all, "{}: {wrong} of {all} derivatives are wrong", model.kind());
     }
 }
 
-/// A reduction with two proxies and changes.
+/// Returns a compressed model with two proxies and parameter deltas.
 fn reduction(model: &dyn InputModel) -> CompressedModel {
     let rule = Recipe::preset("default").unwrap().merge;
     let mut reduction = CompressedModel::pruned(vec![1, 4, 9, 12, 30], &rule);
@@ -342,7 +343,7 @@ fn reduction(model: &dyn InputModel) -> CompressedModel {
         Cluster { output: 1, leader: 4, members: vec![(3, 0.6), (4, 0.4)] },
         Cluster { output: 3, leader: 12, members: vec![(12, 0.5), (17, 0.25), (39, 0.25)] },
     ];
-    // Noise strays from everything: what is proposed is what is written here.
+    // Random motion exceeds any drift limit, so the limit is lifted to test the writing of proposed proxies.
     let rule = crate::recipe::MergeParams { max_drift: f64::INFINITY, ..rule };
     let reference = Reference { frame: 0, extent: 1.0 };
     reduction.proxies = model.solve(&reduction.clusters, reference, &rule).unwrap();
@@ -411,7 +412,7 @@ fn merged_and_changed_ones_read_back_as_they_were_shown() {
 #[test]
 fn a_proxy_of_twins_is_one_of_them() {
     for mut made in [Made::plain(KINDS[0]), Made::plain(KINDS[1]), Made::sparse(KINDS[2])] {
-        // The second is the first, but for its normals.
+        // Gaussian 1 equals Gaussian 0 except for its normals.
         made.cloud.iter_mut().filter(|(name, _)| !name.starts_with('n')).for_each(|(_, of)| of[1] = of[0]);
         let model = made.open();
         let rule = Recipe::preset("default").unwrap().merge;
@@ -423,7 +424,7 @@ fn a_proxy_of_twins_is_one_of_them() {
         let (shown, all) = (model.reduced(&reduction).unwrap(), states(model.source()));
         for (frame, state) in states(&*shown).iter().enumerate() {
             assert!((0..3).all(|c| (state.position.plane(c)[0] - all[frame].position.plane(c)[0]).abs() < 1e-6));
-            // Sizes and rotations are right on average; noise makes quaternions of any length.
+            // Scales and rotations are right on average only; random quaternions have any length.
             let found = off(of_state(state, 0), of_state(&all[frame], 0));
             assert!(found < 0.5, "{} at {frame}: covariance off by {found}", model.kind());
         }
@@ -465,7 +466,7 @@ fn models_that_are_not_read_are_refused_by_name() {
     let mut made = Made::sparse(KINDS[0]);
     made.cfg_args = made.cfg_args.replace("K=3", "max_d_scale=1.5");
     assert!(made.message().contains("max_d_scale"));
-    // Two state dicts.
+    // A file with two state dicts.
     let made = Made::plain(KINDS[0]);
     made.write(7);
     let mut archive = zip::ZipWriter::new(fs::File::create(made.file("deform", 7)).unwrap());

@@ -1,11 +1,13 @@
-//! SC-GS as a family: a canonical cloud that follows a few nodes, which a network of position and time moves.
+//! SC-GS as a model format: canonical Gaussians that follow a few control nodes, which a network of position and time
+//! moves.
 //!
-//! State at t: what the network says of each node is summed with the shares that a Gaussian has in the nodes nearest to it
-//! ([`Nodes`]) and multiplied by its mask, σ of its last feature (1 without one). x = xyz + warp; scale = exp(scale) + d_scaling, of
-//! which only the square counts; rotation = rot + d_rotation, of the raw rot, made unit afterwards. Where the network predicts
-//! them, opacity = σ(opacity) + d_opacity, and a color is added to harmonics of degree 0. With `deform_type='mlp'` there are
-//! neither nodes nor mask, and the network sees each Gaussian. Source: Huang et al., "SC-GS: Sparse-Controlled Gaussian
-//! Splatting for Editable Dynamic Scenes", 2024, and its public code.
+//! State at time t: the network's outputs for the nodes nearest to a Gaussian are summed with its node weights
+//! ([`Nodes`]) and multiplied by its motion mask, σ of its last feature (1 without a mask). x = xyz + warp; scale =
+//! exp(scale) + d_scaling, of which only the square matters; rotation = rot + d_rotation of the raw rot, normalized
+//! afterwards. If the network predicts them, opacity = σ(opacity) + d_opacity, and a color is added to the SH
+//! coefficients of degree 0. With `deform_type='mlp'` there are neither nodes nor mask, and the network is evaluated at
+//! each Gaussian. Source: Huang et al., "SC-GS: Sparse-Controlled Gaussian Splatting for Editable Dynamic Scenes",
+//! 2024, and its public code.
 
 mod nodes;
 
@@ -21,7 +23,7 @@ use crate::models::input_model::ModelFormat;
 use crate::models::motion_model::{MotionModel, copy_stored};
 use nodes::Nodes;
 
-/// A model folder, told from the other family of such by a key of its configuration or by its nodes.
+/// SC-GS model folder, distinguished from Deformable-3D-Gaussians by a key of its configuration or by its nodes.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
     expected: "an SC-GS model folder",
     recognizes: |found| {
@@ -36,38 +38,43 @@ pub(super) const ENTRY: ModelFormat = ModelFormat {
     open: |path, options| Folder::open(path, options, Control::new),
 };
 
-/// Bytes of the outputs that are kept, each of all nodes at one time.
+/// Maximum bytes of cached network outputs, each of all nodes at one time.
 const KEPT_BYTES: usize = 16 << 20;
-/// Largest logarithm of a scale, either way: what is beyond has no size to be drawn in.
+/// Maximum absolute value of a log scale; Gaussians beyond it are too small or large to be drawn.
 const MOST_LOG_SCALE: f64 = 600.0;
-/// Largest logit of an opacity that the network adds to.
+/// Maximum absolute logit of an opacity that the network changes.
 const MOST_LOGIT: f64 = 40.0;
 
-/// How a network moves Gaussians.
+/// Motion model of SC-GS.
 #[derive(Debug)]
 struct Control {
     network: Network,
+    /// Control nodes; `None` if the network moves each Gaussian directly.
     nodes: Option<Sparse>,
 }
 
-/// By nodes.
+/// Control nodes with cached network outputs.
 #[derive(Debug)]
 struct Sparse {
     nodes: Nodes,
+    /// Canonical positions of the nodes, encoded for the network.
     encoded: Encoded,
+    /// Whether the last feature of a Gaussian is a motion mask.
     masked: bool,
-    /// Outputs at times (their f32 bits) that were asked for last, the oldest first.
+    /// Network outputs at the last requested times (keyed by f32 bits), oldest first.
     kept: Mutex<VecDeque<(u32, Arc<PredictedMotion>)>>,
 }
 
-/// What is known of a block of Gaussians for all times.
+/// Time-independent values of a block of Gaussians.
 enum PreparedNodes {
-    /// Their shares, K of each, times the mask.
+    /// Node weights, K per Gaussian, multiplied by the mask.
     Shares(Vec<(u32, f64)>),
+    /// Encoded positions, for a network without nodes.
     Encoded(Encoded),
 }
 
 impl Control {
+    /// Reads the network and its nodes. Refuses options of training whose models are not supported.
     fn new(parts: &Parts<'_>) -> Result<(Control, Vec<String>)> {
         let arguments = parts.arguments;
         let refuse = |key: &'static str, found: &str| {
@@ -101,7 +108,7 @@ impl Control {
             }
         }
         let prefix = if has_nodes { "network." } else { "" };
-        // Other ways to a color have layers within, and a frame of a node has a head.
+        // Other color heads have inner layers, and nodes with local frames have a rotation head.
         for inner in ["gaussian_color.0.weight", "gaussian_color.layers.0.weight", "local_rotation.weight"] {
             let name = format!("{prefix}{inner}");
             if parts.tensors.contains_key(&name) {
@@ -144,13 +151,13 @@ impl Control {
 }
 
 impl Sparse {
-    /// σ of the mask of a Gaussian.
+    /// Returns the motion mask of a Gaussian, σ of its last feature; 1 without a mask.
     fn mask(&self, raw: &Raw, row: usize) -> f64 {
         if self.masked { opacity(raw.own.plane(self.nodes.features())[row]) } else { 1.0 }
     }
 
-    /// What the network says of all nodes at `time`. The same for all blocks, so it is kept for a while; two threads that want
-    /// a time at once find the same.
+    /// Returns the network's output for all nodes at `time`. The output is the same for all blocks, so it is cached.
+    /// Two threads that compute the same time get equal values.
     fn motion(&self, network: &Network, time: f64) -> Result<Arc<PredictedMotion>> {
         let key = (time as f32).to_bits();
         let kept = || self.kept.lock().unwrap_or_else(PoisonError::into_inner);
@@ -170,13 +177,14 @@ impl Sparse {
         Ok(motion)
     }
 
-    /// Times of which outputs are kept.
+    /// Returns the maximum number of times whose outputs are cached.
     fn most_kept(&self) -> usize {
         (KEPT_BYTES / (4 * 14 * self.nodes.len())).max(2)
     }
 }
 
-/// Sums the rows of `of` with the shares of Gaussians, `each` of every one.
+/// Returns the sum of the rows of `of`, weighted by the node weights of each Gaussian. `each` is the number of nodes
+/// per Gaussian.
 fn blend(of: &Column, shares: &[(u32, f64)], each: usize) -> Column {
     let mut out = Column::zeros(of.width(), shares.len() / each.max(1));
     for c in 0..of.width() {
@@ -189,7 +197,7 @@ fn blend(of: &Column, shares: &[(u32, f64)], each: usize) -> Column {
 }
 
 impl Control {
-    /// What the network says of the columns `want` of a block.
+    /// Returns the network's output for the columns `want` of a block.
     fn motion(&self, time: f64, prepared: &PreparedNodes, want: Columns) -> Result<PredictedMotion> {
         let (mut motion, want) = (PredictedMotion::default(), want & self.network.active());
         match (prepared, &self.nodes) {
@@ -278,7 +286,7 @@ impl MotionModel for Control {
             };
         }
         if want.contains(Columns::LOG_SCALE) {
-            // Each of the three by its own.
+            // Each scale depends on its own stored value only.
             let mut out = Column::zeros(9, raw.len());
             for c in 0..3 {
                 let of = raw.gaussians.log_scale.plane(c).iter().zip(motion.scaling.plane(c));
@@ -302,12 +310,12 @@ impl MotionModel for Control {
     }
 }
 
-/// Adds `by`, where there is some, to the first planes of `to`.
+/// Adds `by` to the first planes of `to`. Does nothing if `by` is empty.
 fn add(by: &Column, to: &mut Column) {
     each(by, to, |value, by| value + by);
 }
 
-/// Applies `f` to the values of the planes that `by` has, and to those of `by`.
+/// Replaces each value of the planes that `by` has by `f` of it and the value of `by`.
 #[inline(always)]
 fn each(by: &Column, to: &mut Column, f: impl Fn(f32, f32) -> f32) {
     for c in 0..by.width().min(to.width()) {
@@ -315,13 +323,13 @@ fn each(by: &Column, to: &mut Column, f: impl Fn(f32, f32) -> f32) {
     }
 }
 
-/// The logit of an opacity with `by` added to it.
+/// Returns the logit of a stored opacity after adding `by` to the opacity.
 fn added(stored: f32, by: f32) -> f64 {
     let alpha = opacity(stored) + f64::from(by);
     logit(alpha.clamp(0.0, 1.0)).clamp(-MOST_LOGIT, MOST_LOGIT)
 }
 
-/// How positions change that follow nodes: as the shares in them do.
+/// Returns the derivatives of positions that follow nodes, whose node weights depend on the position.
 fn of_shares(sparse: &Sparse, network: &Network, raw: &Raw, time: f64) -> Result<Column> {
     let motion = sparse.motion(network, time)?;
     let (mut out, mut shares) = (Column::zeros(9, raw.len()), Vec::new());
@@ -359,7 +367,7 @@ impl Deforming for Control {
         self.nodes.as_ref().map_or(0, |sparse| KEPT_BYTES + Network::BYTES_PER_GAUSSIAN * sparse.nodes.len())
     }
 
-    /// `benches/families.rs`.
+    /// Returns the cost measured by `benches/families.rs`.
     fn seconds_per_state(&self) -> f64 {
         match &self.nodes {
             Some(_) => 2e-7,
