@@ -41,7 +41,7 @@ fn all(ply: &Ply) -> Gaussians {
     out
 }
 
-/// `len` Gaussians, every value different and exact in an i16.
+/// Returns `len` Gaussians whose values are all different and exact in an i16.
 fn proxies(len: usize, sh_degree: usize) -> Gaussians {
     let mut out = Gaussians::zeros(len, sh_degree);
     for (k, column) in Columns::all().iter().enumerate() {
@@ -51,13 +51,13 @@ fn proxies(len: usize, sh_degree: usize) -> Gaussians {
     out
 }
 
-/// Bits, because NaN is not equal to itself.
+/// Returns the bits of all values, because NaN is not equal to itself.
 fn bits(column: &Column) -> Vec<u32> {
     column.planes().iter().map(|x| x.to_bits()).collect()
 }
 
 #[test]
-fn keeping_every_row_gives_the_file_back() {
+fn keeping_every_row_gives_the_same_bytes() {
     let scratch = Scratch::new();
     for format in ["binary_little_endian", "binary_big_endian"] {
         for line_end in ["\n", "\r\n"] {
@@ -71,7 +71,7 @@ fn keeping_every_row_gives_the_file_back() {
 
 #[test]
 #[ignore = "needs the trained models"]
-fn real_models_come_back_byte_for_byte() {
+fn trained_models_are_rewritten_byte_for_byte() {
     let data = shared_data();
     let scratch = Scratch::new();
     for name in ["deform2/point_cloud/iteration_600/point_cloud.ply", "static/guitar.ply", "static/biker.ply"] {
@@ -79,7 +79,7 @@ fn real_models_come_back_byte_for_byte() {
         let ply = Ply::open(&path).unwrap();
         let written = scratch.write(&ply, &kept(0..ply.count() as u32), &Gaussians::default());
         assert!(written == fs::read(&path).unwrap(), "{name}");
-        // These are INRIA's own layout, so the other writer gives the same, where normals are zero.
+        // These files have the INRIA layout, so the other writer gives the same bytes, except that normals are zero.
         write_inria(&all(&ply), ply.comments(), &scratch.path("inria.ply")).unwrap();
         assert!(fs::read(scratch.path("inria.ply")).unwrap() == written, "{name}");
     }
@@ -98,7 +98,7 @@ fn fewer_rows_change_the_count_and_nothing_else() {
 }
 
 #[test]
-fn a_comment_that_looks_like_a_header_line_stays() {
+fn a_comment_like_a_header_line_is_unchanged() {
     let scratch = Scratch::new();
     let text = String::from_utf8(file("ascii", "float", &names(), 2, "\n")).unwrap();
     let text = text.replace("comment SplatRenderMode: mip", "comment element vertex 2\ncomment format ascii 1.0");
@@ -116,7 +116,7 @@ fn a_text_template_becomes_little_endian_binary() {
 }
 
 #[test]
-fn a_proxy_replaces_its_columns_and_keeps_the_rest_of_its_leader() {
+fn a_proxy_replaces_attributes_and_keeps_extra_properties() {
     let scratch = Scratch::new();
     let mut names = names();
     names.extend(["nx", "ny", "nz"].map(String::from));
@@ -136,7 +136,7 @@ fn a_proxy_replaces_its_columns_and_keeps_the_rest_of_its_leader() {
             let (before, after) = (all(&ply), all(&out));
             for column in Columns::all().iter() {
                 for plane in 0..after.column(column).width() {
-                    let source = |of: &Gaussians, i: usize| of.column(column).plane(plane)[i];
+                    let source = |gaussians: &Gaussians, i: usize| gaussians.column(column).plane(plane)[i];
                     let expected = [source(&proxies, 1), source(&before, 2), source(&proxies, 0)];
                     assert_eq!(after.column(column).plane(plane), expected, "{format} {kind} {}", column.name());
                 }
@@ -150,7 +150,7 @@ fn a_proxy_replaces_its_columns_and_keeps_the_rest_of_its_leader() {
 }
 
 #[test]
-fn a_change_adds_to_any_column_of_rows_and_proxies_and_zeros_leave_the_bytes() {
+fn deltas_are_added_and_zeros_leave_the_bytes() {
     let scratch = Scratch::new();
     for (format, kind) in [("binary_little_endian", "float"), ("binary_big_endian", "double"), ("ascii", "short")] {
         let ply = scratch.open(&file(format, kind, &names(), 3, "\n"));
@@ -172,7 +172,7 @@ fn a_change_adds_to_any_column_of_rows_and_proxies_and_zeros_leave_the_bytes() {
 }
 
 #[test]
-fn harmonics_above_a_degree_go_and_those_below_are_where_a_file_of_that_degree_has_them() {
+fn lowering_the_sh_degree_gives_a_file_of_that_degree() {
     let scratch = Scratch::new();
     let whole = proxies(4, 3);
     write_inria(&whole, &["of degree 3".to_owned()], &scratch.path("whole.ply")).unwrap();
@@ -186,7 +186,7 @@ fn harmonics_above_a_degree_go_and_those_below_are_where_a_file_of_that_degree_h
         write_like(&ply, &kept(0..4), &Gaussians::default(), &ParamDelta::default(), degree, &found).unwrap();
         assert!(fs::read(&found).unwrap() == fs::read(&expected).unwrap(), "degree {degree}");
     }
-    // Proxies and changes have all of them; what is no attribute stays where it was.
+    // Proxies and deltas have all SH coefficients; extra properties keep their place.
     let ply = scratch.open(&file("binary_big_endian", "double", &names(), 3, "\r\n"));
     let (rows, change) = ([OutRow { source: 2, proxy: Some(0) }, kept([1])[0]], ParamDelta(proxies(2, 1)));
     let mut expected = all(&scratch.open(&scratch.write_changed(&ply, &rows, &proxies(1, 1), &change)));
@@ -205,7 +205,7 @@ fn harmonics_above_a_degree_go_and_those_below_are_where_a_file_of_that_degree_h
 }
 
 #[test]
-fn a_surfel_has_no_place_for_a_third_scale() {
+fn a_surfel_file_drops_the_third_scale_of_proxies() {
     let scratch = Scratch::new();
     let names: Vec<String> = names().into_iter().filter(|name| name != "scale_2").collect();
     let ply = scratch.open(&file("binary_little_endian", "float", &names, 1, "\n"));
@@ -218,7 +218,7 @@ fn a_surfel_has_no_place_for_a_third_scale() {
 }
 
 #[test]
-fn rows_and_proxies_that_do_not_exist_are_refused() {
+fn missing_rows_and_proxies_are_refused() {
     let scratch = Scratch::new();
     let ply = scratch.open(&file("binary_little_endian", "float", &names(), 2, "\n"));
     let refusal = |rows: &[OutRow], proxies: &Gaussians| {
@@ -237,7 +237,7 @@ fn rows_and_proxies_that_do_not_exist_are_refused() {
 }
 
 #[test]
-fn the_inria_layout_reads_back_bit_for_bit_at_every_degree() {
+fn the_inria_layout_round_trips_at_every_degree() {
     let scratch = Scratch::new();
     for degree in 0..=3 {
         let mut gaussians = proxies(5, degree);
