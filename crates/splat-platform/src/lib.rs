@@ -40,7 +40,7 @@
 //! assert_eq!(&bytes, b"3456");
 //! assert_eq!(FileStatus::from_file(&file)?, FileStatus::from_path(&path)?);
 //! std::fs::remove_file(&path)?;
-//! # std::io::Result::Ok(())
+//! # Ok::<(), std::io::Error>(())
 //! ```
 
 #![cfg_attr(not(test), deny(clippy::print_stderr, clippy::print_stdout))]
