@@ -95,10 +95,7 @@ impl<'a> PickleMachine<'a> {
     /// Executes one instruction. Returns the root node after the last one.
     fn step(&mut self) -> Result<Option<NodeId>, Wrong> {
         let start = self.at;
-        self.instructions += 1;
-        if self.instructions > MAX_INSTRUCTIONS {
-            return Err(Wrong::TooMuch(start, format!("at most {MAX_INSTRUCTIONS} instructions"), "more".into()));
-        }
+        self.count_instruction(start)?;
         let [instruction] = self.take_bytes()?;
         match instruction {
             // PROTO and FRAME build nothing.
@@ -186,6 +183,15 @@ impl<'a> PickleMachine<'a> {
             other => self.step_scalar(other, start)?,
         }
         Ok(None)
+    }
+
+    /// Counts one instruction, at byte `start`.
+    fn count_instruction(&mut self, start: usize) -> Result<(), Wrong> {
+        self.instructions += 1;
+        if self.instructions > MAX_INSTRUCTIONS {
+            return Err(Wrong::TooMuch(start, format!("at most {MAX_INSTRUCTIONS} instructions"), "more".into()));
+        }
+        Ok(())
     }
 
     /// Executes an instruction that pushes a scalar, a text or opaque bytes. Refuses unknown instructions.

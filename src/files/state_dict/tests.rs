@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use super::*;
 
-/// One tensor as a pickle describes it: storage class, storage bytes, offset, shape, strides.
+/// Tensor as a pickle describes it: storage class, storage bytes, offset, shape, strides.
 struct Entry {
     name: &'static str,
     class: &'static str,
@@ -39,7 +39,7 @@ fn tuple(items: &[i32]) -> Vec<u8> {
     [b"(".to_vec(), items.iter().flat_map(|&i| int(i)).collect(), b"t".to_vec()].concat()
 }
 
-/// The pickle torch.save writes for an OrderedDict of tensors, without memo.
+/// Returns the pickle that torch.save writes for an OrderedDict of tensors, without memo.
 fn pickle(entries: &[Entry]) -> Vec<u8> {
     let mut out = b"\x80\x02ccollections\nOrderedDict\n)R(".to_vec();
     for (key, e) in entries.iter().enumerate() {
@@ -62,7 +62,7 @@ fn crc32(bytes: &[u8]) -> u32 {
     })
 }
 
-/// A zip archive of stored files.
+/// Returns a zip archive of uncompressed files.
 fn zip(files: &[(String, Vec<u8>)]) -> Vec<u8> {
     let (mut out, mut directory) = (Vec::new(), Vec::new());
     for (name, bytes) in files {
@@ -119,7 +119,7 @@ fn small() -> Vec<Entry> {
 }
 
 #[test]
-fn tensors_come_out_with_their_shapes_and_values() {
+fn tensors_have_their_shapes_and_values() {
     let tensors = Scratch::new().read(&state_dict(&small())).unwrap();
     let expected: Tensors = BTreeMap::from([
         ("net.weight".into(), Tensor { shape: vec![2, 3], data: vec![1.0, 2.0, 3.0, 4.0, 5.0, 6.0] }),
@@ -137,7 +137,7 @@ fn strides_and_offsets_are_honored() {
 }
 
 #[test]
-fn every_floating_type_becomes_f32_and_others_are_left_out() {
+fn float_tensors_become_f32_and_others_are_left_out() {
     let entry = |name, class, element_bytes, bytes: Vec<u8>| Entry {
         name,
         class,
@@ -166,7 +166,7 @@ fn every_floating_type_becomes_f32_and_others_are_left_out() {
 }
 
 #[test]
-fn a_file_cut_anywhere_is_refused() {
+fn truncated_files_are_refused() {
     let (scratch, whole) = (Scratch::new(), state_dict(&small()));
     for length in 0..whole.len() {
         let error = scratch.read(&whole[..length]).expect_err("a cut file must be refused");
@@ -175,7 +175,7 @@ fn a_file_cut_anywhere_is_refused() {
 }
 
 #[test]
-fn a_flipped_bit_anywhere_never_changes_a_value_unnoticed() {
+fn flipped_bits_never_change_a_value_silently() {
     let (scratch, whole) = (Scratch::new(), state_dict(&small()));
     let original = scratch.read(&whole).unwrap();
     for at in 0..whole.len() {
@@ -193,7 +193,7 @@ fn a_flipped_bit_anywhere_never_changes_a_value_unnoticed() {
 }
 
 #[test]
-fn noise_is_refused() {
+fn random_bytes_are_refused() {
     let scratch = Scratch::new();
     let mut seed = 3u64;
     for length in [1usize, 10, 100, 5000] {
@@ -208,9 +208,9 @@ fn noise_is_refused() {
 }
 
 #[test]
-fn a_small_file_cannot_ask_for_much_memory() {
+fn a_small_file_cannot_declare_huge_tensors() {
     let scratch = Scratch::new();
-    // A million values out of one, by stride 0; then a shape whose size overflows.
+    // A million values from one by stride 0; then a shape whose size overflows.
     for shape in [vec![1000, 1000], vec![i32::MAX, i32::MAX, i32::MAX]] {
         let stride = vec![0; shape.len()];
         scratch.read(&state_dict(&[f32_entry("t", &[1.0], &shape, &stride)])).expect_err("must be refused");
@@ -218,7 +218,7 @@ fn a_small_file_cannot_ask_for_much_memory() {
 }
 
 #[test]
-fn storages_shorter_or_other_than_declared_are_refused() {
+fn wrong_storages_are_refused() {
     let scratch = Scratch::new();
     for (shape, stride, offset) in [
         (vec![7], vec![1], 0),
@@ -237,7 +237,7 @@ fn storages_shorter_or_other_than_declared_are_refused() {
 }
 
 #[test]
-fn a_pickle_that_calls_something_is_refused_and_nothing_is_called() {
+fn a_pickle_with_a_call_is_refused_and_not_executed() {
     let scratch = Scratch::new();
     let target = scratch.0.path().join("called");
     let command = string(&format!("touch {}", target.display()));
@@ -248,7 +248,7 @@ fn a_pickle_that_calls_something_is_refused_and_nothing_is_called() {
 }
 
 #[test]
-fn deep_nesting_is_refused_without_exhausting_the_stack() {
+fn deep_nesting_is_refused_without_stack_overflow() {
     let scratch = Scratch::new();
     let nested = [b"\x80\x02".to_vec(), b"]".repeat(200_000), b"a".repeat(199_999), b".".to_vec()].concat();
     scratch.read(&archive(nested, std::iter::empty())).expect_err("must be refused");
@@ -257,7 +257,7 @@ fn deep_nesting_is_refused_without_exhausting_the_stack() {
 }
 
 #[test]
-fn a_missing_file_is_an_error_of_the_system() {
+fn a_missing_file_is_an_io_error() {
     let error = read_state_dict(Path::new("nowhere/deformation.pth"), ReadLimit::NONE).expect_err("must fail");
     assert!(matches!(error, Error::Io { .. }), "{error}");
 }
