@@ -1,4 +1,4 @@
-//! The folder that pieces are in.
+//! Work folder with the files of cache entries.
 
 use std::collections::btree_map::Entry;
 use std::collections::{BTreeMap, BTreeSet};
@@ -16,17 +16,17 @@ use crate::cache::shard::MOST_PARTS;
 use crate::error::{Error, Result, ShowPath};
 use crate::files::atomic::remove_leftovers;
 
-/// A work folder that is written to.
+/// Work folder that is read and written.
 #[derive(Debug)]
 pub(super) struct CacheDir {
     folder: PathBuf,
-    /// What all keys begin with.
+    /// Key on which all keys of this run depend.
     context: CacheKey,
     about: String,
 }
 
 impl CacheDir {
-    /// `folder`, created if it is not there.
+    /// Opens the work folder `folder`; creates it if it does not exist.
     pub(super) fn at(folder: &Path, about: String) -> Result<CacheDir> {
         match fs::create_dir(folder) {
             Err(error) if error.kind() != io::ErrorKind::AlreadyExists => {
@@ -40,17 +40,17 @@ impl CacheDir {
         }
     }
 
-    /// What is read and written from now on follows from this, too.
+    /// Makes all further keys also depend on `context`.
     pub(super) fn follow_from(&mut self, context: CacheKey) {
         self.context = self.context.and(&context);
     }
 
-    /// `key` in this context.
+    /// Returns the combination of `key` with the context.
     pub(super) fn key(&self, key: CacheKey) -> CacheKey {
         self.context.and(&key)
     }
 
-    /// Which of several parts of `stage` are there, by how many there are in all.
+    /// Returns the indices of the stored shards of `stage`, by the number of shards.
     pub(super) fn parts(&self, stage: &str, key: CacheKey) -> Result<BTreeMap<usize, BTreeSet<usize>>> {
         let key = self.key(key).text();
         let mut found: BTreeMap<usize, BTreeSet<usize>> = BTreeMap::new();
@@ -63,13 +63,13 @@ impl CacheDir {
         Ok(found)
     }
 
-    /// To what parts of `stage` belong that follow from something else.
+    /// Returns descriptions of the inputs to which stored shards of `stage` with other keys belong.
     pub(super) fn others(&self, stage: &str, key: CacheKey) -> Result<BTreeSet<String>> {
         let key = self.key(key).text();
         let is_other = |name: &EntryName| name.stage == stage && name.key != key && name.part.1 > 1;
         let mut found = BTreeMap::new();
         for name in names(&self.folder)?.into_iter().filter(is_other) {
-            // One of each is enough; one that is damaged belongs to nobody.
+            // One shard per key is enough. The input of a damaged shard is unknown.
             if let Entry::Vacant(new) = found.entry(name.key.clone()) {
                 let piece = CacheEntry::open(&self.folder.join(name.file()), &name.key)?;
                 new.insert(piece.map_or_else(|_| "nobody knows".to_owned(), |piece| piece.about().to_owned()));
@@ -78,7 +78,8 @@ impl CacheDir {
         Ok(found.into_values().collect())
     }
 
-    /// What is in a piece, if it is there. `damaged` is told of one that is not as it was written; it counts as none.
+    /// Reads the value of a cache entry, if it exists. Calls `damaged` with a message for a damaged entry, which counts
+    /// as missing.
     pub(super) fn read<T: DeserializeOwned>(&self, name: &EntryName, damaged: impl Fn(String)) -> Result<Option<T>> {
         let Some(piece) = self.open_piece(name, &damaged)? else { return Ok(None) };
         let found = piece.value();
@@ -86,7 +87,8 @@ impl CacheDir {
         Ok(found.map_err(wrong).ok())
     }
 
-    /// The content of a piece, if it is there and as it was written.
+    /// Opens the content of a cache entry, if it exists and is undamaged. Calls `damaged` with a message for a damaged
+    /// one.
     pub(super) fn open(&self, name: &EntryName, damaged: impl Fn(String)) -> Result<Option<Spill>> {
         let at = self.folder.join(name.file());
         let spill = |piece: CacheEntry| {
@@ -107,18 +109,18 @@ impl CacheDir {
                 damaged(format!("{} is damaged ({why}): computed again", name.file()));
                 Ok(None)
             }
-            // Somebody removed it meanwhile.
+            // Another process removed the file meanwhile.
             Err(Error::Io { source, .. }) if source.kind() == io::ErrorKind::NotFound => Ok(None),
             Err(error) => Err(error),
         }
     }
 
-    /// A folder that has vanished is not one without pieces.
+    /// Checks that the folder still exists: a vanished folder is an error, not an empty cache.
     fn is_there(&self) -> Result<()> {
         fs::metadata(&self.folder).map(|_| ()).map_err(Error::io("find the work folder", &self.folder))
     }
 
-    /// Writes a piece.
+    /// Writes a cache entry with the value `found`.
     pub(super) fn write<T: Serialize>(&self, name: &EntryName, found: &T) -> Result<()> {
         let mut spilling = self.begin(name)?;
         spilling.write_value(found)?;
@@ -126,7 +128,7 @@ impl CacheDir {
         Ok(())
     }
 
-    /// A piece in the making.
+    /// Begins to write a cache entry.
     pub(super) fn begin(&self, name: &EntryName) -> Result<SpillWriter> {
         self.is_there()?;
         let key = u128::from_str_radix(&name.key, 16).unwrap_or_default();

@@ -1,4 +1,4 @@
-//! What is in a work folder, for people.
+//! Listing and cleaning of a work folder for the command line.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -13,29 +13,29 @@ use crate::error::{Error, Result};
 use crate::files::atomic::remove_leftovers;
 use crate::model::ranges;
 
-/// A result that is in a work folder, in one piece or in parts.
+/// Result in a work folder, complete or in shards.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Listed {
-    /// The stage that found it.
+    /// Name of the stage.
     pub stage: String,
-    /// Digest of all that it follows from.
+    /// Cache key of the result, 32 hexadecimal digits.
     pub key: String,
-    /// How many parts it is in; 1: it is whole.
+    /// Number of shards; 1: the result is not divided.
     pub parts: usize,
-    /// Those that are not there.
+    /// Indices of the shards that are missing.
     pub missing: Vec<usize>,
-    /// Those that are damaged, and will be computed again.
+    /// Indices of the damaged shards, which will be computed again.
     pub damaged: Vec<usize>,
-    /// Bytes of its files.
+    /// Bytes of all files of the result.
     pub bytes: u64,
-    /// What it belongs to.
+    /// Description of the input that the result belongs to.
     pub belongs_to: String,
 }
 
-/// Everything in the work folder `folder`, by what it belongs to and by stage. Looks at every byte.
+/// Returns all results in the work folder `folder`, sorted by input and stage. Reads and verifies every byte.
 ///
 /// # Errors
-/// A folder that cannot be read.
+/// Fails if the folder cannot be read.
 pub fn list(folder: &Path) -> Result<Vec<Listed>> {
     let mut found: BTreeMap<(String, String, usize), Listed> = BTreeMap::new();
     for name in names(folder)? {
@@ -62,7 +62,7 @@ pub fn list(folder: &Path) -> Result<Vec<Listed>> {
     Ok(found)
 }
 
-/// What was listed, for a person.
+/// Formats a listing for display.
 pub fn text(listed: &[Listed]) -> String {
     let mut out = String::new();
     for of_run in listed.chunk_by(|a, b| a.belongs_to == b.belongs_to) {
@@ -86,10 +86,11 @@ pub fn text(listed: &[Listed]) -> String {
     out
 }
 
-/// Removes all pieces of the work folder `folder`, and the folder if nothing else is in it; gives their number and bytes.
+/// Removes all cache entries of the work folder `folder`, and the folder if it is empty then. Returns the number of
+/// files and their bytes.
 ///
 /// # Errors
-/// A folder that cannot be read, a file that cannot be removed.
+/// Fails if the folder cannot be read or a file cannot be removed.
 pub fn clean(folder: &Path) -> Result<(usize, u64)> {
     let (mut files, mut bytes) = (0, 0);
     for name in names(folder)? {
@@ -99,7 +100,7 @@ pub fn clean(folder: &Path) -> Result<(usize, u64)> {
         files += 1;
     }
     remove_leftovers(folder, ENDING);
-    // Other files are somebody else's.
+    // A folder with files of other programs is not empty, so it stays.
     let _ = fs::remove_dir(folder);
     Ok((files, bytes))
 }

@@ -1,4 +1,4 @@
-//! Parts of the work of a stage.
+//! Shards of the work of a stage.
 
 use std::fmt;
 use std::ops::Range;
@@ -6,24 +6,24 @@ use std::str::FromStr;
 
 use crate::error::{Error, Result};
 
-/// Most parts that a stage is divided into: each is a file, and of pictures all may be open at once.
+/// Maximum number of shards of a stage. Each shard is a file, and all files of a stage may be open at once.
 pub(super) const MOST_PARTS: usize = 900;
 
-/// Result of a run that may have been asked for one part of the work alone.
+/// Result of a run that may have computed only one shard of the work.
 #[derive(Debug)]
 #[must_use]
 pub enum Completion<T> {
     /// The run did all the work.
     Whole(T),
-    /// The run did the part it was asked for and wrote no result. Holds what it did, for a person.
+    /// The run computed one shard and wrote no result. Holds a report for display.
     Shard(String),
 }
 
 impl<T> Completion<T> {
-    /// Turns [`Error::ShardDone`], the early end of a run of one part, into a success.
+    /// Turns [`Error::ShardDone`], the early end of a run of one shard, into a success.
     ///
     /// # Errors
-    /// Every other error of `result`.
+    /// Fails with every other error of `result`.
     pub(crate) fn from_result(result: Result<T>) -> Result<Completion<T>> {
         match result {
             Ok(whole) => Ok(Completion::Whole(whole)),
@@ -33,7 +33,7 @@ impl<T> Completion<T> {
     }
 }
 
-/// Part `index`, counted from 1, of `of`.
+/// Shard `index`, counted from 1, of `of` shards.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Shard {
     index: usize,
@@ -41,20 +41,20 @@ pub struct Shard {
 }
 
 impl Shard {
-    /// All there is.
+    /// Shard 1 of 1: all the work.
     pub(super) const WHOLE: Shard = Shard { index: 1, of: 1 };
 
-    /// Every part of `of`.
+    /// Returns all shards of a division into `of`.
     pub(super) fn all(of: usize) -> impl Iterator<Item = Shard> {
         (1..=of).map(move |index| Shard { index, of })
     }
 
-    /// Its number, and how many there are.
+    /// Returns the index of the shard and the number of shards.
     pub(super) fn numbers(self) -> (usize, usize) {
         (self.index, self.of)
     }
 
-    /// Which of `units` are its own.
+    /// Returns the range of `units` that belongs to this shard.
     pub(super) fn of_units(self, units: usize) -> Range<usize> {
         let end = |parts: usize| (units as u128 * parts as u128 / self.of as u128) as usize;
         end(self.index - 1)..end(self.index)

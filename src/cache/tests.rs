@@ -11,7 +11,8 @@ fn open(folder: &Path, part: Option<&str>) -> Cache {
     Cache::open(&asked(folder, part), "a test".to_owned()).unwrap()
 }
 
-/// Squares of the first `units` numbers, divided; and which units were computed.
+/// Computes the squares of the first `units` numbers in shards. Returns the result and the units that were computed
+/// here.
 fn squares(work: &Cache, units: usize) -> (Result<Vec<u64>>, Vec<usize>) {
     let computed = RefCell::new(Vec::new());
     let compute = |some: Range<usize>| {
@@ -41,7 +42,7 @@ fn names_in(folder: &Path) -> Vec<String> {
 }
 
 #[test]
-fn parts_of_any_number_in_any_order_and_twice_join_to_the_whole_and_are_computed_once() {
+fn shards_in_any_order_join_to_the_undivided_result() {
     for (units, of) in [(10, 1), (10, 2), (10, 7), (10, 64), (0, 3), (1, 2)] {
         let folder = tempfile::tempdir().unwrap();
         let mut computed = Vec::new();
@@ -67,7 +68,7 @@ fn names_in_work(folder: &Path) -> usize {
 }
 
 #[test]
-fn a_part_that_is_there_is_not_computed_again_and_missing_ones_are_named_and_then_computed() {
+fn stored_shard_is_not_recomputed_missing_ones_are_named() {
     let folder = tempfile::tempdir().unwrap();
     for index in [2, 3, 5] {
         _ = squares(&open(folder.path(), Some(&format!("{index}/6"))), 12);
@@ -79,12 +80,12 @@ fn a_part_that_is_there_is_not_computed_again_and_missing_ones_are_named_and_the
     let (found, computed) = squares(&work, 12);
     assert_eq!((found.unwrap(), computed), (plainly(12), vec![0, 1, 6, 7, 10, 11]));
     assert_eq!(work.take_notes(), ["squares: missing of 6 parts, and computed here: 1, 4, 6"]);
-    // From now on the whole is there.
+    // The undivided result is stored now.
     assert!(squares(&open(folder.path(), Some("1/2")), 12).0.is_ok());
 }
 
 #[test]
-fn parts_of_another_input_are_refused_by_name() {
+fn shards_of_another_input_are_refused_by_name() {
     let folder = tempfile::tempdir().unwrap();
     let of = |about: &str, part: Option<&str>| {
         let mut work = Cache::open(&asked(folder.path(), part), about.to_owned()).unwrap();
@@ -101,7 +102,7 @@ fn parts_of_another_input_are_refused_by_name() {
 }
 
 #[test]
-fn other_inputs_and_parameters_find_nothing() {
+fn other_inputs_and_parameters_do_not_find_the_result() {
     let folder = tempfile::tempdir().unwrap();
     let key = |number: f64| CacheKey::new(&("stage", number));
     let mut work = open(folder.path(), None);
@@ -117,7 +118,7 @@ fn other_inputs_and_parameters_find_nothing() {
 }
 
 #[test]
-fn a_piece_cut_short_flipped_or_renamed_is_computed_again_with_a_note() {
+fn damaged_or_renamed_entry_is_recomputed_with_a_note() {
     let folder = tempfile::tempdir().unwrap();
     _ = squares(&open(folder.path(), None), 40).0.unwrap();
     let (work, [name]) = (folder.path().join("work"), &names_in(&folder.path().join("work"))[..]) else {
@@ -146,7 +147,7 @@ fn a_piece_cut_short_flipped_or_renamed_is_computed_again_with_a_note() {
 }
 
 #[test]
-fn content_on_the_disk_is_divided_too_and_without_a_folder_it_has_no_name() {
+fn content_on_disk_is_divided_and_unnamed_without_a_folder() {
     let write =
         |some: Range<usize>, to: &mut SpillWriter| some.map(|unit| unit as u8).try_for_each(|byte| to.write(&[byte]));
     let read = |spills: Vec<(Range<usize>, Spill)>| -> Vec<u8> {
@@ -168,14 +169,14 @@ fn content_on_the_disk_is_divided_too_and_without_a_folder_it_has_no_name() {
     let found = spilled(&open(folder.path(), None)).unwrap();
     assert_eq!(found.len(), 3);
     assert_eq!(read(found), expected);
-    // One of them is damaged.
+    // Damage one of the shards.
     let work = folder.path().join("work");
     fs::write(work.join(&names_in(&work)[1]), b"SPLSPIEC").unwrap();
     assert_eq!(read(spilled(&open(folder.path(), None)).unwrap()), expected);
 }
 
 #[test]
-fn what_is_not_divided_ends_a_run_of_a_part() {
+fn undivided_stage_ends_a_run_of_a_shard() {
     let folder = tempfile::tempdir().unwrap();
     let of_part = |work: &Cache| work.known("alone", CacheKey::new(&1), || work.not_divided("alone").map(|()| 5u8));
     let message = of_part(&open(folder.path(), Some("1/2"))).unwrap_err().to_string();
@@ -185,7 +186,7 @@ fn what_is_not_divided_ends_a_run_of_a_part() {
 }
 
 #[test]
-fn a_folder_says_what_is_in_it_and_is_removed_but_for_what_is_somebody_elses() {
+fn listing_names_contents_and_cleaning_keeps_other_files() {
     let folder = tempfile::tempdir().unwrap();
     let work = folder.path().join("work");
     _ = squares(&open(folder.path(), Some("2/3")), 9);
@@ -206,7 +207,7 @@ fn a_folder_says_what_is_in_it_and_is_removed_but_for_what_is_somebody_elses() {
 }
 
 #[test]
-fn a_folder_that_is_none_or_has_vanished_is_an_error_that_names_it() {
+fn invalid_or_vanished_folder_is_an_error_that_names_it() {
     let folder = tempfile::tempdir().unwrap();
     fs::write(folder.path().join("work"), "a file").unwrap();
     let message = Cache::open(&asked(folder.path(), None), String::new()).unwrap_err().to_string();
@@ -225,7 +226,7 @@ fn a_folder_that_is_none_or_has_vanished_is_an_error_that_names_it() {
 }
 
 #[test]
-fn parts_are_named_by_two_numbers() {
+fn shard_is_parsed_from_index_and_count() {
     for good in ["1/1", "3/8", "64/64"] {
         assert_eq!(good.parse::<Shard>().unwrap().to_string(), good);
     }
@@ -235,7 +236,7 @@ fn parts_are_named_by_two_numbers() {
 }
 
 #[test]
-fn where_nothing_is_kept_no_key_is_made() {
+fn no_key_is_hashed_without_a_work_folder() {
     struct Untouched;
     impl Serialize for Untouched {
         fn serialize<S: serde::Serializer>(&self, _: S) -> std::result::Result<S::Ok, S::Error> {

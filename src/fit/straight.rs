@@ -1,34 +1,35 @@
-//! Pieces of straight motion: within each, everything else stands still.
+//! Fit of pieces with linear motion; all other attributes are constant within a piece.
 
 use std::ops::Range;
 
 use super::least_squares::polynomial;
 use super::{FittedTrack, Misfit, Tolerance};
 
-/// What a Gaussian is for some frames.
+/// Attributes of a Gaussian during some frames.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LinearPiece {
-    /// Its frames.
+    /// Frames of the piece.
     pub frames: Range<usize>,
-    /// The instant at which it is at `position`.
+    /// Time at which the Gaussian is at `position`.
     pub at: f64,
-    /// Scene units.
+    /// Position, scene units.
     pub position: [f64; 3],
-    /// Scene units per unit of time.
+    /// Velocity, scene units per unit of time.
     pub velocity: [f64; 3],
-    /// Unit quaternion wxyz.
+    /// Rotation, unit quaternion wxyz.
     pub rotation: [f64; 4],
-    /// Natural logarithms of scene units.
+    /// Log scales, natural logarithms of scene units.
     pub log_scale: [f64; 3],
-    /// In [0, 1].
+    /// Opacity in [0, 1].
     pub opacity: f64,
-    /// Harmonic coefficients.
+    /// SH coefficients.
     pub sh: Vec<f32>,
 }
 
-/// The pieces of `track`, in order: halves of the sequence, of its halves and so on (of 2ᵏ frames from a multiple of 2ᵏ on),
-/// each the largest that holds what `tolerance` says at every frame; nothing where it is not seen. Of all Gaussians together
-/// there are so no more different spans than twice the frames. How far the pieces are off goes into `misfit`.
+/// Returns the pieces of `track` in order. Spans are halves of the sequence, halves of those and so on: 2ᵏ frames that
+/// begin at a multiple of 2ᵏ. Each piece is the largest such span that meets `tolerance` at every frame. Frames where
+/// the Gaussian is invisible have no piece. All Gaussians together have at most twice as many different spans as there
+/// are frames. The error of the pieces is added to `misfit`.
 pub fn straight(track: &FittedTrack, tolerance: &Tolerance, misfit: &mut Misfit) -> Vec<LinearPiece> {
     let mut pieces = Vec::new();
     cut(track, 0..track.len().next_power_of_two(), tolerance, &mut pieces);
@@ -40,7 +41,7 @@ pub fn straight(track: &FittedTrack, tolerance: &Tolerance, misfit: &mut Misfit)
     pieces
 }
 
-/// Adds the pieces of a span of 2ᵏ frames, of which the last ones may not exist.
+/// Adds the pieces of a span of 2ᵏ frames; the last frames of the span may not exist.
 fn cut(track: &FittedTrack, span: Range<usize>, tolerance: &Tolerance, pieces: &mut Vec<LinearPiece>) {
     let frames = span.start..span.end.min(track.len());
     let seen = frames.clone().filter(|&frame| track.is_seen(frame)).count();
@@ -58,12 +59,12 @@ fn cut(track: &FittedTrack, span: Range<usize>, tolerance: &Tolerance, pieces: &
     cut(track, middle..span.end, tolerance, pieces);
 }
 
-/// Where `piece` is at `time`.
+/// Returns the position of `piece` at `time`.
 fn place(piece: &LinearPiece, time: f64) -> [f64; 3] {
     std::array::from_fn(|c| piece.position[c] + piece.velocity[c] * (time - piece.at))
 }
 
-/// The best piece of these frames: positions by least squares, all else their mean.
+/// Returns the best piece for the given frames: least squares for positions, means for all other attributes.
 fn piece(track: &FittedTrack, frames: Range<usize>) -> LinearPiece {
     let count = frames.len() as f64;
     let (first, last) = (track.times[frames.start], track.times[frames.end - 1]);
@@ -87,7 +88,7 @@ fn piece(track: &FittedTrack, frames: Range<usize>) -> LinearPiece {
     }
 }
 
-/// Whether `piece` is as close as `tolerance` asks at every one of its frames.
+/// Returns whether `piece` is within `tolerance` at every one of its frames.
 fn holds(track: &FittedTrack, piece: &LinearPiece, tolerance: &Tolerance) -> bool {
     let near = |a: f64, b: f64, within: f64| (a - b).abs() <= within;
     piece.frames.clone().all(|frame| {
@@ -103,7 +104,7 @@ fn holds(track: &FittedTrack, piece: &LinearPiece, tolerance: &Tolerance) -> boo
 mod tests {
     use super::*;
 
-    /// A Gaussian of size e⁻³ at `position`, seen with `opacity`.
+    /// Returns a track of a Gaussian of scale e⁻³ with the given position and opacity at each time.
     pub(super) fn track(
         frames: usize,
         position: impl Fn(f64) -> [f64; 3],
@@ -121,21 +122,21 @@ mod tests {
     }
 
     #[test]
-    fn straight_motion_is_one_piece_and_an_edge_begins_another() {
+    fn linear_motion_is_one_piece_and_a_bend_splits_it() {
         let mut misfit = Misfit::default();
         let one = straight(&track(50, |t| [1.0 + 2.0 * t, -t, 0.0], |_| 0.7), &Tolerance::default(), &mut misfit);
         assert_eq!(one.len(), 1);
         assert!((one[0].velocity[0] - 2.0).abs() < 1e-9 && one[0].frames == (0..50) && misfit.position < 1e-9);
         let bent = track(50, |t| [(t - 0.4).abs(), 0.0, 0.0], |_| 0.7);
         let pieces = straight(&bent, &Tolerance::default(), &mut misfit);
-        // The edge lies in frame 20: 0 to 15, 16 to 19 and 20 on.
+        // The bend is in frame 20. Pieces: frames 0 to 15, 16 to 19, and 20 on.
         assert!(pieces.len() >= 3 && pieces.len() <= 8, "{} pieces", pieces.len());
         assert_eq!(pieces.iter().map(|piece| piece.frames.len()).sum::<usize>(), 50);
         assert!(misfit.position <= 0.1 && misfit.states == 100, "{misfit:?}");
     }
 
     #[test]
-    fn what_is_not_seen_takes_no_piece_and_a_life_may_pause() {
+    fn invisible_frames_have_no_piece_and_tracks_may_pause() {
         let mut misfit = Misfit::default();
         let blink = track(60, |_| [0.0; 3], |t| if (0.2..0.4).contains(&t) || t > 0.7 { 0.5 } else { 0.001 });
         let pieces = straight(&blink, &Tolerance::default(), &mut misfit);
@@ -143,12 +144,12 @@ mod tests {
         assert_eq!(frames, [12..16, 16..24, 43..44, 44..48, 48..60]);
         let mut broken = track(5, |_| [0.0; 3], |_| 0.5);
         broken.position[2][1] = f64::NAN;
-        // 0 and 1, 3, 4.
+        // Pieces: frames 0 and 1, frame 3, frame 4.
         assert_eq!(straight(&broken, &Tolerance::default(), &mut misfit).len(), 3);
     }
 
     #[test]
-    fn every_frame_of_a_wild_one_is_held_within_the_tolerance() {
+    fn every_frame_of_a_wild_track_is_within_tolerance() {
         let mut misfit = Misfit::default();
         let mut wild = track(200, |t| [(37.0 * t).sin(), (23.0 * t).cos(), t * t], |t| 0.5 + 0.4 * (50.0 * t).sin());
         for (frame, (rotation, scale)) in wild.rotation.iter_mut().zip(&mut wild.log_scale).enumerate() {

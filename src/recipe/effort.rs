@@ -1,33 +1,33 @@
-//! How much time a run may take for how small an error: places on the curves that `splatsieve precision` draws.
+//! Effort of a run, one knob for time against quality: points on the curves that `splatsieve precision` draws.
 
 use super::{MOST_STEPS, Recipe};
 
-/// A place on the curves of error against run time.
+/// Point on the curve of quality against run time.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Effort {
-    /// A third of the steps of refinement, and a coarser look and rounds.
+    /// A third of the optimization steps, and fewer views and larger pruning rounds.
     Fast,
-    /// As the recipe has it.
+    /// Settings of the recipe.
     Default,
-    /// Three times the steps, and a finer look and rounds.
+    /// Three times the optimization steps, and more views and smaller pruning rounds.
     Best,
 }
 
-/// What a place comes to.
+/// Settings of an effort.
 struct Knobs {
     look_pictures: usize,
     round_pictures: usize,
     round_turns: usize,
     round_fraction: f64,
-    /// Times the recipe's own.
+    /// Factor on the optimization steps of the recipe.
     steps: f64,
 }
 
 impl Effort {
-    /// Every one, the fastest first.
+    /// All efforts, the fastest first.
     pub const ALL: [Effort; 3] = [Effort::Fast, Effort::Default, Effort::Best];
 
-    /// As the command line names it.
+    /// Returns the name on the command line.
     pub fn name(self) -> &'static str {
         match self {
             Effort::Fast => "fast",
@@ -54,13 +54,13 @@ impl Effort {
 }
 
 impl Recipe {
-    /// The same at `effort`: the first look, the rounds and the steps of refinement, as far as the recipe has them, with more
-    /// or fewer of them. What a recipe looks at whole stays so.
+    /// Returns this recipe at `effort`: with more or fewer scored views, rounds and optimization steps. Parts that the
+    /// recipe does not use stay unused. A recipe that scores all views keeps scoring all.
     pub fn at_effort(&self, effort: Effort) -> Recipe {
         let Some(knobs) = effort.knobs() else { return self.clone() };
         let steps = knobs.steps * f64::from(self.refine.refine_steps);
         let mut recipe = self.refining_by((steps.ceil() as u32).min(MOST_STEPS));
-        // Never past what the recipe has by itself.
+        // Never cross the recipe's own value in the wrong direction.
         let less = knobs.steps < 1.0;
         let moved = |own: usize, to: usize| if less { own.min(to) } else { own.max(to) };
         if recipe.scan.look_pictures > 0 {
@@ -82,7 +82,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn more_effort_looks_at_more_and_what_a_recipe_does_not_do_stays_undone() {
+    fn effort_increases_work_and_adds_no_unused_parts() {
         let default = Recipe::preset("default").unwrap();
         let at = Effort::ALL.map(|effort| default.at_effort(effort));
         assert_eq!(at[1], default);
