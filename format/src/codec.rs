@@ -4,7 +4,7 @@
 //! and replaces the value by the zigzagged difference. The bytes of equal weight are then stored together (shuffle) and
 //! compressed by zstd. All arithmetic wraps, so every bit pattern is restored exactly.
 //!
-//! StoredTile size in percent of the raw size for tiles of 32 frames of three trained models, zstd level 1, by the filter
+//! Stored size in percent of the raw size for tiles of 32 frames of three trained models, zstd level 1, by the filter
 //! before zstd (`cargo bench --bench filters` of the program prints the table by model, with the times of encoding and
 //! decoding):
 //!
@@ -205,7 +205,7 @@ pub(crate) struct TileDecoder {
     tracks: BoundedTracks,
 }
 
-/// StoredTile bytes of a tile with the parameters needed to decode them.
+/// Stored bytes of a tile with the parameters needed to decode them.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct StoredTile<'a> {
     pub(crate) bytes: &'a [u8],

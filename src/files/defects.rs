@@ -1,18 +1,18 @@
-//! Rows of a file that are not as its format says, and what its reader did about them.
+//! Statistics of the rows of a file that violate its format, and of how its reader treated them.
 
 /// Number of row ids that a note lists per defect.
 const LISTED: usize = 5;
-/// Fraction of a file's rows above which leaving rows out is the first thing said about the file.
+/// Fraction of dropped rows above which the total becomes the first note about the file.
 const LOUD: f64 = 0.01;
 
-/// What a reader did about the defective rows of a file.
+/// Counts of defective rows of a file and of the reader's treatment of them.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Defects {
-    /// Rows of the file, without padding.
+    /// Number of rows of the file, without padding.
     pub rows: usize,
-    /// Rows with at least one defect.
+    /// Number of rows with at least one defect.
     pub defective: usize,
-    /// Rows left out, each counted once.
+    /// Number of dropped rows, each counted once.
     pub dropped: usize,
     /// One entry per kind of defect that was found. A row with several defects counts in several entries.
     pub kinds: Vec<DefectCount>,
@@ -21,15 +21,15 @@ pub struct Defects {
 /// Rows with one kind of defect.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct DefectCount {
-    /// Kind of the defect, such as "zero quaternion".
+    /// Name of the defect, such as "zero quaternion".
     pub what: String,
-    /// Whether such rows are left out; else they are kept, as `why` says.
+    /// Whether these rows are dropped; otherwise they are kept as described by `why`.
     pub dropped: bool,
-    /// Why such rows are treated so, and what to do about it.
+    /// Reason for the treatment, and advice for the user.
     pub why: String,
     /// Number of rows.
     pub rows: usize,
-    /// Numbers of the first few rows.
+    /// Ids of the first few rows.
     pub first: Vec<u32>,
 }
 
@@ -39,7 +39,7 @@ impl Defects {
         Defects { rows, ..Defects::default() }
     }
 
-    /// Counts the defects `found` of row `row`, each with its name, whether it drops the row, and why.
+    /// Counts row `row` with its defects `found`: each has a name, whether it drops the row, and the reason.
     pub fn add(&mut self, row: u32, found: &[(&str, bool, &str)]) {
         self.defective += usize::from(!found.is_empty());
         self.dropped += usize::from(found.iter().any(|&(_, dropped, _)| dropped));
@@ -62,7 +62,8 @@ impl Defects {
         self.defective == 0
     }
 
-    /// Returns one note per kind of defect, and one with the totals, which is the first where many rows are left out.
+    /// Returns one note per kind of defect and one with the totals. The totals come first if more than 1% of the rows
+    /// were dropped, otherwise last.
     pub fn notes(&self) -> Vec<String> {
         if self.is_empty() {
             return Vec::new();

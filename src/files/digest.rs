@@ -1,4 +1,4 @@
-//! Files into a hash, piece by piece: a file's length is no matter of memory.
+//! Hashing of files in chunks, so that the memory does not depend on their length.
 
 use std::fs::File;
 use std::io::Read;
@@ -9,7 +9,7 @@ use xxhash_rust::xxh3::Xxh3;
 use super::open::open_file;
 use crate::error::{Error, Result};
 
-/// Bytes read at a time.
+/// Number of bytes read at a time.
 const PIECE: usize = 1 << 18;
 
 /// Adds the bytes of the file at `path` to `hash`.
@@ -17,7 +17,7 @@ pub(crate) fn hash_file(path: &Path, hash: &mut Xxh3) -> Result<()> {
     hash_rest(&mut open_file(path)?, path, hash)
 }
 
-/// Adds the bytes of `file`, which is at `path`, from where it is to its end.
+/// Adds the bytes of `file`, which was opened from `path`, from its current position to its end.
 pub(crate) fn hash_rest(file: &mut File, path: &Path, hash: &mut Xxh3) -> Result<()> {
     let mut piece = vec![0; PIECE];
     loop {

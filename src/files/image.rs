@@ -1,8 +1,8 @@
-//! A photographed or rendered picture from a PNG file.
+//! Reader of photographs and renders in PNG files.
 //!
-//! In: a PNG of any color type and depth, and the size it must have. Out: an [`Image`] in [0, 1], with
-//! transparency over a background. Memory: the decoded rows beside the result; the size is checked
-//! before either is allocated.
+//! Input: a PNG of any color type and bit depth, and the size it must have. Output: an [`Image`] with values in [0, 1],
+//! transparent pixels blended over a background. Memory: the decoded rows and the result; the size is checked before
+//! either is allocated.
 
 pub mod write;
 
@@ -15,18 +15,18 @@ use super::open::open_file;
 use crate::error::{Error, Result};
 use crate::render::Image;
 
-/// Reads the PNG at `path`, which must be `width` × `height` pixels.
+/// Reads the PNG at `path`, which must have `width` × `height` pixels.
 ///
-/// Gray is repeated into the three channels. Where the picture has transparency, it is laid over
-/// `background`: c·a + background·(1 − a), as the D-NeRF loaders do.
+/// Gray is repeated into the three channels. Transparent pixels are blended over `background`: c·a + background·(1 −
+/// a), as the D-NeRF loaders do.
 ///
 /// # Errors
-/// A file that is no PNG, is damaged, or has another size.
+/// Fails if the file is not a PNG, is damaged, or has another size.
 pub fn read_png(path: &Path, (width, height): (u32, u32), background: [f32; 3]) -> Result<Image> {
     let file = open_file(path)?;
     let mut decoder = Decoder::new(BufReader::new(file));
     decoder.set_transformations(Transformations::EXPAND);
-    // Texts and color profiles are not used, and may decompress to any length.
+    // Text chunks and color profiles are not used and could decompress to any length.
     decoder.set_ignore_text_chunk(true);
     decoder.set_ignore_iccp_chunk(true);
     let mut reader = decoder.read_info().map_err(malformed(path))?;
@@ -37,7 +37,7 @@ pub fn read_png(path: &Path, (width, height): (u32, u32), background: [f32; 3]) 
             .hint("give pictures of the cameras' size, or the cameras of these pictures"));
     }
     let (color, depth) = reader.output_color_type();
-    // None only where the size overflows, which the cameras' limits exclude.
+    // The size is `None` only on overflow, which the limits on cameras exclude.
     let mut bytes = vec![0; reader.output_buffer_size().unwrap_or(0)];
     reader.next_frame(&mut bytes).map_err(malformed(path))?;
     let values: Vec<f32> = match depth {
@@ -53,18 +53,19 @@ pub fn read_png(path: &Path, (width, height): (u32, u32), background: [f32; 3]) 
         ColorType::Grayscale => values.iter().flat_map(|&gray| [gray; 3]).collect(),
         ColorType::GrayscaleAlpha => values.chunks_exact(2).flat_map(|p| over([p[0]; 3], p[1])).collect(),
         ColorType::Rgba => values.chunks_exact(4).flat_map(|p| over([p[0], p[1], p[2]], p[3])).collect(),
-        // A palette arrives expanded.
+        // Palettes are already expanded by the decoder.
         ColorType::Rgb | ColorType::Indexed => values,
     };
     Ok(Image { width, height, data })
 }
 
-/// Reads the size of the PNG or JPEG at `path` in pixels, or `None` if it cannot be read.
+/// Returns the size in pixels of the PNG or JPEG at `path`, or `None` if it cannot be read.
 pub(crate) fn measure(path: &Path) -> Option<(u32, u32)> {
     let size = imagesize::reader_size(BufReader::new(open_file(path).ok()?)).ok()?;
     Some((u32::try_from(size.width).ok()?, u32::try_from(size.height).ok()?))
 }
 
+/// Returns a closure that turns decoding errors of the file at `path` into errors of this crate.
 fn malformed(path: &Path) -> impl Fn(DecodingError) -> Error {
     move |error| match error {
         DecodingError::IoError(source) if source.kind() != std::io::ErrorKind::UnexpectedEof => {
@@ -78,7 +79,7 @@ fn malformed(path: &Path) -> impl Fn(DecodingError) -> Error {
 mod tests {
     use super::*;
 
-    /// A PNG of 2 × 1 pixels.
+    /// Writes a PNG of 2 × 1 pixels.
     fn written(color: ColorType, depth: BitDepth, bytes: &[u8], palette: Option<&[u8]>) -> tempfile::NamedTempFile {
         let file = tempfile::NamedTempFile::new().unwrap();
         let mut encoder = png::Encoder::new(file.reopen().unwrap(), 2, 1);

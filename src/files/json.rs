@@ -1,8 +1,8 @@
-//! JSON files, read as streams.
+//! Streaming reader of JSON files.
 //!
-//! Input: the path of a file of any length. Output: what a [`DeserializeSeed`] makes of it. Memory: a buffer of 64 KiB, one
-//! text, and what the seed keeps. A text, a number or a nesting that no camera file has is refused before the parser sees
-//! it, since the parser keeps the text that it reads in memory.
+//! Input: the path of a file of any length. Output: the value built by a [`DeserializeSeed`]. Memory: a buffer of 64
+//! KiB, one string, and what the seed keeps. Strings, numbers and nesting beyond what a camera file contains are
+//! refused before the parser sees them, because the parser keeps the string it reads in memory.
 
 mod checked;
 pub(crate) mod lists;
@@ -21,23 +21,23 @@ use super::open::{open_file, read_small};
 use crate::error::{Error, Result};
 use checked::Checked;
 
-/// Holds the error of a seed while the parser unwinds: the parser's own error has no room for it.
+/// Error of a seed, kept here while the parser unwinds because the parser's own error type cannot hold it.
 #[derive(Debug, Default)]
 pub(crate) struct Stopped(RefCell<Option<Error>>);
 
 impl Stopped {
-    /// Keeps `error`, and returns the parser's error that ends the reading.
+    /// Stores `error` and returns the parser error that ends the reading.
     pub(crate) fn by<E: serde::de::Error>(&self, error: Error) -> E {
         *self.0.borrow_mut() = Some(error);
         E::custom("stopped")
     }
 }
 
-/// Reads the JSON document in the file at `path` with `seed`, whose own errors are left in `stopped`.
+/// Reads the JSON document in the file at `path` with `seed`, which leaves its own errors in `stopped`.
 ///
 /// # Errors
-/// Those of the seed; a file that cannot be read; text that is no UTF-8 or no JSON, with the place; texts, numbers or
-/// nesting beyond the limits.
+/// Fails if the seed fails, the file cannot be read, the text is not UTF-8 or not JSON (the message names the place),
+/// or a string, number or nesting exceeds the limits.
 pub(crate) fn read<T, S: for<'de> DeserializeSeed<'de, Value = T>>(
     path: &Path,
     stopped: &Stopped,
@@ -46,10 +46,10 @@ pub(crate) fn read<T, S: for<'de> DeserializeSeed<'de, Value = T>>(
     read_from(open_file(path)?, path, stopped, seed)
 }
 
-/// Reads the JSON document that `file` holds, called `path` in messages, as [`read`] does.
+/// Reads the JSON document in `file` as [`read`] does; messages name it `path`.
 ///
 /// # Errors
-/// Those of [`read`].
+/// Fails like [`read`].
 pub(crate) fn read_from<T, S: for<'de> DeserializeSeed<'de, Value = T>>(
     file: impl Read,
     path: &Path,
@@ -86,10 +86,10 @@ pub(crate) fn read_from<T, S: for<'de> DeserializeSeed<'de, Value = T>>(
     })
 }
 
-/// Reads the whole JSON document in the file at `path`, which must hold at most `most_bytes`.
+/// Reads the whole JSON document in the file at `path`, which may hold at most `most_bytes`.
 ///
 /// # Errors
-/// Those of [`read_small`] and of [`read`].
+/// Fails like [`read_small`] and [`read`].
 pub(crate) fn read_json(path: &Path, most_bytes: u64) -> Result<Value> {
     let bytes = read_small(path, most_bytes, "JSON")?;
     read_from(&bytes[..], path, &Stopped::default(), PhantomData::<Value>)

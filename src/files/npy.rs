@@ -1,17 +1,19 @@
-//! What has to be checked of a NumPy array before a reader believes its header.
+//! Checks of the header of a NumPy array that must pass before a reader may parse it.
 
-/// Longest header. Those of arrays of numbers have 118 bytes, or 54 more for every axis.
+/// Maximum length of a header in bytes. Headers of arrays of numbers have 118 bytes, or 54 more for every axis.
 const LONGEST: u64 = 4096;
-/// Bytes of a file that hold its header, if that is not too long.
+/// Number of bytes of a file that contain its header, if its length is legal.
 pub(crate) const HEAD: u64 = LONGEST + 12;
-/// Most digits of a shape: the product of its lengths stays below 2⁶³.
+/// Maximum number of digits in a shape, so that the product of its lengths stays below 2⁶³.
 const MOST_DIGITS: usize = 18;
-/// Deepest brackets: a shape within the dictionary, and one more.
+/// Maximum bracket depth: a shape within the dictionary, and one more.
 const DEEPEST: usize = 3;
 
-/// Whether a file of `bytes`, which begins with `head` ([`HEAD`] of them or all), has a header that a reader can be given: it
-/// makes room for the length that is announced, up to 4 GiB, before it looks, its time doubles with every open bracket, and
-/// it multiplies the lengths of a shape whatever they are.
+/// Returns whether the header of an array file of `bytes` bytes may be passed to the parser. `head` holds the first
+/// [`HEAD`] bytes, or all.
+///
+/// The parser itself is unsafe for forged headers: it allocates the declared length (up to 4 GiB) before reading, its
+/// time doubles with every open bracket, and it multiplies the lengths of a shape without a check.
 pub(crate) fn header_is_sound(head: &[u8], bytes: u64) -> bool {
     let start = if head.get(6) == Some(&1) { 10 } else { 12 };
     let Some(digits) = head.get(8..start) else { return false };
@@ -32,7 +34,7 @@ pub(crate) fn header_is_sound(head: &[u8], bytes: u64) -> bool {
         })
 }
 
-/// Digits of the first tuple of lengths; a header without one has none.
+/// Returns the number of digits in the first tuple of lengths; 0 if the header has none.
 fn digits_of_shape(text: &[u8]) -> usize {
     const KEY: &[u8] = b"'shape'";
     let Some(at) = text.windows(KEY.len()).position(|some| some == KEY) else { return 0 };

@@ -1,16 +1,17 @@
-//! A still scene as a `.spz`, version 3 of the format (nianticlabs/spz, `load-spz.cc`): a header of 16 bytes and one array
-//! after the other, all compressed by gzip.
+//! Writer of still scenes as `.spz`, version 3 of the format (nianticlabs/spz, `load-spz.cc`): a header of 16 bytes and
+//! the arrays below one after the other, all compressed by gzip.
 //!
-//! | array | bytes a Gaussian | value |
+//! | array | bytes per Gaussian | value |
 //! |---|---|---|
 //! | positions | 9 | 24-bit signed, in units of 2^−(fractional bits); axes right, up, back |
 //! | opacities | 1 | 255·α |
 //! | colors | 3 | 255·(.15·f_dc + ½) |
 //! | scales | 3 | 16·(ln s + 10) |
-//! | rotations | 4 | which of x, y, z, w is largest, 2 bits, and of the others sign and 9 bits of 511·√2·value |
-//! | harmonics | 3·((d + 1)² − 1) | 128·c + 128, to the nearest of 5 bits in the first band and of 4 in the others |
+//! | rotations | 4 | 2 bits: index of the largest of x, y, z, w; for each of the others sign and 9 bits of 511·√2·value |
+//! | SH coefficients | 3·((d + 1)² − 1) | 128·c + 128, rounded to 5 bits in degree 1 and to 4 bits above |
 //!
-//! The maintained crate for the format would bring an asynchronous runtime with it; the format is these lines.
+//! The maintained crate for this format depends on an asynchronous runtime; the format itself needs only the lines
+//! below.
 
 use std::fs::File;
 use std::io::{BufWriter, Write};
@@ -24,18 +25,18 @@ use crate::model::{Gaussians, color, opacity};
 
 const MAGIC: u32 = 0x5053_474e;
 const VERSION: u32 = 3;
-/// Largest number that a position's 24 bits hold.
+/// Largest magnitude of a position in units of the last bit (24 bits, signed).
 const MOST: f64 = 8_388_607.0;
-/// Bits below the point, at most: finer ones are noise of f32.
+/// Maximum number of fractional bits of positions; finer bits are noise of f32.
 const MOST_BITS: i32 = 20;
-/// Signs of the harmonics above degree 0 once y and z point the other way.
+/// Signs of the SH coefficients above degree 0 after the y and z axes are reversed.
 const TURNED: [f32; 15] = [-1., -1., 1., -1., 1., 1., -1., 1., -1., 1., -1., -1., 1., -1., 1.];
 
-/// Writes `state`; returns the largest error of a position in the file, in scene units.
+/// Writes `state` to `path`. Returns the largest error of a position in the file, in scene units.
 ///
 /// # Errors
-/// A position that is not finite; values that the file holds only with errors beyond the bounds of
-/// [`accuracy`](super::accuracy); more Gaussians than the format counts; a failed write.
+/// Fails if a position is not finite, if stored values would exceed the error bounds of [`accuracy`](super::accuracy),
+/// if there are more Gaussians than the format can count, or if writing fails.
 pub fn write_spz(state: &Gaussians, path: &Path) -> Result<f64> {
     let furthest = state.position.planes().iter().fold(0.0f64, |most, x| most.max(f64::from(x.abs())));
     if let Some(at) = state.position.planes().iter().position(|x| !x.is_finite()) {
@@ -48,7 +49,7 @@ pub fn write_spz(state: &Gaussians, path: &Path) -> Result<f64> {
     let unit = 0.5f64.powi(bits);
     let off = measured(state, unit)?;
     let file = File::create(path).map_err(Error::io("create", path))?;
-    // No time and no name: the same scene gives the same bytes.
+    // No time stamp and no name, so that the same scene gives the same bytes.
     let mut out = GzBuilder::new().write(BufWriter::new(file), Compression::best());
     let mut write = || -> std::io::Result<()> {
         for word in [MAGIC, VERSION, count] {
@@ -92,10 +93,10 @@ pub fn write_spz(state: &Gaussians, path: &Path) -> Result<f64> {
     Ok(off)
 }
 
-/// Measures what a file with positions in units of `unit` holds of `state`; returns the largest error of a position.
+/// Measures the errors of a file of `state` with positions in units of `unit`. Returns the largest error of a position.
 ///
 /// # Errors
-/// One that is beyond its bound.
+/// Fails if an error exceeds its bound.
 fn measured(state: &Gaussians, unit: f64) -> Result<f64> {
     let mut accuracy = Accuracy::new(&state.position);
     for row in 0..state.len() {
@@ -121,31 +122,36 @@ fn measured(state: &Gaussians, unit: f64) -> Result<f64> {
     Ok(accuracy.position())
 }
 
-/// A coordinate as 24 bits, in units of `unit`.
+/// Returns a coordinate as a 24-bit integer in units of `unit`.
 fn fixed(value: f64, unit: f64) -> i32 {
     (value / unit).round().clamp(-MOST, MOST) as i32
 }
 
+/// Returns the stored byte of an opacity logit.
 fn opacity_byte(logit: f32) -> u8 {
     byte(255.0 * opacity(logit))
 }
 
+/// Returns the stored byte of the SH coefficient of degree 0.
 fn color_byte(dc: f32) -> u8 {
     byte(255.0 * (0.15 * f64::from(dc) + 0.5))
 }
 
+/// Returns the stored byte of a log scale.
 fn scale_byte(log_scale: f32) -> u8 {
     byte(16.0 * (f64::from(log_scale) + 10.0))
 }
 
-/// Coefficient `k`, from 1, of a channel's harmonics: to the nearest of 5 bits in the first band, of 4 in the others.
+/// Returns the stored byte of SH coefficient `k` (from 1) of one channel, rounded to 5 bits in degree 1 and to 4 bits
+/// above.
 fn harmonic_byte(k: usize, value: f32) -> u8 {
     let step = if k < 4 { 8.0 } else { 16.0 };
     let nearest = ((128.0 * f64::from(value)).round() + 128.0 + step / 2.0) / step;
     byte(nearest.floor() * step)
 }
 
-/// A unit quaternion xyzw without its largest component, which is positive of it or of its negative.
+/// Encodes a unit quaternion xyzw without its largest component. q and −q are the same rotation; the sign is chosen so
+/// that the largest component is positive.
 fn smallest_three(q: [f64; 4]) -> u32 {
     let largest = (1..4).fold(0, |largest: usize, i| if q[i].abs() > q[largest].abs() { i } else { largest });
     let others = (0..4).filter(|&i| i != largest);
@@ -155,7 +161,7 @@ fn smallest_three(q: [f64; 4]) -> u32 {
     })
 }
 
-/// To the nearest of a byte's values; NaN is 0.
+/// Rounds to the nearest byte value, clamped to 0–255; NaN becomes 0.
 fn byte(value: f64) -> u8 {
     value.round() as u8
 }
@@ -171,10 +177,10 @@ mod tests {
     use crate::model::Columns;
     use crate::passes::gather_all;
 
-    /// Position, opacity, color, scales, rotation wxyz and harmonics of a Gaussian.
+    /// Position, opacity, color, scales, rotation wxyz and SH coefficients of a Gaussian.
     type Row = (Vec<f64>, f64, Vec<f64>, Vec<f64>, [f64; 4], Vec<f64>);
 
-    /// What bytes can hold of a state, read as the format says.
+    /// Reads a file independently of the writer, as the format specifies.
     fn read(path: &Path) -> Vec<Row> {
         let mut bytes = Vec::new();
         GzDecoder::new(File::open(path).unwrap()).read_to_end(&mut bytes).unwrap();
@@ -194,7 +200,7 @@ mod tests {
         (0..count)
             .map(|i| {
                 let place = of(0, 9, i).as_chunks::<3>().0;
-                // The highest byte has the sign.
+                // The highest byte holds the sign.
                 let place =
                     place.iter().map(|b| f64::from(i32::from_le_bytes([0, b[0], b[1], b[2]]) >> 8) / 2f64.powi(bits));
                 let mut bits_left = u32::from_le_bytes(of(4, 4, i).try_into().unwrap());
@@ -262,7 +268,7 @@ mod tests {
         assert!(write_spz(&state, &again).unwrap_err().to_string().contains("Gaussian 7"));
     }
 
-    /// A color seen from a direction is the same in both systems of axes: what turned signs are for.
+    /// Evaluates a color in a direction in both coordinate systems; the signs in [`TURNED`] must make both equal.
     #[test]
     fn harmonics_turn_with_the_axes() {
         let basis = |[x, y, z]: [f64; 3]| -> [f64; 15] {

@@ -1,28 +1,29 @@
-//! How many files a zip archive announces, before a reader makes room for them.
+//! Reader of the number of files that a zip archive declares, so that it can be checked before memory for them is
+//! allocated.
 
 use std::io::{Error, Read, Result, Seek, SeekFrom};
 
-/// Bytes of the record that ends an archive, without its comment.
+/// Length in bytes of the end record of an archive, without its comment.
 const END: u64 = 22;
-/// Most bytes of an archive's comment.
+/// Maximum length of an archive's comment in bytes.
 const MAX_COMMENT: u64 = 0xffff;
-/// Bytes of the record that says where the 64-bit numbers are, and of these.
+/// Length in bytes of the record that locates the 64-bit end record, and of that record itself.
 const LOCATOR: u64 = 20;
 const END_64: u64 = 56;
 
-/// What an archive says of its own list of files.
+/// Size that an archive declares for its list of files.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Announced {
     /// Number of files.
     pub(crate) entries: u64,
-    /// Bytes of the list, as far as to the end of the archive.
+    /// Number of bytes from the start of the list to the end of the archive.
     pub(crate) bytes: u64,
 }
 
-/// Reads the records at the end of the archive as the crate `zip` finds them.
+/// Reads the records at the end of the archive in the way of the crate `zip`.
 ///
 /// # Errors
-/// No such records; failed reads.
+/// Fails if there are no such records or reading fails.
 pub(crate) fn announced(file: &mut (impl Read + Seek)) -> Result<Announced> {
     let len = file.seek(SeekFrom::End(0))?;
     let missing = || Error::other("no list of files at its end");
@@ -39,7 +40,7 @@ pub(crate) fn announced(file: &mut (impl Read + Seek)) -> Result<Announced> {
     };
     let end_at = tail_at + end as u64;
     let comment = number(&tail, end + 20, 2);
-    // Where the reader looks for the 64-bit records: by the length of the comment.
+    // The crate finds the 64-bit records from the length of the comment.
     let locator = (len - tail_at).checked_sub(LOCATOR + END + comment).map(|at| &tail[at as usize..]);
     let Some(locator) = locator.filter(|bytes| bytes.starts_with(b"PK\x06\x07")) else {
         let bytes = number(&tail, end + 12, 4) + len - end_at;
@@ -52,7 +53,7 @@ pub(crate) fn announced(file: &mut (impl Read + Seek)) -> Result<Announced> {
     let mut record = [0; END_64 as usize];
     file.seek(SeekFrom::Start(at))?;
     file.read_exact(&mut record)?;
-    // Anywhere else the reader would search the whole file for it.
+    // Without a record at this offset the crate would search the whole file for it.
     if !record.starts_with(b"PK\x06\x06") {
         return Err(missing());
     }
@@ -79,7 +80,7 @@ mod tests {
         writer.set_comment("a comment");
         let bytes = writer.finish().unwrap().into_inner();
         let found = announced(&mut Cursor::new(&bytes)).unwrap();
-        // Three records of 46 bytes and a name, the record at the end and the comment.
+        // Three records of 46 bytes plus names, the end record and the comment.
         assert_eq!(found, Announced { entries: 3, bytes: 3 * 46 + 7 + 22 + 9 });
         for length in 0..bytes.len() - 9 - 22 {
             assert!(announced(&mut Cursor::new(&bytes[..length])).is_err(), "{length}");

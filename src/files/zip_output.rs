@@ -1,32 +1,33 @@
-//! A place for a zip archive to be written to that tells of a failed write once, at its end.
+//! Output of a zip writer that reports a failed write once, when it is closed.
 
 use std::io::{self, Seek, SeekFrom, Write};
 
-/// What a zip archive is written into. A writer of archives that is dropped after a failed write writes its directory all
-/// the same and prints what that meets; so after a failure everything is taken, and none of it written.
+/// Output for a zip writer. After a failed write it accepts and discards all further bytes. A zip writer that is
+/// dropped after an error writes its directory nevertheless, and prints the error it gets for that; with this output it
+/// gets none.
 pub(crate) struct ZipOutput<W> {
     inner: W,
     failed: Option<io::Error>,
-    /// Where the next byte would go.
+    /// Offset of the next byte.
     at: u64,
 }
 
 impl<W: Write + Seek> ZipOutput<W> {
-    /// Into `inner`, from its beginning.
+    /// Wraps `inner`, which must be at its start.
     pub(crate) fn new(inner: W) -> Self {
         ZipOutput { inner, failed: None, at: 0 }
     }
 
-    /// Ends writing.
+    /// Flushes the output.
     ///
     /// # Errors
-    /// The first write that failed.
+    /// Fails with the error of the first write that failed.
     pub(crate) fn close(mut self) -> io::Result<()> {
         self.flush()?;
         self.failed.map_or(Ok(()), Err)
     }
 
-    /// What `done` gives, or in its place `instead` once a write has failed.
+    /// Returns the result of `done`. Returns `instead` if an earlier operation failed or `done` fails.
     fn or<T>(&mut self, instead: T, done: impl FnOnce(&mut W) -> io::Result<T>) -> T {
         if self.failed.is_some() {
             return instead;

@@ -1,4 +1,4 @@
-//! Kinds of outputs, what may be replaced, and what lies at an output path.
+//! Kinds of outputs, the policy for replacing existing files, and the check of an output path.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -11,9 +11,9 @@ use crate::error::{Error, Result, ShowPath};
 /// Kind of an output.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
-    /// One file.
+    /// A single file.
     File,
-    /// A folder with everything in it.
+    /// A folder with all its content.
     Folder,
 }
 
@@ -23,18 +23,18 @@ pub enum Replace {
     /// Nothing is replaced.
     #[default]
     Never,
-    /// Results of this program are replaced. In a result's folder these are the files that its summary lists; every
-    /// other file stays where it is, or gets `.kept` behind its name where the new result has a file of that name. A
-    /// single file is known as a result if it is a container or if a summary beside it lists it.
+    /// Results of this program are replaced. In the folder of a result, only the files listed in its summary are
+    /// replaced. Any other file stays where it is, or gets `.kept` appended to its name if the new result has a file of
+    /// that name. A single file counts as a result if it is a container or if a summary beside it lists it.
     Ours,
-    /// Any file or folder is replaced, a folder with everything in it.
+    /// Any file or folder is replaced; a folder with all its content.
     Any,
 }
 
-/// What lies at an output path.
+/// Kind of entry found at an output path.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Destination {
-    /// Nothing.
+    /// No entry.
     Free,
     /// A regular file or a link to one.
     File,
@@ -46,11 +46,11 @@ pub(super) enum Destination {
     Stream,
 }
 
-/// Finds out what lies at `target`.
+/// Returns the kind of entry at `target`.
 ///
 /// # Errors
-/// Sockets, block devices, links to nothing, and links that lead through a system folder to a regular file, as
-/// [`Error::Usage`]: these are neither written nor replaced.
+/// Fails with [`Error::Usage`] for sockets, block devices, dangling links, and links that lead through a system folder
+/// to a regular file: these are neither written nor replaced.
 pub(super) fn destination(target: &Path) -> Result<Destination> {
     let refuse = |what: &str| Err(Error::usage(format!("{} is {what}; give another output", target.shown())));
     let Ok(named) = fs::symlink_metadata(target) else { return Ok(Destination::Free) };
@@ -62,7 +62,7 @@ pub(super) fn destination(target: &Path) -> Result<Destination> {
     };
     match FileKind::from_type(found) {
         FileKind::CharacterDevice | FileKind::Fifo => Ok(Destination::Stream),
-        // Standard output that is redirected to a file: replacing the link would replace a file of the system.
+        // Standard output redirected to a file: replacing the link would replace a link of the system.
         FileKind::File if is_link && leads_through_system_link(target) => {
             refuse("a link of the system, which is not replaced")
         }
@@ -74,7 +74,7 @@ pub(super) fn destination(target: &Path) -> Result<Destination> {
     }
 }
 
-/// Whether `target` or a link that it leads to lies in a folder of the system, as `/dev/stdout` does.
+/// Returns whether `target`, or a link it leads to, lies in a system folder, as `/dev/stdout` does.
 fn leads_through_system_link(target: &Path) -> bool {
     let mut link = target.to_owned();
     // Linux follows at most 40 links.
@@ -90,10 +90,10 @@ fn leads_through_system_link(target: &Path) -> bool {
     false
 }
 
-/// Confirms that the entry at `target`, if there is one, may be replaced by an output of `kind`.
+/// Checks that the entry at `target`, if there is one, may be replaced by an output of `kind`.
 ///
 /// # Errors
-/// As [`Error::Usage`]: an entry of another kind, or one that `replace` does not allow to replace.
+/// Fails with [`Error::Usage`] if the entry has another kind or `replace` does not allow to replace it.
 pub(super) fn check_replace(target: &Path, kind: Kind, replace: Replace) -> Result<()> {
     let shown = target.shown();
     let found = destination(target)?;
@@ -124,7 +124,7 @@ pub(super) fn check_replace(target: &Path, kind: Kind, replace: Replace) -> Resu
     }
 }
 
-/// Confirms that the folder at `target` is a result of this program that lists its files.
+/// Checks that the folder at `target` is a result of this program with a list of its files.
 fn check_folder(target: &Path) -> Result<()> {
     let shown = target.shown();
     match Owner::read(&target.join(MARKER)) {
@@ -136,7 +136,7 @@ fn check_folder(target: &Path) -> Result<()> {
     }
 }
 
-/// Whether `target` is an empty folder and not a link to one.
+/// Returns whether `target` is an empty folder and not a link to one.
 fn is_empty_folder(target: &Path) -> bool {
     fs::symlink_metadata(target).is_ok_and(|found| found.is_dir())
         && entries(target).is_ok_and(|entries| entries.is_empty())
@@ -145,7 +145,7 @@ fn is_empty_folder(target: &Path) -> bool {
 /// Returns the real path of the folder that `target` is written into.
 ///
 /// # Errors
-/// As [`Error::Usage`]: a target without a name, a folder that does not exist, a parent that is no folder.
+/// Fails with [`Error::Usage`] if the target has no name, or if its folder does not exist or is not a folder.
 pub(super) fn real_parent(target: &Path) -> Result<PathBuf> {
     let (parent, _) = parts(target)?;
     let real = fs::canonicalize(&parent).map_err(|_| {

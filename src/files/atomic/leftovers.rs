@@ -1,4 +1,5 @@
-//! Workspaces of runs that were killed: interrupted publications are completed or taken back, the rest is removed.
+//! Cleanup of workspaces of killed runs: interrupted publications are completed or reverted, everything else is
+//! removed.
 
 use std::ffi::{OsStr, OsString};
 use std::io::{self, Read as _};
@@ -17,25 +18,25 @@ use super::workspace::{
 };
 use crate::error::{Error, Result, ShowPath};
 
-/// Longest wait for another run that is publishing its result under the same name, which takes it milliseconds.
+/// Maximum time to wait for another run that publishes a result under the same name, which takes milliseconds.
 const LONGEST_WAIT: Duration = Duration::from_secs(60);
-/// Longest wait for another run to stop looking at an unfinished workspace, which takes it microseconds.
+/// Maximum time to wait until another run has finished inspecting an unfinished workspace, which takes microseconds.
 const LONGEST_LOOK: Duration = Duration::from_secs(5);
-/// Bytes of the largest journal that is read.
+/// Maximum length of a journal in bytes.
 const MAX_JOURNAL: u64 = 1 << 20;
 
-/// Lock that a run holds while it publishes a result under one name, or repairs an interrupted publication of it.
+/// Lock of a run while it publishes a result under one name or repairs an interrupted publication of it.
 ///
-/// The lock is a workspace with a fixed name, so the rules for leftovers of killed runs hold for it as well.
+/// The lock is a workspace with a fixed name, so a lock left by a killed run is removed like any other leftover.
 pub(super) struct PublishLock {
     _workspace: Workspace,
 }
 
 impl PublishLock {
-    /// Waits until no other run publishes under the name of `target`.
+    /// Waits until no other run publishes under the name of `target`, then takes the lock.
     ///
     /// # Errors
-    /// Another run or a foreign folder that has the name of the lock for a minute; the system refuses.
+    /// Fails if another run or a foreign folder has the name of the lock for a minute, or if a system call fails.
     pub(super) fn acquire(target: &Path) -> Result<PublishLock> {
         let (parent, name) = parts(target)?;
         let name = publishing_name(name);
@@ -66,17 +67,17 @@ impl PublishLock {
     }
 }
 
-/// Files of a result that are published together, in this order.
+/// List of files of a result that are published together, in this order.
 #[derive(Debug, Serialize, Deserialize)]
 pub(super) struct Journal {
     pub(super) replace: Replace,
-    /// Name of each file in the workspace, and its name beside it.
+    /// Name of each file in the workspace, and its final name beside the workspace.
     pub(super) files: Vec<(String, OsString)>,
 }
 
-/// Repairs and removes what killed runs left beside `target` of outputs with this name and of scratch files.
+/// Repairs and removes leftovers of killed runs beside `target`: outputs with this name and scratch files.
 ///
-/// Never fails: what cannot be repaired stays, with a warning.
+/// Never fails; leftovers that cannot be repaired stay and cause a warning.
 pub(super) fn tidy(target: &Path) {
     let Ok((path, name)) = parts(target) else { return };
     let Ok(parent) = FolderHandle::open(&path) else { return };
@@ -89,7 +90,7 @@ pub(super) fn tidy(target: &Path) {
         }
     }
     for entry in left(name).into_iter().chain(left(SCRATCH.as_ref())) {
-        // A workspace that became unfinished meanwhile is left to the next run.
+        // Leave a workspace that became unfinished meanwhile to the next run.
         if let Ok(leftover) = Leftover::take(&parent, entry)
             && !is_unfinished(&leftover.folder)
         {
@@ -98,7 +99,7 @@ pub(super) fn tidy(target: &Path) {
     }
 }
 
-/// Removes what killed runs left in `folder` of files whose names end with `ending`.
+/// Removes leftovers of killed runs in `folder` whose target names end with `ending`.
 pub fn remove_leftovers(folder: &Path, ending: &str) {
     let Ok(parent) = FolderHandle::open(folder) else { return };
     for entry in parent.entries().unwrap_or_default() {
@@ -112,8 +113,8 @@ pub fn remove_leftovers(folder: &Path, ending: &str) {
 
 /// Repairs interrupted publications under the name of `target`. The caller holds the [`PublishLock`].
 ///
-/// A publication that cannot be completed is discarded if the caller publishes a result that `supersedes` it: a later run
-/// must not complete it over that result.
+/// `supersedes`: the caller is about to publish a result. A publication that cannot be completed is then discarded, so
+/// that no later run completes it over that result.
 pub(super) fn repair(target: &Path, supersedes: bool) {
     let Ok((path, name)) = parts(target) else { return };
     let Ok(parent) = FolderHandle::open(&path) else { return };
@@ -129,8 +130,9 @@ pub(super) fn repair(target: &Path, supersedes: bool) {
     }
 }
 
-/// Takes an unfinished workspace while this run holds the [`PublishLock`]. No run that goes on has one then, except after
-/// a failure and just before its end, so a lock on it is another run looking at it for a moment.
+/// Takes an unfinished workspace while this run holds the [`PublishLock`]. A running process has an unfinished
+/// workspace then only after a failure, just before it ends. A lock on the workspace otherwise means that another run
+/// is inspecting it for a moment, so this waits.
 fn take_unfinished(parent: &FolderHandle, name: &OsStr) -> Option<Leftover> {
     let start = Instant::now();
     loop {
@@ -142,11 +144,11 @@ fn take_unfinished(parent: &FolderHandle, name: &OsStr) -> Option<Leftover> {
     }
 }
 
-/// Brings an interrupted publication to its end. The caller holds the [`PublishLock`].
+/// Completes or reverts an interrupted publication. The caller holds the [`PublishLock`].
 ///
-/// Files of a journal get their names. An earlier folder gets its name back if no other entry has it; otherwise entries
-/// that its summary does not list are moved into the new folder. If that is refused, for example because a folder belongs
-/// to another user, the earlier folder is kept beside the result under a visible name.
+/// Files of a journal get their final names. An earlier folder gets its name back if no other entry has it. Otherwise
+/// its entries that its summary does not list are moved into the new folder. If that fails, for example because a
+/// folder belongs to another user, the earlier folder is kept beside the result under a visible name.
 pub(super) fn settle(folder: &FolderHandle, parent: &FolderHandle, target: &Path) -> Result<()> {
     let (_, name) = parts(target)?;
     if folder.has(JOURNAL) {
@@ -157,7 +159,7 @@ pub(super) fn settle(folder: &FolderHandle, parent: &FolderHandle, target: &Path
             folder.rename(aside, parent, name).map_err(Error::io("put back", target))?;
         }
     }
-    // In one step: a part of an earlier result must not be taken for a result.
+    // Rename in one step: a partly deleted earlier result must not be mistaken for a result.
     let discard =
         |aside| folder.rename(aside, folder, DISCARDED).map_err(Error::io("discard the earlier folder of", target));
     if folder.has(REPLACED_WHOLE) {
@@ -190,7 +192,7 @@ pub(super) fn settle(folder: &FolderHandle, parent: &FolderHandle, target: &Path
     Ok(())
 }
 
-/// Gives the remaining files of a journal their names.
+/// Gives the remaining files of the journal their final names.
 fn complete(folder: &FolderHandle, parent: &FolderHandle, target: &Path) -> Result<()> {
     let failed = |error| Error::io("complete the interrupted output of", target)(error);
     let (_, name) = parts(target)?;

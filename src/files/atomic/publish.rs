@@ -1,4 +1,4 @@
-//! Publication: finished outputs get their names, one run at a time for each name.
+//! Publication of finished outputs under their names, by one run at a time for each name.
 
 use std::ffi::OsString;
 use std::fs;
@@ -13,14 +13,14 @@ use super::warnings::warn;
 use super::workspace::{JOURNAL, REPLACED, REPLACED_WHOLE, Workspace, live};
 use crate::error::{Error, Result, ShowPath};
 
-/// Gives files in `workspace` the names beside it that go with them, in order; the last one is the output itself, the others
-/// are its companions. The files have been written through to the disk.
+/// Renames files from `workspace` to their targets, in order. The last one is the output itself, the others are its
+/// companions. The files must have been synced to disk.
 ///
-/// A journal says which files belong together: after a kill or a failure in between the next run with this output
-/// completes the set.
+/// For more than one file, a journal records which files belong together: if the process is killed or fails in between,
+/// the next run with this output completes the set.
 ///
 /// # Errors
-/// An entry that appeared meanwhile and that `replace` does not allow to replace; the system refuses.
+/// Fails if a file that `replace` does not allow to replace appeared meanwhile, or if a system call fails.
 pub(super) fn publish_files(workspace: &Workspace, files: &[(String, &Path)], replace: Replace) -> Result<()> {
     let Some((_, target)) = files.last() else { return Ok(()) };
     let lock = PublishLock::acquire(target)?;
@@ -47,11 +47,12 @@ pub(super) fn publish_files(workspace: &Workspace, files: &[(String, &Path)], re
     Ok(())
 }
 
+/// Writes and syncs the journal of the files in `workspace`.
 fn write_journal(workspace: &Workspace, files: &[(String, &Path)], replace: Replace) -> Result<()> {
     let names = files.iter().map(|(content, target)| Ok((content.clone(), parts(target)?.1.to_owned())));
     let journal = Journal { replace, files: names.collect::<Result<Vec<(String, OsString)>>>()? };
     let text = serde_json::to_vec(&journal).expect("plain data");
-    // Under another name until it is complete.
+    // Write under another name until it is complete.
     let (begun, path) = (workspace.folder.join("journal-begun"), workspace.folder.join(JOURNAL));
     let written = fs::write(&begun, text).and_then(|()| sync_file(&begun));
     let written = written.and_then(|()| fs::rename(&begun, &path)).and_then(|()| workspace.sync());
@@ -61,13 +62,14 @@ fn write_journal(workspace: &Workspace, files: &[(String, &Path)], replace: Repl
     })
 }
 
-/// Gives the folder in `workspace` the name `target`, in place of an earlier folder if there is one.
+/// Renames the folder in `workspace` to `target`, replacing an earlier folder if there is one.
 ///
-/// After a kill in between, the next run with this output puts the earlier folder back or moves what follows the name.
+/// If the process is killed in between, the next run with this output either puts the earlier folder back or completes
+/// the replacement.
 ///
 /// # Errors
-/// An entry that appeared meanwhile and that `replace` does not allow to replace; the system refuses. The target is then
-/// as it was. A failure after the folder has its name is a warning.
+/// Fails if an entry that `replace` does not allow to replace appeared meanwhile, or if a system call fails. The target
+/// is then unchanged. A failure after the rename is only a warning.
 pub(super) fn publish_folder(workspace: &Workspace, target: &Path, replace: Replace) -> Result<()> {
     let lock = PublishLock::acquire(target)?;
     repair(target, true);
@@ -99,7 +101,7 @@ pub(super) fn publish_folder(workspace: &Workspace, target: &Path, replace: Repl
     Ok(())
 }
 
-/// Writes the name of a published output through to the disk. A failure is a warning: the output is in place.
+/// Syncs the name of a published output to disk. A failure is only a warning, because the output is in place.
 fn sync_parent(target: &Path) {
     let Ok((parent, _)) = parts(target) else { return };
     if let Err(error) = sync_folder(&parent) {

@@ -105,7 +105,7 @@ fn the_input_what_holds_it_and_what_lies_in_it_are_never_a_target() {
         assert!(refusal(&detour, Kind::Folder, &[&model], replace).contains("input itself"));
         assert!(refusal(&model.join("smaller"), Kind::Folder, &[&model], replace).contains("lies inside the input"));
     }
-    // A name that merely starts like the input's is another one.
+    // A name that only starts like the input's is another path.
     check_target(&base.path().join("scenes/model2"), Kind::Folder, &[&model], Replace::Never).unwrap();
 }
 
@@ -164,7 +164,7 @@ fn impossible_targets_are_refused() {
     }
 }
 
-/// What a run leaves beside `base/out` that is killed: its folder, and the file whose lock it held.
+/// Creates the workspace that a killed run leaves beside `base/out`: its folder and an unlocked lock file.
 fn left_behind(base: &Path, random: &str) -> PathBuf {
     let folder = base.join(format!(".out.{random}.splatsieve-tmp"));
     put(&folder.join("lock"), workspace::LOCK_LINE);
@@ -178,13 +178,12 @@ fn leftovers_of_killed_runs_go_and_those_of_running_ones_stay() {
     put(&left_behind(base.path(), "dead1").join("content/deep/part"), "half");
     put(&left_behind(base.path(), "dead2").join("content"), "half");
     fs::create_dir(base.path().join(".out.begun.splatsieve-tmp")).unwrap();
-    // A run of which this process knows nothing but its lock, as of one in another container.
+    // A run known to this process only by its lock, like one in another container.
     let runs = left_behind(base.path(), "alive");
     let lock = File::open(runs.join("lock")).unwrap();
     lock.lock().unwrap();
     put(&runs.join("content"), "half");
-    // Somebody else's, whatever they are called.
-    // A folder without the line in its lock is foreign.
+    // Folders of other targets or with other names, and folders without the line in their lock file, are foreign.
     let kept = [
         ".other.dead1.splatsieve-tmp/lock",
         ".out.a.b.splatsieve-tmp/lock",
@@ -221,7 +220,7 @@ fn a_run_killed_between_its_renames_does_not_lose_the_old_output() {
 fn a_workspace_whose_lock_is_still_empty_is_removed() {
     let base = tempfile::tempdir().unwrap();
     let target = base.path().join("out");
-    // As a run leaves it that is killed between creating the lock file and writing its line.
+    // State left by a run that is killed between creating the lock file and writing its line.
     let workspace = Workspace::beside(&target).unwrap();
     File::create(workspace.folder.join("lock")).unwrap();
     let begun = base.path().join(".out.killed.splatsieve-tmp");
@@ -307,7 +306,7 @@ fn a_summary_lists_its_files_and_keeps_its_order() {
     assert_eq!(names(base.path()), ["out"]);
 }
 
-/// Prepares `x.ply` and its two companions in `base`, with `text` in each.
+/// Stages `x.ply` and its two companions in `base`, with `text` in each.
 fn stage_set(base: &Path, text: &str, replace: Replace) -> Result<StagedFiles> {
     let companions = ["x.ply.summary.json", "x.ply.recipe.toml"].map(|name| base.join(name)).to_vec();
     let staged = StagedFiles::new(&base.join("x.ply"), companions, replace)?;
@@ -336,7 +335,7 @@ fn files_side_by_side_are_known_by_the_summary_that_lists_them() {
     drop(stage_set(base.path(), "", Replace::Ours));
 }
 
-/// What a run leaves in `base` that is killed after it published `published` of its companions.
+/// Creates the state left in `base` by a run that is killed after it published the first `published` files.
 fn leave_half_published(base: &Path, published: usize, replace: Replace) {
     let left = base.join(".x.ply.dead.splatsieve-tmp");
     put(&left.join("lock"), workspace::LOCK_LINE);
