@@ -26,7 +26,7 @@ impl FloatSketch {
     /// Counts `values` with the default number of mantissa bits. NaN and infinities are ignored. −0 counts as 0, and a
     /// finite value beyond the range of f32 as the largest f32 of its sign.
     pub fn from_values(values: impl IntoIterator<Item = f64>) -> Self {
-        Self::keyed_by(MANTISSA_BITS, values)
+        Self::with_mantissa_bits(MANTISSA_BITS, values)
     }
 
     /// Counts `values` with keys of `bits` mantissa bits, at most [`MOST_BITS`]. There are 2^(9 + bits) counts of 4
@@ -136,7 +136,7 @@ mod tests {
             values in prop::collection::vec(-1e6..1e6f64, 1..300), p in 0u32..=100, bits in 1u32..=MOST_BITS
         ) {
             let exact = sorted_percentile(&values, p).unwrap();
-            let rough = FloatSketch::keyed_by(bits, values.iter().copied()).rough_percentile(f64::from(p)).unwrap();
+            let rough = FloatSketch::with_mantissa_bits(bits, values.iter().copied()).rough_percentile(f64::from(p)).unwrap();
             // Half of a bucket [m, m + 1)·2^(e − bits) is at most 2^−bits / 2 of its least value, except for
             // subnormals.
             prop_assert!((rough - exact).abs() <= 0.51 * exact.abs().max(1e-37) * 0.5f64.powi(bits as i32));
