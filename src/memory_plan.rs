@@ -18,7 +18,7 @@ use crate::model::{Camera, Columns, Rig, Schedule, SequenceInfo};
 use crate::models::MemoryProfile;
 use crate::models::trajectories::state_bytes;
 use crate::outputs::container::{FRAME_BLOCK, GAUSSIAN_BLOCK};
-use crate::passes::{BLOCK, PICTURES_PER_THREAD};
+use crate::passes::{BLOCK, VIEWS_PER_THREAD};
 use crate::progress::{Events, Message, duration};
 use crate::render;
 
@@ -197,7 +197,7 @@ impl Workload {
     /// the making with `sums` bytes per Gaussian. Per Gaussian, and however many there are.
     pub fn looking(&self, limits: &Limits, of: Columns, sums: u64) -> (Vec<MemoryPart>, Vec<MemoryPart>) {
         let pictures = self.threads.min(limits.pictures_together as u64);
-        let ready = PICTURES_PER_THREAD as u64 * self.threads;
+        let ready = VIEWS_PER_THREAD as u64 * self.threads;
         let per_gaussian = vec![
             ("states", ready.min(limits.frames_together as u64) * self.state(of)),
             ("readers", self.input.reader),
@@ -414,7 +414,7 @@ impl Plan {
     ) -> Plan {
         let mut limits = Limits {
             frames_held: FRAME_BLOCK,
-            frames_together: PICTURES_PER_THREAD * work.threads as usize,
+            frames_together: VIEWS_PER_THREAD * work.threads as usize,
             pictures_together: work.threads as usize,
             gaussians_together: work.gaussians.max(GAUSSIAN_BLOCK as u64) as usize,
             pairs_together: 8 * work.gaussians.max(1) as usize,
