@@ -12,7 +12,7 @@
 //! program prints the table). "By frame" and "by track" is the order of the residuals; the third and fourth columns
 //! store residuals of moving tracks only; the last one also halves the step of static tracks where that is smaller:
 //!
-//! | column | all tracks, by frame | all tracks, by track | moving tracks, by frame | moving tracks, by track | half step for static tracks where smaller |
+//! | column | all, by frame | all, by track | moving, by frame | moving, by track | half step where smaller |
 //! |---|---|---|---|---|---|
 //! | position | 14–20 | 18–22 | 14–20 | 18–22 | 18–23 |
 //! | rotation | 43–63 | 44–67 | 44–76 | 45–77 | 50–103 |
@@ -111,7 +111,7 @@ struct Multiples {
 }
 
 impl Multiples {
-    /// Quantizes `values`. BoundedTracks are static if one multiple of the step, halved `halvings` times (0 or 1), fits all
+    /// Quantizes `values`. Tracks are static if one multiple of the step, halved `halvings` times (0 or 1), fits all
     /// their values.
     fn new(values: &[f32], plane: usize, max_error: f64, step: f64, halvings: u32) -> Multiples {
         let resting_step = static_step(step, halvings);

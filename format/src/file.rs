@@ -57,8 +57,8 @@ impl MappedFile {
         self.map.len() as u64
     }
 
-    /// Reads `out.len()` bytes at byte `offset` with a system call. Does not use the memory map: if another process shortens
-    /// the file, this returns an error, whereas touching a mapped page would end the process.
+    /// Reads `out.len()` bytes at byte `offset` with a system call. Does not use the memory map: if another process
+    /// shortens the file, this returns an error, whereas touching a mapped page would end the process.
     pub(crate) fn read_at(&self, offset: u64, out: &mut [u8]) -> Result<()> {
         splat_platform::read_exact_at(&self.file, out, offset).map_err(|error| match error.kind() {
             io::ErrorKind::UnexpectedEof => self.too_short(offset, out.len() as u64),
@@ -66,8 +66,8 @@ impl MappedFile {
         })
     }
 
-    /// Calls `each` with the offset and the bytes of successive chunks of `range`. Every chunk has [`CHUNK_BYTES`] bytes
-    /// except the last one, which may be shorter.
+    /// Calls `each` with the offset and the bytes of successive chunks of `range`. Every chunk has [`CHUNK_BYTES`]
+    /// bytes except the last one, which may be shorter.
     pub(crate) fn read_chunks(
         &self,
         range: std::ops::Range<u64>,

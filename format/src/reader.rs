@@ -482,8 +482,8 @@ fn check_payload(tile: &TileRecord, computed: u64) -> std::result::Result<(), Fa
     Err(Fault::new(tile.offset, expected, format!("{computed:016x}")))
 }
 
-/// Checks the footer at `offset` against the header, and its payload length against `payload_bytes`, the bytes before the
-/// trailer.
+/// Checks the footer at `offset` against the header, and its payload length against `payload_bytes`, the bytes before
+/// the trailer.
 fn check_footer(
     footer: &FooterRecord,
     layout: &Layout,
