@@ -73,7 +73,7 @@ impl PlyLayout {
 
 /// Returns the name of a property after the SH degree has been reduced from `from` to `to`; `None` if the property is
 /// removed.
-pub(crate) fn name_at_sh_degree(name: &str, from: usize, to: usize) -> Option<String> {
+pub(crate) fn name_without_bands(name: &str, from: usize, to: usize) -> Option<String> {
     let [old_count, new_count] = [from, to.min(from)].map(|degree| sh_coefficients(degree) - 1);
     let Some(number) = name.strip_prefix("f_rest_").and_then(|number| number.parse::<usize>().ok()) else {
         return Some(name.to_owned());

@@ -24,7 +24,7 @@ use header::Element;
 pub(crate) use header::PlyHeader;
 pub use header::{PlyEncoding, Property, Scalar};
 pub use layout::THIN_LOG_SCALE;
-pub(crate) use layout::{PlaneSource, PlyLayout, name_at_sh_degree};
+pub(crate) use layout::{PlaneSource, PlyLayout, name_without_bands};
 
 use super::map::FileMap;
 use super::open::open_file;

@@ -11,7 +11,7 @@ use std::path::Path;
 use crate::compressed_model::{CompressedModel, ParamDelta};
 use crate::error::{Error, Result, ShowPath};
 use crate::files::ply::{
-    PlaneSource, Ply, PlyEncoding, PlyHeader, PlyLayout, Property, Scalar, name_at_sh_degree, read_plane,
+    PlaneSource, Ply, PlyEncoding, PlyHeader, PlyLayout, Property, Scalar, name_without_bands, read_plane,
 };
 use crate::model::{Columns, Gaussians, HIGHEST_DEGREE, sh_coefficients};
 
@@ -56,7 +56,7 @@ pub fn write_like(
     path: &Path,
 ) -> Result<()> {
     check_rows(template, rows, proxies, change)?;
-    let name = |name: &str| name_at_sh_degree(name, template.sh_degree(), sh_degree);
+    let name = |name: &str| name_without_bands(name, template.sh_degree(), sh_degree);
     let big_endian = template.header().encoding == PlyEncoding::BigEndian;
     let sources: Vec<u32> = rows.iter().map(|row| row.source).collect();
     write_rows_like(template, &sources, name, path, |place, bytes| {
