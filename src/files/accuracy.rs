@@ -18,17 +18,17 @@ use crate::error::{Error, Result};
 use crate::model::{Column, Gaussians, color, opacity};
 
 /// Maximum error of a position, as a fraction of the median of the Gaussian's three scales.
-const OF_SCALE: f64 = 0.5;
+const MAX_POSITION_ERROR_IN_SCALES: f64 = 0.5;
 /// Maximum error of positions and scales, as a fraction of the scene size.
-const OF_SCENE: f64 = 0.01;
+const MAX_ERROR_IN_SCENE_SIZES: f64 = 0.01;
 /// Maximum error of a scale, as a fraction of its value.
-const OF_ITSELF: f64 = 0.1;
+const MAX_RELATIVE_SCALE_ERROR: f64 = 0.1;
 /// Maximum error of opacities and base colors, which are in [0, 1].
-const OF_ONE: f64 = 0.02;
+const MAX_COLOR_ERROR: f64 = 0.02;
 /// Maximum error of SH coefficients above degree 0; their sum is a color.
-const OF_HARMONIC: f64 = 1.0;
+const MAX_SH_ERROR: f64 = 1.0;
 /// Opacity below which a Gaussian is not drawn.
-const UNSEEN: f64 = 1.0 / 255.0;
+const MIN_OPACITY: f64 = 1.0 / 255.0;
 
 /// Attributes of one Gaussian as a renderer uses them.
 #[derive(Debug, Clone, Copy)]
@@ -100,39 +100,46 @@ impl Accuracy {
     }
 
     /// Returns the largest error of a position so far, in scene units.
-    pub fn position(&self) -> f64 {
+    pub fn position_error(&self) -> f64 {
         self.position
     }
 
     /// Adds Gaussian `id` with its original attributes `wanted` and its stored ones `found`.
     pub fn add(&mut self, id: usize, wanted: &Drawn, found: &Drawn) {
-        if wanted.opacity < UNSEEN && found.opacity < UNSEEN {
+        if wanted.opacity < MIN_OPACITY && found.opacity < MIN_OPACITY {
             return;
         }
-        let room = OF_SCENE * self.scene;
+        let scene_bound = MAX_ERROR_IN_SCENE_SIZES * self.scene;
         let largest = |errors: [f64; 3]| {
             errors.into_iter().fold(0.0, |most: f64, x| if x > most || x.is_nan() { x } else { most })
         };
-        let apart = |a: [f64; 3], b: [f64; 3]| largest([0, 1, 2].map(|k| (a[k] - b[k]).abs()));
-        let of_position = apart(wanted.position, found.position);
-        self.position = largest([self.position, of_position, 0.0]);
+        let max_difference = |a: [f64; 3], b: [f64; 3]| largest([0, 1, 2].map(|k| (a[k] - b[k]).abs()));
+        let position_error = max_difference(wanted.position, found.position);
+        self.position = largest([self.position, position_error, 0.0]);
         let scales = [0, 1, 2].map(|k| (wanted.scale[k], (wanted.scale[k] - found.scale[k]).abs()));
         // Screens show colors clamped to [0, 1].
-        let [before, after] = [wanted, found].map(|of| of.color.map(|c| c.clamp(0.0, 1.0)));
-        self.judge(id, "position", of_position, room.max(OF_SCALE * wanted.middle_scale()));
-        scales.into_iter().for_each(|(scale, error)| self.judge(id, "scale", error, room.max(OF_ITSELF * scale)));
-        self.judge(id, "opacity", (wanted.opacity - found.opacity).abs(), OF_ONE);
-        self.judge(id, "color", apart(before, after), OF_ONE);
+        let [before, after] = [wanted, found].map(|drawn| drawn.color.map(|c| c.clamp(0.0, 1.0)));
+        self.check_error(
+            id,
+            "position",
+            position_error,
+            scene_bound.max(MAX_POSITION_ERROR_IN_SCALES * wanted.middle_scale()),
+        );
+        scales.into_iter().for_each(|(scale, error)| {
+            self.check_error(id, "scale", error, scene_bound.max(MAX_RELATIVE_SCALE_ERROR * scale))
+        });
+        self.check_error(id, "opacity", (wanted.opacity - found.opacity).abs(), MAX_COLOR_ERROR);
+        self.check_error(id, "color", max_difference(before, after), MAX_COLOR_ERROR);
     }
 
     /// Adds the error of one SH coefficient above degree 0 of Gaussian `id`.
-    pub fn add_harmonic(&mut self, id: usize, error: f64) {
-        self.judge(id, "harmonics", error, OF_HARMONIC);
+    pub fn add_sh(&mut self, id: usize, error: f64) {
+        self.check_error(id, "SH coefficient", error, MAX_SH_ERROR);
     }
 
     /// Compares an error with its bound and keeps it if it exceeds the bound by the largest factor so far.
-    fn judge(&mut self, id: usize, quantity: &'static str, error: f64, bound: f64) {
-        let excess = |of: &Excess| if of.error.is_nan() { f64::INFINITY } else { of.error / of.bound };
+    fn check_error(&mut self, id: usize, quantity: &'static str, error: f64, bound: f64) {
+        let excess = |e: &Excess| if e.error.is_nan() { f64::INFINITY } else { e.error / e.bound };
         let now = Excess { id, quantity, error, bound };
         // Written as "not within" because NaN counts as beyond every bound.
         let is_within = error <= bound;
@@ -156,7 +163,7 @@ impl Accuracy {
             _ => "\n  drop it (compress --drop-ids), or write a .ply or .gseq".to_owned(),
         };
         Err(Error::usage(format!(
-            "{kind} cannot hold the {quantity} of Gaussian {id} of what is written: expected an error of at most \
+            "{kind} cannot store the {quantity} of Gaussian {id} of the output accurately: expected an error of at most \
              {bound:.2e}{unit}, found {error:.2e}{why}"
         )))
     }
@@ -188,11 +195,11 @@ mod tests {
     }
 
     #[test]
-    fn one_that_is_far_away_does_not_widen_the_bound() {
+    fn far_gaussian_does_not_widen_the_bound() {
         let mut found = accuracy();
         found.add(1, &drawn(2.0, 1e-3), &drawn(2.019, 1e-3));
         found.check("a file").unwrap();
-        assert!((found.position() - 0.019).abs() < 1e-12);
+        assert!((found.position_error() - 0.019).abs() < 1e-12);
         found.add(2, &drawn(4.0, 1e-3), &drawn(4.5, 1e-3));
         let message = found.check("a file").unwrap_err().to_string();
         let parts =

@@ -23,13 +23,13 @@ use std::path::{Path, PathBuf};
 use crate::error::{Error, Result, ShowPath};
 use destination::{Destination, check_replace, destination, real_parent};
 pub use destination::{Kind, Replace};
+use leftovers::clean_up;
 pub use leftovers::remove_leftovers;
-use leftovers::tidy;
 pub use named::MARKER;
-use named::{entries, files_below, name_files, parts, present};
+use named::{add_file_list, entries, exists, files_below, split_target};
 pub use stream::is_standard_output_used;
 pub use warnings::take_warnings;
-use workspace::{SCRATCH, Workspace, named_in};
+use workspace::{SCRATCH, Workspace, user_path};
 pub use workspace::{Withdrawn, withdraw_all};
 
 /// Checks, before any work, that a run reading `inputs` may write an output to `target`. Completes or removes an output
@@ -45,23 +45,23 @@ pub use workspace::{Withdrawn, withdraw_all};
 pub fn check_target(target: &Path, kind: Kind, inputs: &[&Path], replace: Replace) -> Result<()> {
     let shown = target.shown();
     let real_parent = real_parent(target)?;
-    let (_, name) = parts(target)?;
+    let (_, name) = split_target(target)?;
     // Compare the entry itself and the file it links to: renaming over a link replaces only the link, but a user who
     // names the input through a link does not want it replaced.
     let named = real_parent.join(name);
-    let meant = fs::canonicalize(target).unwrap_or_else(|_| named.clone());
+    let linked = fs::canonicalize(target).unwrap_or_else(|_| named.clone());
     for input in inputs {
         let Ok(real) = fs::canonicalize(input) else { continue };
-        if real == named || real == meant {
+        if real == named || real == linked {
             return Err(Error::usage(format!("{shown} is the input itself; give another output")));
         }
-        if real.starts_with(&named) || real.starts_with(&meant) {
+        if real.starts_with(&named) || real.starts_with(&linked) {
             let input = input.shown();
             return Err(Error::usage(format!("{shown} contains the input {input}; give another output")));
         }
         // A PLY file added to a folder of frames would become another frame, a folder added to a model another
         // iteration.
-        if named.starts_with(&real) || meant.starts_with(&real) {
+        if named.starts_with(&real) || linked.starts_with(&real) {
             let input = input.shown();
             return Err(Error::usage(format!("{shown} lies inside the input {input}; give another output")));
         }
@@ -69,7 +69,7 @@ pub fn check_target(target: &Path, kind: Kind, inputs: &[&Path], replace: Replac
     if kind == Kind::File && destination(target)? == Destination::Stream {
         return Ok(());
     }
-    tidy(target);
+    clean_up(target);
     check_replace(target, kind, replace)
 }
 
@@ -110,8 +110,8 @@ impl StagedFile {
         let is_stream = destination(target)? == Destination::Stream;
         let workspace = match is_stream {
             // No folder can be created beside a device.
-            true => scratch_in(&std::env::temp_dir())?,
-            false => staged(target, Kind::File, replace)?,
+            true => scratch_workspace(&std::env::temp_dir())?,
+            false => output_workspace(target, Kind::File, replace)?,
         };
         Ok(StagedFile { target: target.to_owned(), content: workspace.content(), replace, is_stream, workspace })
     }
@@ -163,7 +163,7 @@ impl StagedFiles {
 
     /// Returns the path to write companion `index` to.
     pub fn companion(&self, index: usize) -> PathBuf {
-        self.file.workspace.folder.join(companion_content(index))
+        self.file.workspace.folder.join(companion_name(index))
     }
 
     /// Lists all files in the summary, syncs them to disk and publishes them. The summary comes first, so that the
@@ -177,16 +177,16 @@ impl StagedFiles {
     pub fn commit(self) -> Result<()> {
         let StagedFiles { file, companions } = &self;
         let names = companions.iter().chain([&file.target]);
-        let names = names.map(|path| Ok(parts(path)?.1.to_string_lossy().into_owned()));
+        let names = names.map(|path| Ok(split_target(path)?.1.to_string_lossy().into_owned()));
         let mut names = names.collect::<Result<Vec<String>>>()?;
         names.sort();
         if !companions.is_empty() {
-            name_files(&self.companion(0), &names)?;
+            add_file_list(&self.companion(0), &names)?;
         }
         let mut files: Vec<(String, &Path)> = Vec::new();
         for (index, target) in companions.iter().enumerate() {
             sync(&self.companion(index))?;
-            files.push((companion_content(index), target));
+            files.push((companion_name(index), target));
         }
         sync(file.path())?;
         files.push((workspace::CONTENT.to_owned(), &file.target));
@@ -195,7 +195,7 @@ impl StagedFiles {
 }
 
 /// Returns the name of companion `index` in the workspace.
-fn companion_content(index: usize) -> String {
+fn companion_name(index: usize) -> String {
     format!("companion-{index}")
 }
 
@@ -215,7 +215,7 @@ impl StagedFolder {
     /// Fails if the target has no name, if it exists and `replace` does not allow to replace it, or if a system call
     /// fails.
     pub fn new(target: &Path, replace: Replace) -> Result<StagedFolder> {
-        let workspace = staged(target, Kind::Folder, replace)?;
+        let workspace = output_workspace(target, Kind::Folder, replace)?;
         let content = workspace.content();
         fs::create_dir(&content).map_err(Error::io("create", &content))?;
         Ok(StagedFolder { target: target.to_owned(), content, replace, workspace })
@@ -237,8 +237,8 @@ impl StagedFolder {
     /// system call fails. The target is then unchanged.
     pub fn commit(self) -> Result<()> {
         let summary = self.content.join(MARKER);
-        if present(&summary) {
-            name_files(&summary, &files_below(&self.content)?)?;
+        if exists(&summary) {
+            add_file_list(&summary, &files_below(&self.content)?)?;
         }
         sync_tree(&self.content)?;
         publish::publish_folder(&self.workspace, &self.target, self.replace)
@@ -246,16 +246,16 @@ impl StagedFolder {
 }
 
 /// Creates the workspace of an output after repairing and removing leftovers of killed runs with this output.
-fn staged(target: &Path, kind: Kind, replace: Replace) -> Result<Workspace> {
-    tidy(target);
+fn output_workspace(target: &Path, kind: Kind, replace: Replace) -> Result<Workspace> {
+    clean_up(target);
     check_replace(target, kind, replace)?;
     Workspace::beside(target)
 }
 
 /// Creates a workspace for scratch files in `folder` after removing scratch files of killed runs.
-fn scratch_in(folder: &Path) -> Result<Workspace> {
+fn scratch_workspace(folder: &Path) -> Result<Workspace> {
     let target = folder.join(SCRATCH);
-    tidy(&target);
+    clean_up(&target);
     Workspace::beside(&target)
 }
 
@@ -272,7 +272,7 @@ impl ScratchFile {
     /// # Errors
     /// Fails if the folder does not exist or a system call fails.
     pub fn new(folder: &Path) -> Result<ScratchFile> {
-        let workspace = scratch_in(folder)?;
+        let workspace = scratch_workspace(folder)?;
         Ok(ScratchFile { content: workspace.content(), _workspace: workspace })
     }
 
@@ -311,7 +311,7 @@ pub fn as_named(error: Error) -> Error {
         }
         error => return error,
     };
-    match named_in(&path) {
+    match user_path(&path) {
         Some((path, true)) => Error::Io { action: "write a scratch file in", path, source },
         Some((path, false)) => Error::Io { action, path, source },
         None => Error::Io { action, path, source },

@@ -21,7 +21,7 @@ use zip::{CompressionMethod, ZipArchive};
 use super::pickle::Wrong;
 pub(crate) use super::pickle::{MAX_DEPTH, Node, NodeId, Pickle};
 use super::shared_file::SharedFile;
-use super::zip_directory::announced;
+use super::zip_directory::declared_directory;
 use crate::error::{Error, Result, quoted};
 use crate::limits::ReadLimit;
 
@@ -44,7 +44,7 @@ pub(crate) struct Checkpoint {
     archive: ZipArchive<SharedFile>,
     pickle: Pickle,
     /// Index of the pickle among the entries of the archive.
-    pickle_at: usize,
+    pickle_index: usize,
     /// Storages by key: index of the entry in the archive, and size in bytes.
     storages: HashMap<String, (usize, usize)>,
 }
@@ -199,18 +199,18 @@ impl Checkpoint {
         let file = SharedFile::open(path)?;
         let wrong = |place: &str, found: String| {
             Error::input(path, place, "a checkpoint as torch.save writes it", found).hint(
-                "if the file was copied, copy it again; one of PyTorch before 1.6 has to be loaded and saved anew",
+                "if the file was copied, copy it again; if PyTorch before 1.6 saved it, load it and save it again",
             )
         };
         let broken = |error: zip::result::ZipError| wrong(LIST, error.to_string());
-        let directory = announced(&mut file.clone()).map_err(|error| wrong(LIST, error.to_string()))?;
+        let directory = declared_directory(&mut file.clone()).map_err(|error| wrong(LIST, error.to_string()))?;
         if directory.entries > MAX_ENTRIES {
             return Err(wrong(LIST, format!("{} files", directory.entries)));
         }
         let listed = 3 * directory.bytes.min(file.len()) + ENTRY_BYTES * directory.entries;
         memory.check(path, LIST, &format!("the names of {} files", directory.entries), listed)?;
         let mut archive = ZipArchive::new(file.clone()).map_err(broken)?;
-        let (mut storages, mut pickle_at) = (HashMap::new(), None);
+        let (mut storages, mut pickle_index) = (HashMap::new(), None);
         for index in 0..archive.len() {
             let entry = archive.by_index(index).map_err(broken)?;
             let at = |found: &str| wrong(&format!("file {}", quoted(entry.name())), found.to_owned());
@@ -218,7 +218,7 @@ impl Checkpoint {
                 return Err(Error::input(
                     path,
                     format!("file {}", quoted(entry.name())),
-                    "a file that is stored as it is, as torch.save stores it",
+                    "an uncompressed file, as torch.save writes it",
                     "a compressed one",
                 )
                 .hint("load the checkpoint with torch.load and save it again with torch.save"));
@@ -236,10 +236,10 @@ impl Checkpoint {
                         format!("{} bytes", entry.size()),
                     ));
                 }
-                PICKLE if pickle_at.is_some() => return Err(at("a second one")),
-                PICKLE => pickle_at = Some((index, entry.size())),
-                "byteorder" if starts_big(&file, entry.data_start()) => {
-                    return Err(wrong("byteorder", "values of which the highest byte comes first".into()));
+                PICKLE if pickle_index.is_some() => return Err(at("a second pickle")),
+                PICKLE => pickle_index = Some((index, entry.size())),
+                "byteorder" if is_big_endian_marker(&file, entry.data_start()) => {
+                    return Err(wrong("byteorder", "big-endian values".into()));
                 }
                 other => {
                     if let Some(key) = other.strip_prefix("data/") {
@@ -248,11 +248,11 @@ impl Checkpoint {
                 }
             }
         }
-        let (pickle_at, bytes) = pickle_at.ok_or_else(|| wrong(LIST, format!("no {PICKLE}")))?;
+        let (pickle_index, bytes) = pickle_index.ok_or_else(|| wrong(LIST, format!("no {PICKLE}")))?;
         memory.check(path, PICKLE, "the list of files and the pickle", listed + bytes)?;
         // Keep an eighth for the allocator: memory that was freed before may not fit new requests.
         let left = (memory.bytes() - listed - bytes) / 8 * 7;
-        let bytes = bytes_of(&mut archive, &file, pickle_at).map_err(|error| wrong(PICKLE, error.to_string()))?;
+        let bytes = read_entry(&mut archive, &file, pickle_index).map_err(|error| wrong(PICKLE, error.to_string()))?;
         let pickle = Pickle::read(&bytes, left).map_err(|error| match error {
             Wrong::Malformed(at, found) => wrong(&format!("{PICKLE}, byte {at}"), found),
             Wrong::TooMuch(at, expected, found) => Error::input(path, format!("{PICKLE}, byte {at}"), expected, found)
@@ -266,7 +266,7 @@ impl Checkpoint {
                 })
             }
         })?;
-        Ok(Checkpoint { path: path.to_owned(), memory, file, archive, pickle, pickle_at, storages })
+        Ok(Checkpoint { path: path.to_owned(), memory, file, archive, pickle, pickle_index, storages })
     }
 
     /// Checks that reading `what` at `place` may take `bytes` of memory.
@@ -370,14 +370,14 @@ impl Checkpoint {
             return Err(format!("no file data/{}", tensor.storage));
         };
         let values = bytes / tensor.kind.bytes();
-        let said = || format!("{}, and {values} values in data/{}", tensor.describe(), tensor.storage);
-        let len = tensor.len().ok_or_else(said)?;
+        let too_short = || format!("{}, and {values} values in data/{}", tensor.describe(), tensor.storage);
+        let len = tensor.len().ok_or_else(too_short)?;
         let last = tensor.shape.iter().zip(&tensor.stride).try_fold(tensor.offset, |last, (&length, &stride)| {
             last.checked_add(length.saturating_sub(1).checked_mul(stride)?)
         });
         match last {
             Some(last) if len == 0 || last < values => Ok(()),
-            _ => Err(said()),
+            _ => Err(too_short()),
         }
     }
 
@@ -398,7 +398,7 @@ impl Checkpoint {
         };
         let &(index, bytes) = self.storages.get(key).ok_or_else(|| wrong("no such file".into()))?;
         self.allow(&place, "its values", bytes as u64)?;
-        bytes_of(&mut self.archive.clone(), &self.file, index).map_err(|error| wrong(error.to_string()))
+        read_entry(&mut self.archive.clone(), &self.file, index).map_err(|error| wrong(error.to_string()))
     }
 
     /// Reads the elements of a floating-point tensor as f32, the last axis fastest; `place` names it in messages.
@@ -442,9 +442,9 @@ impl Checkpoint {
                 self.wrong(&format!("file {index}"), "its bytes as they were written", error.to_string())
             };
             let name = archive.by_index(index).map_err(|error| broken(&error))?.name().to_owned();
-            let bytes = bytes_of(&mut archive, &self.file, index).map_err(|error| broken(&error))?;
+            let bytes = read_entry(&mut archive, &self.file, index).map_err(|error| broken(&error))?;
             let what = match inside(&name).strip_prefix("data/") {
-                _ if index == self.pickle_at => CheckpointFile::Pickle,
+                _ if index == self.pickle_index => CheckpointFile::Pickle,
                 Some(key) => CheckpointFile::Storage(key),
                 None => CheckpointFile::Other,
             };
@@ -477,14 +477,14 @@ fn inside(name: &str) -> &str {
 const LIST: &str = "list of files";
 
 /// Returns whether the file has the text "big" at `at`.
-fn starts_big(file: &SharedFile, at: u64) -> bool {
+fn is_big_endian_marker(file: &SharedFile, at: u64) -> bool {
     let (mut file, mut text) = (file.clone(), [0; 3]);
     file.seek(SeekFrom::Start(at)).and_then(|_| file.read_exact(&mut text)).is_ok() && &text == b"big"
 }
 
 /// Reads all bytes of an uncompressed entry and checks its checksum. PyTorch writes 0 as checksum if it did not compute
 /// one.
-fn bytes_of(archive: &mut ZipArchive<SharedFile>, file: &SharedFile, index: usize) -> std::io::Result<Vec<u8>> {
+fn read_entry(archive: &mut ZipArchive<SharedFile>, file: &SharedFile, index: usize) -> std::io::Result<Vec<u8>> {
     let (start, size, expected) = {
         let entry = archive.by_index(index)?;
         (entry.data_start(), entry.size(), entry.crc32())
@@ -500,7 +500,7 @@ fn bytes_of(archive: &mut ZipArchive<SharedFile>, file: &SharedFile, index: usiz
     sum.update(&bytes);
     match expected == 0 || sum.sum() == expected {
         true => Ok(bytes),
-        false => Err(std::io::Error::other("other bytes than its checksum is of")),
+        false => Err(std::io::Error::other("bytes that do not match their checksum")),
     }
 }
 

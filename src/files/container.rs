@@ -29,7 +29,7 @@ use crate::model::{Columns, SequenceInfo};
 use crate::source::{BlockReader, FrameSource, Ids, Prefetch, Reads};
 
 /// Number of offsets of the file that are tested to find out whether it is in the page cache.
-const SAMPLES: u64 = 64;
+const CACHE_SAMPLES: u64 = 64;
 
 impl FrameSource for Container {
     fn info(&self) -> &SequenceInfo {
@@ -47,7 +47,7 @@ impl FrameSource for Container {
 
     /// Returns `None` if the file is in the page cache; the figures at the top of this module give the reason.
     fn ahead(&self) -> Option<&dyn Prefetch> {
-        match self.reader.is_cached(SAMPLES) {
+        match self.reader.is_cached(CACHE_SAMPLES) {
             Some(true) => None,
             _ => Some(self),
         }
@@ -64,10 +64,12 @@ impl Prefetch for Container {
             return;
         }
         let layout = self.reader.layout();
-        let block = |id: usize, of: u32| (id / of as usize) as u32;
-        let of = layout.gaussian_block;
+        let block = |id: usize, block_len: u32| (id / block_len as usize) as u32;
+        let gaussians_per_block = layout.gaussian_block;
         for frame_block in block(frames.start, layout.frame_block)..=block(frames.end - 1, layout.frame_block) {
-            for gaussian_block in block(gaussians.start, of)..=block(gaussians.end - 1, of) {
+            for gaussian_block in
+                block(gaussians.start, gaussians_per_block)..=block(gaussians.end - 1, gaussians_per_block)
+            {
                 let tiles = || self.unheld(want, gaussian_block, frame_block);
                 // Request all tiles first, then wait for each.
                 self.reader.expect(tiles());

@@ -36,7 +36,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn texts_are_no_formulas_and_numbers_stay_numbers() {
+    fn formulas_are_escaped_and_numbers_unchanged() {
         let row =
             ["=1+1", "+cmd", "-2+3", "@SUM(A1)", "\tx", "\rx", " =1", "＝1", "-1.5", "+3", "-inf", "-1e-7", "a=b", ""];
         let text = table(&row.map(|_| "n"), [row.map(str::to_owned).to_vec()]);

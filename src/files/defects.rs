@@ -1,9 +1,9 @@
 //! Statistics of the rows of a file that violate its format, and of how its reader treated them.
 
 /// Number of row ids that a note lists per defect.
-const LISTED: usize = 5;
+const LISTED_ROWS: usize = 5;
 /// Fraction of dropped rows above which the total becomes the first note about the file.
-const LOUD: f64 = 0.01;
+const TOTALS_FIRST_FRACTION: f64 = 0.01;
 
 /// Counts of defective rows of a file and of the reader's treatment of them.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -51,7 +51,7 @@ impl Defects {
             });
             let kind = &mut self.kinds[place];
             kind.rows += 1;
-            if kind.first.len() < LISTED {
+            if kind.first.len() < LISTED_ROWS {
                 kind.first.push(row);
             }
         }
@@ -69,7 +69,7 @@ impl Defects {
             return Vec::new();
         }
         let percent = |rows: usize| 100.0 * rows as f64 / self.rows.max(1) as f64;
-        let of_kind = |kind: &DefectCount| {
+        let note = |kind: &DefectCount| {
             let first: Vec<String> = kind.first.iter().map(u32::to_string).collect();
             let more = if kind.rows > first.len() { ", ..." } else { "" };
             format!(
@@ -83,7 +83,7 @@ impl Defects {
                 first.join(", "),
             )
         };
-        let mut notes: Vec<String> = self.kinds.iter().map(of_kind).collect();
+        let mut notes: Vec<String> = self.kinds.iter().map(note).collect();
         let total = format!(
             "{} of {} rows have defects: {} ({:.2}%) left out, {} repaired",
             self.defective,
@@ -92,8 +92,8 @@ impl Defects {
             percent(self.dropped),
             self.defective - self.dropped
         );
-        let is_loud = self.dropped as f64 > LOUD * self.rows as f64;
-        notes.insert(if is_loud { 0 } else { notes.len() }, total);
+        let is_totals_first = self.dropped as f64 > TOTALS_FIRST_FRACTION * self.rows as f64;
+        notes.insert(if is_totals_first { 0 } else { notes.len() }, total);
         notes
     }
 }

@@ -10,7 +10,7 @@ use super::open::open_file;
 use crate::error::{Error, Result};
 
 /// Number of bytes read at a time.
-const PIECE: usize = 1 << 18;
+const CHUNK_BYTES: usize = 1 << 18;
 
 /// Adds the bytes of the file at `path` to `hash`.
 pub(crate) fn hash_file(path: &Path, hash: &mut Xxh3) -> Result<()> {
@@ -19,11 +19,11 @@ pub(crate) fn hash_file(path: &Path, hash: &mut Xxh3) -> Result<()> {
 
 /// Adds the bytes of `file`, which was opened from `path`, from its current position to its end.
 pub(crate) fn hash_rest(file: &mut File, path: &Path, hash: &mut Xxh3) -> Result<()> {
-    let mut piece = vec![0; PIECE];
+    let mut chunk = vec![0; CHUNK_BYTES];
     loop {
-        match file.read(&mut piece).map_err(Error::io("read", path))? {
+        match file.read(&mut chunk).map_err(Error::io("read", path))? {
             0 => return Ok(()),
-            read => hash.update(&piece[..read]),
+            read => hash.update(&chunk[..read]),
         }
     }
 }

@@ -34,7 +34,7 @@ pub fn read_png(path: &Path, (width, height): (u32, u32), background: [f32; 3]) 
     if found != (width, height) {
         let found = format!("{} x {}", found.0, found.1);
         return Err(Error::input(path, "", format!("{width} x {height} pixels, as its camera has"), found)
-            .hint("give pictures of the cameras' size, or the cameras of these pictures"));
+            .hint("give images of the cameras' size, or the cameras of these images"));
     }
     let (color, depth) = reader.output_color_type();
     // The size is `None` only on overflow, which the limits on cameras exclude.
@@ -71,7 +71,7 @@ fn malformed(path: &Path) -> impl Fn(DecodingError) -> Error {
         DecodingError::IoError(source) if source.kind() != std::io::ErrorKind::UnexpectedEof => {
             Error::Io { action: "read", path: path.to_owned(), source }
         }
-        other => Error::input(path, "", "a PNG picture", other.to_string()),
+        other => Error::input(path, "", "a PNG image", other.to_string()),
     }
 }
 
@@ -95,25 +95,25 @@ mod tests {
     }
 
     #[test]
-    fn every_color_type_gives_the_same_picture() {
+    fn color_types_decode_to_equal_values() {
         let expected = [1.0, 0.0, 0.0, 0.2, 0.2, 0.2].map(|v: f32| v);
         let wide: Vec<u8> = [65535u16, 0, 0, 13107, 13107, 13107].iter().flat_map(|v| v.to_be_bytes()).collect();
-        let pictures = [
+        let images = [
             written(ColorType::Rgb, BitDepth::Eight, &[255, 0, 0, 51, 51, 51], None),
             written(ColorType::Rgb, BitDepth::Sixteen, &wide, None),
             written(ColorType::Rgba, BitDepth::Eight, &[255, 0, 0, 255, 51, 51, 51, 255], None),
             written(ColorType::Indexed, BitDepth::One, &[0b1000_0000], Some(&[51, 51, 51, 255, 0, 0])),
         ];
-        for (i, file) in pictures.iter().enumerate() {
+        for (i, file) in images.iter().enumerate() {
             let got = read_png(file.path(), (2, 1), [0.5; 3]).unwrap();
-            assert_eq!(got.data, expected, "picture {i}");
+            assert_eq!(got.data, expected, "image {i}");
         }
         let gray = written(ColorType::Grayscale, BitDepth::Eight, &[255, 51], None);
         assert_eq!(read_png(gray.path(), (2, 1), [0.5; 3]).unwrap().data, [1.0, 1.0, 1.0, 0.2, 0.2, 0.2]);
     }
 
     #[test]
-    fn what_is_transparent_shows_the_background() {
+    fn transparent_pixels_show_the_background() {
         let file = written(ColorType::Rgba, BitDepth::Eight, &[255, 0, 0, 0, 255, 0, 0, 51], None);
         let got = read_png(file.path(), (2, 1), [0.0, 0.5, 1.0]).unwrap();
         for (got, expected) in got.data.iter().zip([0.0, 0.5, 1.0, 0.2, 0.4, 0.8]) {
@@ -124,7 +124,7 @@ mod tests {
     }
 
     #[test]
-    fn another_size_damage_and_other_files_are_named() {
+    fn wrong_size_damage_and_other_files_are_refused() {
         let file = written(ColorType::Rgb, BitDepth::Eight, &[255, 0, 0, 51, 51, 51], None);
         let message = |path: &Path, size| read_png(path, size, [0.0; 3]).unwrap_err().to_string();
         let text = message(file.path(), (3, 1));
@@ -133,9 +133,9 @@ mod tests {
         for cut in 0..whole.len() - 12 {
             std::fs::write(file.path(), &whole[..cut]).unwrap();
             let text = message(file.path(), (2, 1));
-            assert!(text.contains("expected a PNG picture"), "cut at {cut}: {text}");
+            assert!(text.contains("expected a PNG image"), "cut at {cut}: {text}");
         }
         std::fs::write(file.path(), b"\xff\xd8\xff\xe0 a JPEG begins like this").unwrap();
-        assert!(message(file.path(), (2, 1)).contains("a PNG picture"));
+        assert!(message(file.path(), (2, 1)).contains("a PNG image"));
     }
 }

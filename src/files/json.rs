@@ -19,7 +19,7 @@ use serde_json::error::Category;
 
 use super::open::{open_file, read_small};
 use crate::error::{Error, Result};
-use checked::Checked;
+use checked::CheckedReader;
 
 /// Error of a seed, kept here while the parser unwinds because the parser's own error type cannot hold it.
 #[derive(Debug, Default)]
@@ -56,7 +56,7 @@ pub(crate) fn read_from<T, S: for<'de> DeserializeSeed<'de, Value = T>>(
     stopped: &Stopped,
     seed: S,
 ) -> Result<T> {
-    let mut text = Checked::new(file, path);
+    let mut text = CheckedReader::new(file, path);
     let mut parser = serde_json::Deserializer::from_reader(&mut text);
     let read = seed.deserialize(&mut parser).and_then(|value| parser.end().map(|()| value));
     read.map_err(|error| {
@@ -78,9 +78,7 @@ pub(crate) fn read_from<T, S: for<'de> DeserializeSeed<'de, Value = T>>(
             .iter()
             .any(|word| (0..3).any(|at| around.get(at..).is_some_and(|rest| rest.starts_with(word.as_bytes()))));
         match is_number {
-            true => {
-                refused.hint("NaN and Infinity are no JSON: if a pose holds them, take the picture out of the file")
-            }
+            true => refused.hint("NaN and Infinity are not JSON: if a pose holds them, remove that image from the file"),
             false => refused,
         }
     })
@@ -106,12 +104,12 @@ mod tests {
     }
 
     #[test]
-    fn hints_fit_what_is_wrong() {
+    fn hints_match_the_error() {
         for (bytes, expected, absent) in [
             (&b"{\"frames\": [{\"a"[..], "cut short", "NaN"),
             (b"", "an empty file", "NaN"),
             (b" \n", "an empty file", "NaN"),
-            (b"{\"a\": NaN}", "NaN and Infinity are no JSON", "cut short"),
+            (b"{\"a\": NaN}", "NaN and Infinity are not JSON", "cut short"),
             (b"{\"a\": NaN}", "line 1, column 7", "cut short"),
             (b"{\"a\": -Infinity}", "line 1, column 8", "cut short"),
             (b"{\"a\": \"caf\xe9\"}", "Latin-1", "NaN"),
@@ -127,21 +125,21 @@ mod tests {
     }
 
     #[test]
-    fn a_byte_order_mark_of_utf_8_is_passed_over() {
+    fn utf_8_byte_order_mark_is_skipped() {
         let read = |bytes: &[u8]| read_from(bytes, Path::new("a"), &Stopped::default(), PhantomData::<Value>);
         assert_eq!(read(b"\xef\xbb\xbf{\"a\": 1}").unwrap()["a"], 1);
         assert!(refused(b"\xef\xbb\xbf\"\xe9").contains("byte 4"));
     }
 
     #[test]
-    fn values_are_those_of_a_parser_of_whole_texts() {
+    fn values_equal_those_of_serde_json() {
         let text = r#" {"a\n\u00e9\ud83d\ude00": [1, -2.5e3, true, null, "\"[{\\", {}], "größe": [[[]]], "b": 18446744073709551615} "#;
         let read = read_from(text.as_bytes(), Path::new("a"), &Stopped::default(), PhantomData::<Value>).unwrap();
         assert_eq!(read, serde_json::from_str::<Value>(text).unwrap());
     }
 
     #[test]
-    fn long_texts_numbers_and_deep_nesting_are_refused_even_where_they_are_ignored() {
+    fn values_beyond_limits_are_refused_even_if_ignored() {
         let text = format!("{{\"a\": \"{}\"}}", "x".repeat(2 << 20));
         let escapes = format!("\"{}\"", "\\\"".repeat(1 << 20));
         let key = format!("{{\"{}\": 1}}", "k".repeat(2 << 20));

@@ -15,9 +15,9 @@ use super::open::open_file;
 use crate::error::{Error, Result};
 
 /// Number of bytes of a map that may be resident before its pages are released. Releasing takes about 2 µs.
-const RESIDENT: usize = 2 << 20;
+const MAX_RESIDENT_BYTES: usize = 2 << 20;
 /// Bytes around a touched page that the system may map together with it (Linux: fault-around of 64 KiB).
-const AROUND: usize = 1 << 16;
+const FAULT_AROUND_BYTES: usize = 1 << 16;
 
 /// Read-only map of a whole file, or of a part of a scratch file. Keeps no file descriptor open.
 #[derive(Debug)]
@@ -85,9 +85,9 @@ impl FileMap {
     /// Records that the bytes of `range` were or will be read, and releases the pages of the map once about 2 MiB of
     /// them may be resident. Slices of the map stay valid: their pages are read from the file again.
     pub(crate) fn touched(&self, range: Range<usize>) {
-        let gap = self.last_end.swap(range.end, Ordering::Relaxed).abs_diff(range.start).min(AROUND);
+        let gap = self.last_end.swap(range.end, Ordering::Relaxed).abs_diff(range.start).min(FAULT_AROUND_BYTES);
         let more = gap + range.len();
-        if self.resident.fetch_add(more, Ordering::Relaxed) + more > RESIDENT {
+        if self.resident.fetch_add(more, Ordering::Relaxed) + more > MAX_RESIDENT_BYTES {
             self.resident.store(0, Ordering::Relaxed);
             self.release();
         }
@@ -129,7 +129,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_file_cut_short_under_the_map_is_an_error_not_a_signal() {
+    fn shrinking_mapped_file_is_an_error() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a");
         fs::write(&path, vec![7; 10_000]).unwrap();
@@ -142,7 +142,7 @@ mod tests {
 
     #[cfg(unix)]
     #[test]
-    fn a_file_replaced_or_removed_under_the_map_reads_on() {
+    fn replaced_or_removed_file_stays_readable() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a");
         fs::write(&path, vec![7; 10_000]).unwrap();

@@ -9,7 +9,7 @@ use crate::error::ShowPath;
 /// Number of leading folders that a recipe and the files it names must have in common, unless all are below the working
 /// directory. With fewer, a relative path could reveal a name: from `/home/a/small` to `/home/b/data` it would contain
 /// `b`.
-const SHARED: usize = 2;
+const MIN_SHARED_FOLDERS: usize = 2;
 
 /// Returns the last name of `path`; for `.` and paths ending in `..` the name of the folder itself.
 pub fn name_of(path: &Path) -> String {
@@ -23,15 +23,15 @@ pub fn shown_name(path: &Path) -> String {
 }
 
 /// Returns `path` relative to `folder`, which need not exist yet, or only its last name if the two are too far apart
-/// ([`SHARED`]). Separators are `/` on every system.
+/// ([`MIN_SHARED_FOLDERS`]). Separators are `/` on every system.
 pub fn from_folder(path: &Path, folder: &Path) -> PathBuf {
     let found = (|| {
-        let (path, folder) = (real(path)?, real(folder)?);
+        let (path, folder) = (real_path(path)?, real_path(folder)?);
         let shared = path.components().zip(folder.components()).take_while(|(a, b)| a == b).count();
         let is_near = |common: &Path| {
             let names = common.components().filter(|part| matches!(part, Component::Normal(_))).count();
             let here = std::env::current_dir().ok().and_then(|here| fs::canonicalize(here).ok());
-            names >= SHARED || names > 0 && here.is_some_and(|here| common.starts_with(here))
+            names >= MIN_SHARED_FOLDERS || names > 0 && here.is_some_and(|here| common.starts_with(here))
         };
         if !is_near(&path.components().take(shared).collect::<PathBuf>()) {
             return None;
@@ -45,12 +45,12 @@ pub fn from_folder(path: &Path, folder: &Path) -> PathBuf {
 }
 
 /// Returns `path` as an absolute path whose folders contain no links and no `..`.
-fn real(path: &Path) -> Option<PathBuf> {
+fn real_path(path: &Path) -> Option<PathBuf> {
     let absolute = std::path::absolute(path).ok()?;
     match (absolute.parent(), absolute.file_name()) {
         (Some(parent), Some(name)) => {
             // A folder that does not exist yet lies below one that does.
-            let parent = fs::canonicalize(parent).ok().or_else(|| real(parent))?;
+            let parent = fs::canonicalize(parent).ok().or_else(|| real_path(parent))?;
             Some(parent.join(name))
         }
         (Some(_), None) => fs::canonicalize(&absolute).ok(),
@@ -71,7 +71,7 @@ mod tests {
     }
 
     #[test]
-    fn a_path_from_a_folder_finds_the_file() {
+    fn relative_path_finds_the_file() {
         let top = tempfile::tempdir().unwrap();
         let top = top.path().join("place");
         fs::create_dir_all(top.join("data")).unwrap();
@@ -88,7 +88,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_far_away_is_named_by_its_last_name() {
+    fn distant_file_is_named_by_its_last_name() {
         for (path, folder) in [("/secret/client/data", "/elsewhere/small"), ("/home/b/data", "/home/a/small")] {
             assert_eq!(from_folder(Path::new(path), Path::new(folder)), Path::new("data"));
         }

@@ -20,20 +20,20 @@ use zip::read::ZipFile;
 use super::map::FileMap;
 use super::npy::{HEAD, header_is_sound};
 use super::open::open_file;
-use super::zip_directory::{Announced, announced};
+use super::zip_directory::{DeclaredDirectory, declared_directory};
 use crate::error::{Error, Result};
 
 /// Maximum number of arrays in an archive.
 const MAX_ARRAYS: usize = 4096;
 /// Maximum size in bytes of the list of files at the end of an archive.
 const MAX_LIST: u64 = 4 << 20;
-/// Maximum number of bytes of decoded arrays per byte of the archive, in addition to [`SCRATCH`]. Trained models have 1
-/// to 2.
+/// Maximum number of bytes of decoded arrays per byte of the archive, in addition to [`BASE_SCRATCH_BYTES`]. Trained
+/// models have 1 to 2.
 const SCRATCH_PER_BYTE: u64 = 64;
 /// Number of bytes of decoded arrays that any archive may have.
-const SCRATCH: u64 = 64 << 20;
+const BASE_SCRATCH_BYTES: u64 = 64 << 20;
 /// Maximum compression factor of DEFLATE.
-const MOST_PER_BYTE: u64 = 1032;
+const MAX_DEFLATE_FACTOR: u64 = 1032;
 
 /// Open archive.
 #[derive(Debug)]
@@ -150,7 +150,7 @@ impl Npz {
             let bytes = entry.float.map(|float| entry.len() * float.bytes);
             if bytes.is_some_and(|bytes| (entry.header + bytes) as u64 != file.size())
                 || entry.stored > map.len() as u64
-                || file.size() > entry.stored.saturating_mul(MOST_PER_BYTE).saturating_add(64)
+                || file.size() > entry.stored.saturating_mul(MAX_DEFLATE_FACTOR).saturating_add(64)
                 || !entry.is_compressed && entry.start as u64 + (file.size() - entry.header as u64) > map.len() as u64
             {
                 return Err(wrong(name, {
@@ -185,7 +185,7 @@ impl Npz {
     /// # Errors
     /// Fails if one of these conditions does not hold; the message names the array.
     pub(crate) fn check_floats(&self, names: &[&str]) -> Result<()> {
-        let most = SCRATCH + SCRATCH_PER_BYTE * self.map.len() as u64;
+        let most = BASE_SCRATCH_BYTES + SCRATCH_PER_BYTE * self.map.len() as u64;
         let mut decoded = 0u64;
         for name in names {
             let (entry, float) = self.float(name)?;
@@ -209,7 +209,7 @@ impl Npz {
             return Err(Error::input(&self.path, name, "an array of this name", names.join(", ")));
         };
         let Some(float) = entry.float else {
-            let found = format!("{} in another order or type", entry.descr);
+            let found = format!("{}, another type or Fortran order", entry.descr);
             return Err(Error::input(&self.path, name, "float16, float32 or float64 in C order", found));
         };
         Ok((entry, float))
@@ -229,17 +229,17 @@ impl Npz {
         let file = tempfile::tempfile_in(scratch).map_err(Error::io("create a scratch file in", scratch))?;
         let failed = |error| Error::io("write a scratch file in", scratch)(error);
         let mut out = BufWriter::new(&file);
-        let mut piece = vec![0; entry.len().min(1 << 16) * float.bytes];
+        let mut chunk = vec![0; entry.len().min(1 << 16) * float.bytes];
         let mut left = entry.len() * float.bytes;
         self.read(entry, |values| {
             while left > 0 {
-                let piece = &mut piece[..left.min(1 << 16)];
-                values.read_exact(piece).map_err(|error| self.damaged(entry, &error))?;
-                for stored in piece.chunks_exact(float.bytes) {
+                let chunk = &mut chunk[..left.min(1 << 16)];
+                values.read_exact(chunk).map_err(|error| self.damaged(entry, &error))?;
+                for stored in chunk.chunks_exact(float.bytes) {
                     let value = float.decode(stored).to_le_bytes();
                     out.write_all(&value).map_err(failed)?;
                 }
-                left -= piece.len();
+                left -= chunk.len();
             }
             out.flush().map_err(failed)
         })?;
@@ -270,14 +270,14 @@ impl Npz {
 /// Opens the zip archive at `path`. The inner error says what is wrong with its content.
 fn open_zip(path: &Path) -> Result<std::result::Result<ZipArchive<BufReader<File>>, String>> {
     let mut file = open_file(path)?;
-    let directory = match announced(&mut file) {
+    let directory = match declared_directory(&mut file) {
         Ok(directory) => directory,
         Err(error) => return Ok(Err(error.to_string())),
     };
     if directory.entries > MAX_ARRAYS as u64 || directory.bytes > MAX_LIST {
-        let Announced { entries, bytes } = directory;
+        let DeclaredDirectory { entries, bytes } = directory;
         return Ok(Err(format!(
-            "{entries} files in a list of {bytes} bytes, where at most {MAX_ARRAYS} files and {MAX_LIST} bytes can be"
+            "{entries} files in a list of {bytes} bytes, more than the limits of {MAX_ARRAYS} files and {MAX_LIST} bytes"
         )));
     }
     Ok(ZipArchive::new(BufReader::new(file)).map_err(|error| error.to_string()))

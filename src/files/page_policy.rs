@@ -24,7 +24,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_digest_is_that_of_the_specification() {
+    fn digest_matches_the_specification() {
         // Example from "Content Security Policy Level 3", section 8.3.
         assert_eq!(digest_of("doSomething();"), "'sha256-RFWPLDbv2BY+rCkDzsE+0fr8ylGr2R2faWMhq4lfEQc='");
     }

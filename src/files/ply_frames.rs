@@ -36,14 +36,14 @@ impl PlyFrames {
     /// Fails if the numbers of the frames have a gap, if an entry is named like a frame but is not a file, if the
     /// folder has no PLY files, if [`Ply::open`] fails for a file, or if frames differ in their properties.
     pub fn open(folder: &Path, options: &PlyOptions) -> Result<PlyFrames> {
-        let (frames, others) = frames_of(folder)?;
+        let (frames, others) = list_frames(folder)?;
         if let Some(other) = others.first() {
             let found = if other.is_dir() { "a folder" } else { "a link to nothing" };
-            return Err(Error::input(other, "", "a PLY file, as its name says", found).hint(ALLOW_GAPS));
+            return Err(Error::input(other, "", "a PLY file, as its name says", found).hint(ALLOW_GAPS_HINT));
         }
         if let Some((missing, before, after)) = first_gap(&frames) {
             let found = format!("{before}, then {after}");
-            return Err(Error::input(folder, "", format!("a frame {missing}"), found).hint(ALLOW_GAPS));
+            return Err(Error::input(folder, "", format!("a frame {missing}"), found).hint(ALLOW_GAPS_HINT));
         }
         Self::from_paths(folder, frames, options)
     }
@@ -53,7 +53,7 @@ impl PlyFrames {
     /// # Errors
     /// Fails like [`PlyFrames::open`], except for gaps and entries that are not files.
     pub fn open_with_gaps(folder: &Path, options: &PlyOptions) -> Result<PlyFrames> {
-        Self::from_paths(folder, frames_of(folder)?.0, options)
+        Self::from_paths(folder, list_frames(folder)?.0, options)
     }
 
     /// Opens one PLY file as the only frame.
@@ -161,14 +161,14 @@ fn file_name(path: &Path) -> &OsStr {
 }
 
 /// Hint for a refused sequence.
-const ALLOW_GAPS: &str = "--allow-gaps takes the frames that are there as the whole sequence";
+const ALLOW_GAPS_HINT: &str = "--allow-gaps reads the existing frames as the whole sequence";
 
 /// Returns the files of a folder's frames in natural order, and entries that are named like frames but are not files.
-fn frames_of(folder: &Path) -> Result<(Vec<PathBuf>, Vec<PathBuf>)> {
+fn list_frames(folder: &Path) -> Result<(Vec<PathBuf>, Vec<PathBuf>)> {
     let mut found = Vec::new();
     for entry in fs::read_dir(folder).map_err(Error::io("list", folder))? {
         let path = entry.map_err(Error::io("list", folder))?.path();
-        if is_called_frame(&path) {
+        if is_named_like_frame(&path) {
             found.push(path);
         }
     }
@@ -202,7 +202,7 @@ fn first_gap(frames: &[PathBuf]) -> Option<(String, String, String)> {
 
 /// Returns whether a file is named like a frame. Hidden files are excluded: a file manager's `._frame_1.ply` is not a
 /// frame.
-fn is_called_frame(path: &Path) -> bool {
+fn is_named_like_frame(path: &Path) -> bool {
     path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("ply"))
         && !file_name(path).as_encoded_bytes().starts_with(b".")
 }

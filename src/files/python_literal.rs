@@ -76,7 +76,7 @@ type Parsed<T> = std::result::Result<T, ParseError>;
 /// Parses `name(key=value, …)` and returns its arguments in order.
 pub(crate) fn parse_call(text: &str, name: &'static str) -> Parsed<Vec<Argument>> {
     let mut parser = Parser { text, at: 0 };
-    parser.space();
+    parser.skip_space();
     if !parser.take(name) {
         return Err(parser.error("Namespace(…)"));
     }
@@ -88,7 +88,7 @@ pub(crate) fn parse_call(text: &str, name: &'static str) -> Parsed<Vec<Argument>
             return Err(parser.error("a key or `)`"));
         }
         parser.expect("=", "`=`")?;
-        parser.space();
+        parser.skip_space();
         let start = parser.at;
         let value = parser.value(0)?;
         let place = start..start + text[start..parser.at].trim_end().len();
@@ -97,7 +97,7 @@ pub(crate) fn parse_call(text: &str, name: &'static str) -> Parsed<Vec<Argument>
             return Err(parser.error("`,` or `)`"));
         }
     }
-    parser.space();
+    parser.skip_space();
     if parser.rest().is_empty() { Ok(keys) } else { Err(parser.error("nothing after the closing `)`")) }
 }
 
@@ -119,7 +119,7 @@ impl<'a> Parser<'a> {
     }
 
     /// Skips white space.
-    fn space(&mut self) {
+    fn skip_space(&mut self) {
         self.at = self.text.len() - self.rest().trim_start().len();
     }
 
@@ -134,7 +134,7 @@ impl<'a> Parser<'a> {
 
     /// Skips white space, then `token` if it comes next, and returns whether it did.
     fn take_token(&mut self, token: &str) -> bool {
-        self.space();
+        self.skip_space();
         self.take(token)
     }
 
@@ -145,7 +145,7 @@ impl<'a> Parser<'a> {
 
     /// Takes the longest run of characters that occur in names, keywords and numbers.
     fn word(&mut self) -> &'a str {
-        self.space();
+        self.skip_space();
         let rest = self.rest();
         let end = rest.find(|c: char| !(c.is_alphanumeric() || "_.+-".contains(c))).unwrap_or(rest.len());
         self.at += end;
@@ -154,7 +154,7 @@ impl<'a> Parser<'a> {
 
     /// Parses a literal that ends at a separator; other text becomes [`Literal::Opaque`] up to the next separator.
     fn value(&mut self, depth: usize) -> Parsed<Literal> {
-        self.space();
+        self.skip_space();
         let start = self.at;
         if depth > MAX_DEPTH {
             return Err(self.error("at most 32 levels of nesting"));
@@ -176,7 +176,7 @@ impl<'a> Parser<'a> {
 
     /// Skips white space and returns whether a separator, a closing bracket or the end comes next.
     fn at_separator(&mut self) -> bool {
-        self.space();
+        self.skip_space();
         matches!(self.rest().chars().next(), None | Some(',' | ')' | ']' | '}' | ':'))
     }
 

@@ -25,7 +25,7 @@ pub const ROW_BYTES: usize = 64;
 /// Number of bytes per texel: four words.
 const TEXEL_BYTES: usize = 16;
 /// Maximum length of the JSON text in bytes: about 3000 cameras. Its parsed values take up to 30 times as much memory.
-const MOST_TEXT: usize = 1 << 20;
+const MAX_TEXT_BYTES: usize = 1 << 20;
 /// Number of 32-bit words per Gaussian.
 pub const WORDS: usize = 16;
 
@@ -122,8 +122,8 @@ impl Splatv {
             return Err(Error::input(path, "byte 0", format!("the magic {MAGIC:#06x}"), format!("{magic:#06x}")));
         }
         let start = 8 + word(4)? as usize;
-        if start > MOST_TEXT && map.len() >= start {
-            let expected = format!("a text of at most {MOST_TEXT} bytes");
+        if start > MAX_TEXT_BYTES && map.len() >= start {
+            let expected = format!("a text of at most {MAX_TEXT_BYTES} bytes");
             return Err(Error::input(path, "byte 4", expected, format!("{} bytes", start - 8)));
         }
         let text = map.get(8..start).ok_or_else(|| cut(format!("{start} bytes up to the end of its text")))?;
@@ -176,7 +176,7 @@ impl Splatv {
     /// Returns a note if the file ends before its texture does.
     pub fn note(&self) -> Option<String> {
         let (declared, rows) = (self.declared?, (self.map.len() - self.start) / ROW_BYTES);
-        Some(format!("{rows} rows of {declared} declared: the file is not padded to whole rows of its texture"))
+        Some(format!("{rows} rows of {declared} declared: the file ends before its texture is complete"))
     }
 
     /// Returns the cameras as JSON, unchanged from the file.
@@ -194,7 +194,7 @@ impl Splatv {
     /// Checks that the file has not been cut short since it was opened.
     ///
     /// # Errors
-    /// Fails if it has.
+    /// Fails if the file is shorter than at opening.
     pub fn check(&self) -> Result<()> {
         self.map.check()
     }

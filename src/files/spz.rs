@@ -7,7 +7,7 @@
 //! | opacities | 1 | 255·α |
 //! | colors | 3 | 255·(.15·f_dc + ½) |
 //! | scales | 3 | 16·(ln s + 10) |
-//! | rotations | 4 | 2 bits: index of the largest of x, y, z, w; for each of the others sign and 9 bits of 511·√2·value |
+//! | rotations | 4 | 2 bits: index of the largest of x, y, z, w; then sign and 9 bits of 511·√2·value each |
 //! | SH coefficients | 3·((d + 1)² − 1) | 128·c + 128, rounded to 5 bits in degree 1 and to 4 bits above |
 //!
 //! The maintained crate for this format depends on an asynchronous runtime; the format itself needs only the lines
@@ -26,11 +26,11 @@ use crate::model::{Gaussians, color, opacity};
 const MAGIC: u32 = 0x5053_474e;
 const VERSION: u32 = 3;
 /// Largest magnitude of a position in units of the last bit (24 bits, signed).
-const MOST: f64 = 8_388_607.0;
+const MAX_FIXED: f64 = 8_388_607.0;
 /// Maximum number of fractional bits of positions; finer bits are noise of f32.
-const MOST_BITS: i32 = 20;
+const MAX_FRACTION_BITS: i32 = 20;
 /// Signs of the SH coefficients above degree 0 after the y and z axes are reversed.
-const TURNED: [f32; 15] = [-1., -1., 1., -1., 1., 1., -1., 1., -1., 1., -1., -1., 1., -1., 1.];
+const AXIS_SIGNS: [f32; 15] = [-1., -1., 1., -1., 1., 1., -1., 1., -1., 1., -1., -1., 1., -1., 1.];
 
 /// Writes `state` to `path`. Returns the largest error of a position in the file, in scene units.
 ///
@@ -41,13 +41,16 @@ pub fn write_spz(state: &Gaussians, path: &Path) -> Result<f64> {
     let furthest = state.position.planes().iter().fold(0.0f64, |most, x| most.max(f64::from(x.abs())));
     if let Some(at) = state.position.planes().iter().position(|x| !x.is_finite()) {
         let id = at % state.len();
-        return Err(Error::usage(format!("{}: no .spz can hold the position of Gaussian {id}", path.shown())));
+        return Err(Error::usage(format!(
+            "{}: the position of Gaussian {id} is not finite, which a .spz cannot store",
+            path.shown()
+        )));
     }
     let count = u32::try_from(state.len())
         .map_err(|_| Error::usage(format!("{}: {} Gaussians are too many for a .spz", path.shown(), state.len())))?;
-    let bits = (MOST / furthest.max(1e-9)).log2().floor().clamp(0.0, f64::from(MOST_BITS)) as i32;
+    let bits = (MAX_FIXED / furthest.max(1e-9)).log2().floor().clamp(0.0, f64::from(MAX_FRACTION_BITS)) as i32;
     let unit = 0.5f64.powi(bits);
-    let off = measured(state, unit)?;
+    let position_error = check_accuracy(state, unit)?;
     let file = File::create(path).map_err(Error::io("create", path))?;
     // No time stamp and no name, so that the same scene gives the same bytes.
     let mut out = GzBuilder::new().write(BufWriter::new(file), Compression::best());
@@ -80,9 +83,9 @@ pub fn write_spz(state: &Gaussians, path: &Path) -> Result<f64> {
             out.write_all(&smallest_three([x, -y, -z, w]).to_le_bytes())?;
         }
         for row in rows {
-            for (k, turned) in (1..state.sh.width() / 3).zip(TURNED) {
+            for (k, turned) in (1..state.sh.width() / 3).zip(AXIS_SIGNS) {
                 for c in 0..3 {
-                    out.write_all(&[harmonic_byte(k, turned * state.sh.plane(3 * k + c)[row])])?;
+                    out.write_all(&[sh_byte(k, turned * state.sh.plane(3 * k + c)[row])])?;
                 }
             }
         }
@@ -90,14 +93,14 @@ pub fn write_spz(state: &Gaussians, path: &Path) -> Result<f64> {
         out.get_mut().flush()
     };
     write().map_err(Error::io("write", path))?;
-    Ok(off)
+    Ok(position_error)
 }
 
 /// Measures the errors of a file of `state` with positions in units of `unit`. Returns the largest error of a position.
 ///
 /// # Errors
 /// Fails if an error exceeds its bound.
-fn measured(state: &Gaussians, unit: f64) -> Result<f64> {
+fn check_accuracy(state: &Gaussians, unit: f64) -> Result<f64> {
     let mut accuracy = Accuracy::new(&state.position);
     for row in 0..state.len() {
         let wanted = Drawn::of_state(state, row);
@@ -110,21 +113,21 @@ fn measured(state: &Gaussians, unit: f64) -> Result<f64> {
         };
         accuracy.add(row, &wanted, &found);
         if wanted.color.iter().any(|c| !c.is_finite()) {
-            accuracy.add_harmonic(row, f64::INFINITY);
+            accuracy.add_sh(row, f64::INFINITY);
         }
         for (k, c) in (1..state.sh.width() / 3).flat_map(|k| (0..3).map(move |c| (k, c))) {
             let value = state.sh.plane(3 * k + c)[row];
-            let held = (f64::from(harmonic_byte(k, value)) - 128.0) / 128.0;
-            accuracy.add_harmonic(row, (f64::from(value) - held).abs());
+            let held = (f64::from(sh_byte(k, value)) - 128.0) / 128.0;
+            accuracy.add_sh(row, (f64::from(value) - held).abs());
         }
     }
     accuracy.check("a .spz")?;
-    Ok(accuracy.position())
+    Ok(accuracy.position_error())
 }
 
 /// Returns a coordinate as a 24-bit integer in units of `unit`.
 fn fixed(value: f64, unit: f64) -> i32 {
-    (value / unit).round().clamp(-MOST, MOST) as i32
+    (value / unit).round().clamp(-MAX_FIXED, MAX_FIXED) as i32
 }
 
 /// Returns the stored byte of an opacity logit.
@@ -144,7 +147,7 @@ fn scale_byte(log_scale: f32) -> u8 {
 
 /// Returns the stored byte of SH coefficient `k` (from 1) of one channel, rounded to 5 bits in degree 1 and to 4 bits
 /// above.
-fn harmonic_byte(k: usize, value: f32) -> u8 {
+fn sh_byte(k: usize, value: f32) -> u8 {
     let step = if k < 4 { 8.0 } else { 16.0 };
     let nearest = ((128.0 * f64::from(value)).round() + 128.0 + step / 2.0) / step;
     byte(nearest.floor() * step)
@@ -194,16 +197,17 @@ mod tests {
             .scan(16, |at, width| Some(std::mem::replace(at, *at + width * count)))
             .chain([16 + 20 * count])
             .collect();
-        let of = |array: usize, width: usize, i: usize| &bytes[starts[array] + width * i..][..width];
-        let values =
-            |bytes: &[u8], of: &dyn Fn(f64) -> f64| bytes.iter().map(|&b| of(f64::from(b))).collect::<Vec<f64>>();
+        let row_bytes = |array: usize, width: usize, i: usize| &bytes[starts[array] + width * i..][..width];
+        let values = |bytes: &[u8], decode: &dyn Fn(f64) -> f64| {
+            bytes.iter().map(|&b| decode(f64::from(b))).collect::<Vec<f64>>()
+        };
         (0..count)
             .map(|i| {
-                let place = of(0, 9, i).as_chunks::<3>().0;
+                let place = row_bytes(0, 9, i).as_chunks::<3>().0;
                 // The highest byte holds the sign.
                 let place =
                     place.iter().map(|b| f64::from(i32::from_le_bytes([0, b[0], b[1], b[2]]) >> 8) / 2f64.powi(bits));
-                let mut bits_left = u32::from_le_bytes(of(4, 4, i).try_into().unwrap());
+                let mut bits_left = u32::from_le_bytes(row_bytes(4, 4, i).try_into().unwrap());
                 let (largest, mut q) = ((bits_left >> 30) as usize, [0.0f64; 4]);
                 for k in (0..4).rev().filter(|&k| k != largest) {
                     let size = f64::from(bits_left & 511) / 511.0 / 2f64.sqrt();
@@ -213,24 +217,24 @@ mod tests {
                 q[largest] = (1.0 - q.iter().map(|x| x * x).sum::<f64>()).sqrt();
                 (
                     place.collect(),
-                    f64::from(of(1, 1, i)[0]) / 255.0,
-                    values(of(2, 3, i), &|b| (b / 255.0 - 0.5) / 0.15),
-                    values(of(3, 3, i), &|b| b / 16.0 - 10.0),
+                    f64::from(row_bytes(1, 1, i)[0]) / 255.0,
+                    values(row_bytes(2, 3, i), &|b| (b / 255.0 - 0.5) / 0.15),
+                    values(row_bytes(3, 3, i), &|b| b / 16.0 - 10.0),
                     [q[3], q[0], q[1], q[2]],
-                    values(of(5, more, i), &|b| (b - 128.0) / 128.0),
+                    values(row_bytes(5, more, i), &|b| (b - 128.0) / 128.0),
                 )
             })
             .collect()
     }
 
     #[test]
-    fn a_reader_of_the_format_finds_what_bytes_can_hold_of_every_gaussian() {
+    fn independent_reader_finds_the_written_values() {
         let mut state = gather_all(&Scene::new(300, 1), 0, Columns::all()).unwrap();
         state.sh = crate::model::Column::zeros(48, 300);
         state.sh.planes_mut().iter_mut().enumerate().for_each(|(k, x)| *x = (k as f32 * 0.618_034).fract() - 0.5);
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.spz");
-        let off = write_spz(&state, &path).unwrap();
+        let position_error = write_spz(&state, &path).unwrap();
         for (row, (place, visible, color, scales, q, sh)) in read(&path).into_iter().enumerate() {
             let near = |found: &[f64], expected: &[f64], within: f64, what: &str| {
                 for (a, b) in found.iter().zip(expected) {
@@ -238,10 +242,10 @@ mod tests {
                 }
             };
             let [x, y, z] = state.position.row::<3>(row).map(f64::from);
-            near(&place, &[x, -y, -z], 1.01 * off, "position");
+            near(&place, &[x, -y, -z], 1.01 * position_error, "position");
             near(&[visible], &[opacity(state.opacity_logit.row::<1>(row)[0])], 0.5 / 255.0, "opacity");
             let dc = state.sh.row::<3>(row).map(f64::from);
-            near(&color, &dc, 0.51 / 255.0 / 0.15, "colour");
+            near(&color, &dc, 0.51 / 255.0 / 0.15, "color");
             near(
                 &scales,
                 &state.log_scale.row::<3>(row).map(|s| f64::from(s).clamp(-10.0, 5.93)),
@@ -256,8 +260,8 @@ mod tests {
             for k in 1..16 {
                 let half = if k < 4 { 4.5 / 128.0 } else { 8.5 / 128.0 };
                 for c in 0..3 {
-                    let expected = f64::from(TURNED[k - 1] * state.sh.plane(3 * k + c)[row]);
-                    near(&[sh[3 * (k - 1) + c]], &[expected], half, "harmonics");
+                    let expected = f64::from(AXIS_SIGNS[k - 1] * state.sh.plane(3 * k + c)[row]);
+                    near(&[sh[3 * (k - 1) + c]], &[expected], half, "SH coefficient");
                 }
             }
         }
@@ -268,9 +272,9 @@ mod tests {
         assert!(write_spz(&state, &again).unwrap_err().to_string().contains("Gaussian 7"));
     }
 
-    /// Evaluates a color in a direction in both coordinate systems; the signs in [`TURNED`] must make both equal.
+    /// Evaluates a color in a direction in both coordinate systems; the signs in [`AXIS_SIGNS`] must make both equal.
     #[test]
-    fn harmonics_turn_with_the_axes() {
+    fn sh_signs_match_the_reversed_axes() {
         let basis = |[x, y, z]: [f64; 3]| -> [f64; 15] {
             [
                 -y,
@@ -293,7 +297,7 @@ mod tests {
         let direction = [0.48, -0.6, 0.64];
         let turned = basis([direction[0], -direction[1], -direction[2]]);
         for (k, (a, b)) in basis(direction).iter().zip(turned).enumerate() {
-            assert!((a * f64::from(TURNED[k]) - b).abs() < 1e-12, "function {k}");
+            assert!((a * f64::from(AXIS_SIGNS[k]) - b).abs() < 1e-12, "function {k}");
         }
     }
 }

@@ -130,7 +130,7 @@ mod tests {
     }
 
     #[test]
-    fn only_lines_that_are_read_have_a_longest_length() {
+    fn length_limit_applies_only_to_lines_read() {
         let long = [b"a\n".to_vec(), vec![b'x'; 1 << 20], b"\nb\n\xff\n".to_vec()].concat();
         let file = file(&long);
         let mut lines = TextLines::open(file.path()).unwrap();
@@ -144,7 +144,7 @@ mod tests {
     }
 
     #[test]
-    fn texts_in_other_encodings_are_named() {
+    fn other_encodings_are_named_in_errors() {
         let refused = |bytes: &[u8]| read_text(file(bytes).path(), 100).unwrap_err().to_string();
         assert!(refused(b"\xef\xbb\xbf\"\xe9").contains("byte 4") && refused(b"caf\xe9").contains("Latin-1"));
         assert!(refused(b"\xff\xfe{\0}\0").contains("UTF-16") && refused(&[b'a'; 101]).contains("at most 100 bytes"));

@@ -27,39 +27,39 @@ impl<W: Write + Seek> ZipOutput<W> {
         self.failed.map_or(Ok(()), Err)
     }
 
-    /// Returns the result of `done`. Returns `instead` if an earlier operation failed or `done` fails.
-    fn or<T>(&mut self, instead: T, done: impl FnOnce(&mut W) -> io::Result<T>) -> T {
+    /// Returns the result of `done`. Returns `fallback` if an earlier operation failed or `done` fails.
+    fn unless_failed<T>(&mut self, fallback: T, done: impl FnOnce(&mut W) -> io::Result<T>) -> T {
         if self.failed.is_some() {
-            return instead;
+            return fallback;
         }
         done(&mut self.inner).unwrap_or_else(|error| {
             self.failed = Some(error);
-            instead
+            fallback
         })
     }
 }
 
 impl<W: Write + Seek> Write for ZipOutput<W> {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
-        let written = self.or(bytes.len(), |inner| inner.write(bytes));
+        let written = self.unless_failed(bytes.len(), |inner| inner.write(bytes));
         self.at += written as u64;
         Ok(written)
     }
 
     fn flush(&mut self) -> io::Result<()> {
-        self.or((), W::flush);
+        self.unless_failed((), W::flush);
         Ok(())
     }
 }
 
 impl<W: Write + Seek> Seek for ZipOutput<W> {
     fn seek(&mut self, to: SeekFrom) -> io::Result<u64> {
-        let instead = match to {
+        let fallback = match to {
             SeekFrom::Start(at) => at,
             SeekFrom::Current(by) => self.at.saturating_add_signed(by),
             SeekFrom::End(_) => self.at,
         };
-        self.at = self.or(instead, |inner| inner.seek(to));
+        self.at = self.unless_failed(fallback, |inner| inner.seek(to));
         Ok(self.at)
     }
 }

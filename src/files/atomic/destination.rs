@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use splat_platform::{FileKind, is_system_folder};
 
-use super::named::{MARKER, Owner, entries, is_our_file, parts};
+use super::named::{MARKER, Owner, entries, is_our_file, split_target};
 use crate::error::{Error, Result, ShowPath};
 
 /// Kind of an output.
@@ -20,14 +20,14 @@ pub enum Kind {
 /// Policy for an output path that already exists.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize, serde::Deserialize)]
 pub enum Replace {
-    /// Nothing is replaced.
+    /// Existing outputs are never replaced.
     #[default]
     Never,
     /// Results of this program are replaced. In the folder of a result, only the files listed in its summary are
     /// replaced. Any other file stays where it is, or gets `.kept` appended to its name if the new result has a file of
     /// that name. A single file counts as a result if it is a container or if a summary beside it lists it.
     Ours,
-    /// Any file or folder is replaced; a folder with all its content.
+    /// Existing files and folders are replaced, folders with all their content.
     Any,
 }
 
@@ -57,7 +57,7 @@ pub(super) fn destination(target: &Path) -> Result<Destination> {
     let is_link = named.is_symlink();
     let found = match fs::metadata(target) {
         Ok(found) => found.file_type(),
-        Err(_) if is_link => return refuse("a link to nothing, which is not replaced"),
+        Err(_) if is_link => return refuse("a link to nothing (its target does not exist), which is not replaced"),
         Err(error) => return Err(Error::io("examine", target)(error)),
     };
     match FileKind::from_type(found) {
@@ -79,7 +79,7 @@ fn leads_through_system_link(target: &Path) -> bool {
     let mut link = target.to_owned();
     // Linux follows at most 40 links.
     for _ in 0..40 {
-        let Ok((parent, name)) = parts(&link) else { return false };
+        let Ok((parent, name)) = split_target(&link) else { return false };
         let Ok(parent) = fs::canonicalize(parent) else { return false };
         let Ok(leads_to) = fs::read_link(parent.join(name)) else { return false };
         if is_system_folder(&parent) {
@@ -105,7 +105,7 @@ pub(super) fn check_replace(target: &Path, kind: Kind, replace: Replace) -> Resu
         (Kind::Folder, Destination::Folder) if is_empty_folder(target) => Ok(()),
         (_, Destination::File | Destination::Folder | Destination::FolderLink) if replace == Replace::Never => {
             Err(Error::usage(format!(
-                "{shown} exists already\n  --overwrite replaces a result of splatsieve, --force whatever is there"
+                "{shown} exists already\n  --overwrite replaces a result of splatsieve, --force any file or folder"
             )))
         }
         (Kind::File, Destination::Folder | Destination::FolderLink) => {
@@ -117,8 +117,8 @@ pub(super) fn check_replace(target: &Path, kind: Kind, replace: Replace) -> Resu
         _ if replace == Replace::Any => Ok(()),
         (Kind::File, Destination::File) if is_our_file(target) => Ok(()),
         (Kind::File, Destination::File) => Err(Error::usage(format!(
-            "{shown} exists already, and nothing says that splatsieve wrote it: it is no container, and no summary beside \
-             it lists it\n  --force replaces it all the same; or give another output"
+            "{shown} exists already and is not a known result of splatsieve: it is not a container, and no {MARKER} beside \
+             it lists it\n  --force replaces it anyway; or give another output"
         ))),
         (Kind::Folder, Destination::Folder) => check_folder(target),
     }
@@ -131,7 +131,7 @@ fn check_folder(target: &Path) -> Result<()> {
         Owner::Listed(_) => Ok(()),
         Owner::Unknown => Err(Error::usage(format!(
             "{shown} is not a result of splatsieve (no {MARKER} of its own that lists its files), so --overwrite leaves it alone\n  \
-             --force replaces it with all that is in it; or give another output"
+             --force replaces it with all its content; or give another output"
         ))),
     }
 }
@@ -147,7 +147,7 @@ fn is_empty_folder(target: &Path) -> bool {
 /// # Errors
 /// Fails with [`Error::Usage`] if the target has no name, or if its folder does not exist or is not a folder.
 pub(super) fn real_parent(target: &Path) -> Result<PathBuf> {
-    let (parent, _) = parts(target)?;
+    let (parent, _) = split_target(target)?;
     let real = fs::canonicalize(&parent).map_err(|_| {
         Error::usage(format!(
             "{}: the folder {} to write it into does not exist; create it first",

@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 use splat_platform::FolderHandle;
 
 use super::destination::{Kind, Replace, check_replace};
-use super::named::{MARKER, carry_foreign, parts};
+use super::named::{MARKER, move_foreign_entries, split_target};
 use super::warnings::warn;
 use super::workspace::{
     DISCARDED, JOURNAL, Leftover, REPLACED, REPLACED_WHOLE, Refusal, SCRATCH, Workspace, is_unfinished, is_workspace,
@@ -19,9 +19,9 @@ use super::workspace::{
 use crate::error::{Error, Result, ShowPath};
 
 /// Maximum time to wait for another run that publishes a result under the same name, which takes milliseconds.
-const LONGEST_WAIT: Duration = Duration::from_secs(60);
+const MAX_WAIT: Duration = Duration::from_secs(60);
 /// Maximum time to wait until another run has finished inspecting an unfinished workspace, which takes microseconds.
-const LONGEST_LOOK: Duration = Duration::from_secs(5);
+const MAX_INSPECTION_WAIT: Duration = Duration::from_secs(5);
 /// Maximum length of a journal in bytes.
 const MAX_JOURNAL: u64 = 1 << 20;
 
@@ -38,7 +38,7 @@ impl PublishLock {
     /// # Errors
     /// Fails if another run or a foreign folder has the name of the lock for a minute, or if a system call fails.
     pub(super) fn acquire(target: &Path) -> Result<PublishLock> {
-        let (parent, name) = parts(target)?;
+        let (parent, name) = split_target(target)?;
         let name = publishing_name(name);
         let start = Instant::now();
         loop {
@@ -49,14 +49,14 @@ impl PublishLock {
             let folder = FolderHandle::open(&parent).map_err(Error::io("open", &parent))?;
             match Leftover::take(&folder, &name) {
                 Ok(leftover) => leftover.remove(&folder),
-                Err(_) if start.elapsed() > LONGEST_WAIT => {
+                Err(_) if start.elapsed() > MAX_WAIT => {
                     let source = io::Error::new(
                         io::ErrorKind::TimedOut,
                         format!(
                             "{} has existed for {} s: another run is writing this output, or was killed on a file system \
                              without locks or by another user\n  remove that folder if no other run is going on",
                             parent.join(&name).shown(),
-                            LONGEST_WAIT.as_secs()
+                            MAX_WAIT.as_secs()
                         ),
                     );
                     return Err(Error::io("write", target)(source));
@@ -78,8 +78,8 @@ pub(super) struct Journal {
 /// Repairs and removes leftovers of killed runs beside `target`: outputs with this name and scratch files.
 ///
 /// Never fails; leftovers that cannot be repaired stay and cause a warning.
-pub(super) fn tidy(target: &Path) {
-    let Ok((path, name)) = parts(target) else { return };
+pub(super) fn clean_up(target: &Path) {
+    let Ok((path, name)) = split_target(target) else { return };
     let Ok(parent) = FolderHandle::open(&path) else { return };
     let entries = parent.entries().unwrap_or_default();
     let left = |name: &OsStr| entries.iter().filter(|entry| is_workspace(entry, name)).collect::<Vec<_>>();
@@ -116,14 +116,14 @@ pub fn remove_leftovers(folder: &Path, ending: &str) {
 /// `supersedes`: the caller is about to publish a result. A publication that cannot be completed is then discarded, so
 /// that no later run completes it over that result.
 pub(super) fn repair(target: &Path, supersedes: bool) {
-    let Ok((path, name)) = parts(target) else { return };
+    let Ok((path, name)) = split_target(target) else { return };
     let Ok(parent) = FolderHandle::open(&path) else { return };
     for entry in parent.entries().unwrap_or_default().iter().filter(|entry| is_workspace(entry, name)) {
         if !parent.open_folder(entry).is_ok_and(|folder| is_unfinished(&folder)) {
             continue;
         }
         let Some(leftover) = take_unfinished(&parent, entry) else { continue };
-        if let Err(error) = settle(&leftover.folder, &parent, target) {
+        if let Err(error) = finish_publication(&leftover.folder, &parent, target) {
             let _ = if supersedes { leftover.folder.remove(JOURNAL) } else { Ok(()) };
             warn(format!("an interrupted run that wrote {} could not be repaired: {error}", target.shown()));
         }
@@ -138,7 +138,7 @@ fn take_unfinished(parent: &FolderHandle, name: &OsStr) -> Option<Leftover> {
     loop {
         match Leftover::take(parent, name) {
             Ok(leftover) => return Some(leftover),
-            Err(Refusal::Busy) if start.elapsed() < LONGEST_LOOK => std::thread::sleep(Duration::from_millis(1)),
+            Err(Refusal::Busy) if start.elapsed() < MAX_INSPECTION_WAIT => std::thread::sleep(Duration::from_millis(1)),
             Err(_) => return None,
         }
     }
@@ -149,10 +149,10 @@ fn take_unfinished(parent: &FolderHandle, name: &OsStr) -> Option<Leftover> {
 /// Files of a journal get their final names. An earlier folder gets its name back if no other entry has it. Otherwise
 /// its entries that its summary does not list are moved into the new folder. If that fails, for example because a
 /// folder belongs to another user, the earlier folder is kept beside the result under a visible name.
-pub(super) fn settle(folder: &FolderHandle, parent: &FolderHandle, target: &Path) -> Result<()> {
-    let (_, name) = parts(target)?;
+pub(super) fn finish_publication(folder: &FolderHandle, parent: &FolderHandle, target: &Path) -> Result<()> {
+    let (_, name) = split_target(target)?;
     if folder.has(JOURNAL) {
-        complete(folder, parent, target)?;
+        complete_journal(folder, parent, target)?;
     }
     for aside in [REPLACED, REPLACED_WHOLE] {
         if folder.has(aside) && !parent.has(name) {
@@ -170,7 +170,7 @@ pub(super) fn settle(folder: &FolderHandle, parent: &FolderHandle, target: &Path
     }
     let old = folder.open_folder(REPLACED).map_err(Error::io("open the earlier folder of", target))?;
     let carried = match parent.has_folder(name) {
-        true => carry_foreign(&old, target),
+        true => move_foreign_entries(&old, target),
         false => Err(io::Error::from(io::ErrorKind::NotADirectory)),
     };
     let Err(refused) = carried else {
@@ -193,9 +193,9 @@ pub(super) fn settle(folder: &FolderHandle, parent: &FolderHandle, target: &Path
 }
 
 /// Gives the remaining files of the journal their final names.
-fn complete(folder: &FolderHandle, parent: &FolderHandle, target: &Path) -> Result<()> {
+fn complete_journal(folder: &FolderHandle, parent: &FolderHandle, target: &Path) -> Result<()> {
     let failed = |error| Error::io("complete the interrupted output of", target)(error);
-    let (_, name) = parts(target)?;
+    let (_, name) = split_target(target)?;
     let mut text = Vec::new();
     let mut file = folder.open_file(JOURNAL, false).map_err(failed)?;
     (&mut file).take(MAX_JOURNAL).read_to_end(&mut text).map_err(failed)?;

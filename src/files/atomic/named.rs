@@ -79,7 +79,7 @@ pub(super) fn is_our_file(path: &Path) -> bool {
 }
 
 /// Adds the list `files` to the summary at `path`. Fails if the summary is not a JSON object.
-pub(super) fn name_files(path: &Path, files: &[String]) -> Result<()> {
+pub(super) fn add_file_list(path: &Path, files: &[String]) -> Result<()> {
     let text = fs::read_to_string(path).map_err(Error::io("read back", path))?;
     let found: serde_json::Value = serde_json::from_str(&text).unwrap_or_default();
     // Edit the text, so that the other entries keep their order.
@@ -118,7 +118,7 @@ pub(super) fn files_below(folder: &Path) -> Result<Vec<String>> {
 ///
 /// Entries that cannot be moved stay, and the first failure is returned. The function may be repeated after an
 /// interruption at any point: every entry is always in exactly one of the two folders.
-pub(super) fn carry_foreign(old: &FolderHandle, new: &Path) -> io::Result<()> {
+pub(super) fn move_foreign_entries(old: &FolderHandle, new: &Path) -> io::Result<()> {
     let listed = match old.open_file(MARKER, false).map(Owner::read_file) {
         Ok(Owner::Listed(listed)) => listed,
         _ => BTreeSet::new(),
@@ -126,7 +126,7 @@ pub(super) fn carry_foreign(old: &FolderHandle, new: &Path) -> io::Result<()> {
     let mut foreign = Vec::new();
     let mut result = find_foreign(old, new, Path::new(""), &listed, &mut foreign);
     for relative in foreign {
-        let to = free_place(new, &relative);
+        let to = unused_path(new, &relative);
         let made = to.parent().map_or(Ok(()), fs::create_dir_all);
         result = result.and(made.and_then(|()| old.move_to(&relative, &to)));
     }
@@ -166,13 +166,13 @@ fn find_foreign(
 }
 
 /// Returns an unused path below `folder` for `relative`. Names that are in the way of it get `.kept` appended.
-fn free_place(folder: &Path, relative: &Path) -> PathBuf {
+fn unused_path(folder: &Path, relative: &Path) -> PathBuf {
     let mut place = folder.to_owned();
     let mut components = relative.components().peekable();
     while let Some(component) = components.next() {
         let mut name = component.as_os_str().to_owned();
         let is_last = components.peek().is_none();
-        while present(&place.join(&name)) && (is_last || !is_folder(&place.join(&name))) {
+        while exists(&place.join(&name)) && (is_last || !is_folder(&place.join(&name))) {
             name.push(".kept");
         }
         place.push(name);
@@ -195,7 +195,7 @@ pub(super) fn entries(folder: &Path) -> Result<Vec<OsString>> {
 }
 
 /// Returns whether an entry exists at `path`, including dangling links.
-pub(super) fn present(path: &Path) -> bool {
+pub(super) fn exists(path: &Path) -> bool {
     fs::symlink_metadata(path).is_ok()
 }
 
@@ -205,9 +205,12 @@ fn is_folder(path: &Path) -> bool {
 }
 
 /// Splits a target into its folder and its name. Fails if it has no name.
-pub(super) fn parts(target: &Path) -> Result<(PathBuf, &OsStr)> {
+pub(super) fn split_target(target: &Path) -> Result<(PathBuf, &OsStr)> {
     let Some(name) = target.file_name() else {
-        return Err(Error::usage(format!("{} is no name for an output", quoted(&target.to_string_lossy()))));
+        return Err(Error::usage(format!(
+            "{} cannot be the name of an output; give a file or folder name",
+            quoted(&target.to_string_lossy())
+        )));
     };
     let parent = target.parent().filter(|parent| !parent.as_os_str().is_empty());
     Ok((parent.unwrap_or(Path::new(".")).to_owned(), name))

@@ -7,10 +7,10 @@ use std::path::Path;
 use splat_platform::{FolderHandle, sync_file, sync_folder};
 
 use super::destination::{Kind, Replace, check_replace};
-use super::leftovers::{Journal, PublishLock, repair, settle};
-use super::named::{parts, present};
+use super::leftovers::{Journal, PublishLock, finish_publication, repair};
+use super::named::{exists, split_target};
 use super::warnings::warn;
-use super::workspace::{JOURNAL, REPLACED, REPLACED_WHOLE, Workspace, live};
+use super::workspace::{JOURNAL, REPLACED, REPLACED_WHOLE, Workspace, live_workspaces};
 use crate::error::{Error, Result, ShowPath};
 
 /// Renames files from `workspace` to their targets, in order. The last one is the output itself, the others are its
@@ -28,7 +28,7 @@ pub(super) fn publish_files(workspace: &Workspace, files: &[(String, &Path)], re
     for (_, target) in files {
         check_replace(target, Kind::File, replace)?;
     }
-    let held = live();
+    let held = live_workspaces();
     let journal = workspace.folder.join(JOURNAL);
     if files.len() > 1 {
         write_journal(workspace, files, replace)?;
@@ -49,7 +49,7 @@ pub(super) fn publish_files(workspace: &Workspace, files: &[(String, &Path)], re
 
 /// Writes and syncs the journal of the files in `workspace`.
 fn write_journal(workspace: &Workspace, files: &[(String, &Path)], replace: Replace) -> Result<()> {
-    let names = files.iter().map(|(content, target)| Ok((content.clone(), parts(target)?.1.to_owned())));
+    let names = files.iter().map(|(content, target)| Ok((content.clone(), split_target(target)?.1.to_owned())));
     let journal = Journal { replace, files: names.collect::<Result<Vec<(String, OsString)>>>()? };
     let text = serde_json::to_vec(&journal).expect("plain data");
     // Write under another name until it is complete.
@@ -74,9 +74,9 @@ pub(super) fn publish_folder(workspace: &Workspace, target: &Path, replace: Repl
     let lock = PublishLock::acquire(target)?;
     repair(target, true);
     check_replace(target, Kind::Folder, replace)?;
-    let held = live();
+    let held = live_workspaces();
     let aside = workspace.folder.join(if replace == Replace::Any { REPLACED_WHOLE } else { REPLACED });
-    if present(target) {
+    if exists(target) {
         workspace.sync().map_err(Error::io("sync", &workspace.folder))?;
         fs::rename(target, &aside).map_err(Error::io("move aside", target))?;
     }
@@ -84,13 +84,14 @@ pub(super) fn publish_folder(workspace: &Workspace, target: &Path, replace: Repl
         let _ = fs::rename(&aside, target);
         return Err(Error::io("write", target)(error));
     }
-    let (parent, _) = parts(target)?;
+    let (parent, _) = split_target(target)?;
     let handles = FolderHandle::open(&workspace.folder).and_then(|folder| Ok((folder, FolderHandle::open(&parent)?)));
-    let settled =
-        handles.map_err(Error::io("open", &parent)).and_then(|(folder, parent)| settle(&folder, &parent, target));
+    let settled = handles
+        .map_err(Error::io("open", &parent))
+        .and_then(|(folder, parent)| finish_publication(&folder, &parent, target));
     if let Err(error) = settled {
         warn(format!(
-            "{} is complete and in place, but the earlier folder could not be dealt with ({error}); the next run with this \
+            "{} is complete and in place, but the earlier folder could not be cleaned up ({error}); the next run with this \
              output tries again",
             target.shown()
         ));
@@ -103,7 +104,7 @@ pub(super) fn publish_folder(workspace: &Workspace, target: &Path, replace: Repl
 
 /// Syncs the name of a published output to disk. A failure is only a warning, because the output is in place.
 fn sync_parent(target: &Path) {
-    let Ok((parent, _)) = parts(target) else { return };
+    let Ok((parent, _)) = split_target(target) else { return };
     if let Err(error) = sync_folder(&parent) {
         warn(format!(
             "{} is complete and in place, but its name could not be written through to the disk ({error}): a power failure \

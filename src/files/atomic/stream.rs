@@ -12,7 +12,7 @@ use super::destination::{Destination, destination};
 use crate::error::{Error, Result, ShowPath};
 
 /// Maximum time to wait for a program to open the other end of a FIFO.
-const LONGEST_WAIT: Duration = Duration::from_secs(10);
+const MAX_WAIT: Duration = Duration::from_secs(10);
 
 /// Whether an output was written to standard output.
 static IS_STANDARD_OUTPUT_USED: AtomicBool = AtomicBool::new(false);
@@ -42,14 +42,14 @@ pub(super) fn copy(content: &Path, target: &Path) -> Result<()> {
     Ok(())
 }
 
-/// Opens a device or FIFO for writing. Retries for [`LONGEST_WAIT`] if no program reads a FIFO, then fails.
+/// Opens a device or FIFO for writing. Retries for [`MAX_WAIT`] if no program reads a FIFO, then fails.
 fn open(target: &Path) -> io::Result<File> {
     let start = Instant::now();
     loop {
         if let Some(file) = open_stream(target)? {
             return Ok(file);
         }
-        if start.elapsed() > LONGEST_WAIT {
+        if start.elapsed() > MAX_WAIT {
             return Err(io::Error::new(
                 io::ErrorKind::TimedOut,
                 "no program has opened this FIFO for reading for 10 s",

@@ -19,7 +19,7 @@ use std::time::Duration;
 
 use splat_platform::{FileIdentity, FolderHandle, create_private_folder, private_permissions};
 
-use super::named::{parts, present};
+use super::named::{exists, split_target};
 use crate::error::{Error, Result};
 
 /// Target name of scratch files in any folder.
@@ -46,12 +46,12 @@ const UNFINISHED: [&str; 3] = [REPLACED, REPLACED_WHOLE, JOURNAL];
 
 /// Workspaces of this process and the identity of their folders. A thread that publishes a result holds the guard, so
 /// that a signal is handled either before the result has its name or after.
-static LIVE: Mutex<BTreeMap<PathBuf, FileIdentity>> = Mutex::new(BTreeMap::new());
+static LIVE_WORKSPACES: Mutex<BTreeMap<PathBuf, FileIdentity>> = Mutex::new(BTreeMap::new());
 
 /// Locks the table of workspaces of this process.
-pub(super) fn live() -> MutexGuard<'static, BTreeMap<PathBuf, FileIdentity>> {
+pub(super) fn live_workspaces() -> MutexGuard<'static, BTreeMap<PathBuf, FileIdentity>> {
     // The map is consistent even if a thread panicked while holding the lock.
-    LIVE.lock().unwrap_or_else(PoisonError::into_inner)
+    LIVE_WORKSPACES.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// Hidden folder for the content of one target. Dropping it removes the folder.
@@ -66,13 +66,13 @@ pub(super) struct Workspace {
 impl Workspace {
     /// Creates a workspace beside `target`.
     pub(super) fn beside(target: &Path) -> Result<Workspace> {
-        let (parent, name) = parts(target)?;
+        let (parent, name) = split_target(target)?;
         let mut prefix = OsString::from(".");
         prefix.push(name);
         prefix.push(".");
         loop {
             // Held until the folder is in the table, so that a signal handler knows it.
-            let mut live = live();
+            let mut live = live_workspaces();
             let mut builder = tempfile::Builder::new();
             builder.prefix(&prefix).suffix(ENDING);
             // Private permissions: [`Leftover::take`] recognizes the folder by them before its lock file has the line.
@@ -80,7 +80,7 @@ impl Workspace {
                 builder.permissions(private);
             }
             let made = builder.tempdir_in(&parent).map_err(Error::io("create a folder in", &parent))?;
-            let claimed = claim(made.path()).map_err(Error::io("create a lock in", made.path()))?;
+            let claimed = lock_and_mark(made.path()).map_err(Error::io("create a lock in", made.path()))?;
             if let Some(workspace) = claimed {
                 let _ = made.keep();
                 live.insert(workspace.folder.clone(), workspace.identity);
@@ -92,12 +92,12 @@ impl Workspace {
     /// Creates the workspace `name` in the folder `parent`; `None` if the name is taken.
     pub(super) fn with_name(parent: &Path, name: &OsStr) -> io::Result<Option<Workspace>> {
         let folder = parent.join(name);
-        let mut live = live();
+        let mut live = live_workspaces();
         match create_private_folder(&folder) {
             Err(error) if error.kind() == io::ErrorKind::AlreadyExists => return Ok(None),
             made => made?,
         }
-        let claimed = claim(&folder);
+        let claimed = lock_and_mark(&folder);
         match &claimed {
             Ok(Some(workspace)) => _ = live.insert(folder, workspace.identity),
             Ok(None) => (),
@@ -116,7 +116,7 @@ impl Workspace {
 
     /// Returns whether the workspace holds entries that must not be deleted with it.
     fn is_unfinished(&self) -> bool {
-        UNFINISHED.iter().any(|name| present(&self.folder.join(name)))
+        UNFINISHED.iter().any(|name| exists(&self.folder.join(name)))
     }
 
     /// Syncs the lock file and the names in the workspace to disk.
@@ -130,10 +130,10 @@ impl Workspace {
 
 impl Drop for Workspace {
     fn drop(&mut self) {
-        let mut live = live();
+        let mut live = live_workspaces();
         live.remove(&self.folder);
         if !self.is_unfinished() {
-            dismantle(&self.folder, self.identity, self.lock.take());
+            remove_workspace(&self.folder, self.identity, self.lock.take());
         }
     }
 }
@@ -172,7 +172,7 @@ fn hidden_name<'a>(entry: &'a OsStr, ending: &str) -> Option<&'a str> {
 
 /// Translates a path in a workspace into the path that the user gave: the target or a file in it. For a scratch file,
 /// whose name means nothing to the user, returns its folder and `true`. Returns `None` for other paths.
-pub(super) fn named_in(path: &Path) -> Option<(PathBuf, bool)> {
+pub(super) fn user_path(path: &Path) -> Option<(PathBuf, bool)> {
     let mut parts = path.components();
     let mut before = PathBuf::new();
     let name = loop {
@@ -205,17 +205,17 @@ pub struct Withdrawn(
 ///
 /// Waits for a result that is being published, which is then complete. Files outside workspaces stay.
 pub fn withdraw_all() -> Withdrawn {
-    let mut live = live();
+    let mut live = live_workspaces();
     for (folder, identity) in std::mem::take(&mut *live) {
-        if UNFINISHED.iter().any(|name| present(&folder.join(name))) {
+        if UNFINISHED.iter().any(|name| exists(&folder.join(name))) {
             continue;
         }
         // Threads that are still writing into it fail from here on, because the folder is gone.
         let _ = fs::rename(folder.join(CONTENT), folder.join(DISCARDED));
         // A thread may be creating a file while the folder is emptied, so try again.
         for _ in 0..100 {
-            dismantle(&folder, identity, None);
-            if !present(&folder) {
+            remove_workspace(&folder, identity, None);
+            if !exists(&folder) {
                 break;
             }
             std::thread::sleep(Duration::from_millis(1));
@@ -225,7 +225,7 @@ pub fn withdraw_all() -> Withdrawn {
 }
 
 /// Locks and marks the new workspace `folder`; `None` if another run mistook it for a leftover and is removing it.
-fn claim(folder: &Path) -> io::Result<Option<Workspace>> {
+fn lock_and_mark(folder: &Path) -> io::Result<Option<Workspace>> {
     let lost = |error: io::Error| match error.kind() {
         io::ErrorKind::NotFound | io::ErrorKind::AlreadyExists => Ok(None),
         _ => Err(error),
@@ -261,9 +261,9 @@ pub(super) struct Leftover {
 /// Reason why a workspace may not be taken as a leftover.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Refusal {
-    /// Its run is going on, or another run is inspecting it.
+    /// Workspace whose run is going on, or that another run is inspecting.
     Busy,
-    /// It is gone, or was not created by this program for this user.
+    /// Workspace that is gone, or that this program did not create for this user.
     Foreign,
 }
 
@@ -275,7 +275,7 @@ impl Leftover {
         let status = folder.status().map_err(foreign)?;
         // Skip workspaces of this process: a network file system may release this process's own lock when the lock file
         // is opened a second time.
-        if !status.is_own || live().values().any(|&identity| identity == status.identity) {
+        if !status.is_own || live_workspaces().values().any(|&identity| identity == status.identity) {
             return Err(Refusal::Foreign);
         }
         let mut lock = match folder.open_file(LOCK, true) {
@@ -305,25 +305,25 @@ impl Leftover {
 
     /// Removes the workspace. Entries that cannot be removed stay and are harmless.
     pub(super) fn remove(self, parent: &FolderHandle) {
-        empty(&self.folder, Some(self.lock));
+        remove_content(&self.folder, Some(self.lock));
         let _ = parent.remove_empty(&self.name);
     }
 }
 
 /// Removes the workspace at `folder` if it still has this identity.
-fn dismantle(folder: &Path, identity: FileIdentity, lock: Option<File>) {
-    let Ok((parent, name)) = parts(folder) else { return };
+fn remove_workspace(folder: &Path, identity: FileIdentity, lock: Option<File>) {
+    let Ok((parent, name)) = split_target(folder) else { return };
     let Ok(parent) = FolderHandle::open(&parent) else { return };
     let Ok(handle) = parent.open_folder(name) else { return };
     if handle.status().is_ok_and(|status| status.identity == identity) {
-        empty(&handle, lock);
+        remove_content(&handle, lock);
         let _ = parent.remove_empty(name);
     }
 }
 
 /// Removes everything in a workspace. The lock file goes last and before the lock is released: a run that gets the lock
 /// afterwards sees that the file is gone.
-fn empty(folder: &FolderHandle, lock: Option<File>) {
+fn remove_content(folder: &FolderHandle, lock: Option<File>) {
     for entry in folder.entries().unwrap_or_default().iter().filter(|entry| *entry != LOCK) {
         let _ = folder.remove(entry);
     }

@@ -28,7 +28,7 @@ enum Token {
 
 /// Reader that passes on UTF-8 text and fails for other bytes and for strings, numbers or nesting beyond the limits.
 #[derive(Debug)]
-pub(super) struct Checked<R> {
+pub(super) struct CheckedReader<R> {
     file: R,
     path: PathBuf,
     buffer: Vec<u8>,
@@ -47,10 +47,10 @@ pub(super) struct Checked<R> {
     refusal: Option<Error>,
 }
 
-impl<R: Read> Checked<R> {
+impl<R: Read> CheckedReader<R> {
     /// Starts a checked reader of `file`; `path` names it in messages.
-    pub(super) fn new(file: R, path: &Path) -> Checked<R> {
-        Checked {
+    pub(super) fn new(file: R, path: &Path) -> CheckedReader<R> {
+        CheckedReader {
             file,
             path: path.to_owned(),
             buffer: vec![0; BUFFER],
@@ -207,7 +207,7 @@ impl<R: Read> Checked<R> {
     }
 }
 
-impl<R: Read> Read for Checked<R> {
+impl<R: Read> Read for CheckedReader<R> {
     #[inline]
     fn read(&mut self, out: &mut [u8]) -> IoResult<usize> {
         if self.taken == self.checked {

@@ -108,7 +108,7 @@ macro_rules! ignore_scalars {
 }
 
 /// Implements [`DeserializeSeed`] for a visitor that accepts any value.
-macro_rules! any {
+macro_rules! seed_from_visitor {
     ($type:ty) => {
         impl<'de> DeserializeSeed<'de> for $type {
             type Value = ();
@@ -122,7 +122,7 @@ macro_rules! any {
 
 /// Visitor of a document that holds lists.
 struct Document<'a, 'b>(&'a mut Lists<'b>);
-any!(Document<'_, '_>);
+seed_from_visitor!(Document<'_, '_>);
 
 impl<'de> Visitor<'de> for Document<'_, '_> {
     type Value = ();
@@ -151,7 +151,7 @@ struct List<'a, 'b> {
     lists: &'a mut Lists<'b>,
     key: usize,
 }
-any!(List<'_, '_>);
+seed_from_visitor!(List<'_, '_>);
 
 impl<'de> Visitor<'de> for List<'_, '_> {
     type Value = ();
@@ -162,7 +162,7 @@ impl<'de> Visitor<'de> for List<'_, '_> {
         for index in 0.. {
             let at = JsonPlace { key: self.key, index, inner: None };
             let value = match ask.nested {
-                true => list.next_element_seed(Within { lists: self.lists, at })?,
+                true => list.next_element_seed(InnerList { lists: self.lists, at })?,
                 false => list.next_element_seed(Keep { wanted: ask.wanted, elements: MAX_ELEMENTS })?,
             };
             let Some(value) = value else { break };
@@ -177,12 +177,12 @@ impl<'de> Visitor<'de> for List<'_, '_> {
 }
 
 /// Visitor of an element that should be a list itself. Its own value is a description without its elements.
-struct Within<'a, 'b> {
+struct InnerList<'a, 'b> {
     lists: &'a mut Lists<'b>,
     at: JsonPlace,
 }
 
-impl<'de> DeserializeSeed<'de> for Within<'_, '_> {
+impl<'de> DeserializeSeed<'de> for InnerList<'_, '_> {
     type Value = Small;
 
     fn deserialize<D: Deserializer<'de>>(self, from: D) -> std::result::Result<Small, D::Error> {
@@ -190,7 +190,7 @@ impl<'de> DeserializeSeed<'de> for Within<'_, '_> {
     }
 }
 
-impl<'de> Visitor<'de> for Within<'_, '_> {
+impl<'de> Visitor<'de> for InnerList<'_, '_> {
     type Value = Small;
 
     fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -243,7 +243,7 @@ struct Entries<'a> {
     each: &'a mut dyn FnMut(&str, Small) -> Result<()>,
     stopped: &'a Stopped,
 }
-any!(Entries<'_>);
+seed_from_visitor!(Entries<'_>);
 
 impl<'de> Visitor<'de> for Entries<'_> {
     type Value = ();
@@ -305,7 +305,7 @@ mod tests {
     }
 
     #[test]
-    fn an_error_of_the_receiver_ends_the_reading_and_comes_back() {
+    fn error_of_the_callback_ends_reading() {
         let file = file("[1, 2, 3");
         let ask = Ask { keys: &[], nested: false, wanted: &[] };
         let error = each_element(file.path(), ask, |at, _| match at.index {

@@ -144,32 +144,32 @@ impl<'de> DeserializeSeed<'de> for Keep<'_> {
     type Value = Small;
 
     fn deserialize<D: Deserializer<'de>>(self, from: D) -> Result<Small, D::Error> {
-        from.deserialize_any(Inner { keep: &self, left: &mut MAX_VALUES.clone(), depth: 0 })
+        from.deserialize_any(NestedValue { keep: &self, remaining: &mut MAX_VALUES.clone(), depth: 0 })
     }
 }
 
 /// Seed and visitor of a value within another one.
-struct Inner<'a> {
+struct NestedValue<'a> {
     keep: &'a Keep<'a>,
     /// Number of values that may still be kept of the entry.
-    left: &'a mut usize,
+    remaining: &'a mut usize,
     depth: usize,
 }
 
-impl<'a> Inner<'a> {
+impl<'a> NestedValue<'a> {
     /// Returns the seed of the next value one level deeper.
-    fn inner(&mut self) -> Inner<'_> {
-        Inner { keep: self.keep, left: self.left, depth: self.depth + 1 }
+    fn next_level(&mut self) -> NestedValue<'_> {
+        NestedValue { keep: self.keep, remaining: self.remaining, depth: self.depth + 1 }
     }
 }
 
-impl<'de> DeserializeSeed<'de> for Inner<'_> {
+impl<'de> DeserializeSeed<'de> for NestedValue<'_> {
     type Value = Small;
 
     fn deserialize<D: Deserializer<'de>>(self, from: D) -> Result<Small, D::Error> {
-        match self.left.checked_sub(1) {
-            Some(left) => {
-                *self.left = left;
+        match self.remaining.checked_sub(1) {
+            Some(remaining) => {
+                *self.remaining = remaining;
                 from.deserialize_any(self)
             }
             None => IgnoredAny::deserialize(from).map(|IgnoredAny| Small::Large("a value of many parts".into())),
@@ -177,7 +177,7 @@ impl<'de> DeserializeSeed<'de> for Inner<'_> {
     }
 }
 
-impl<'de> Visitor<'de> for Inner<'_> {
+impl<'de> Visitor<'de> for NestedValue<'_> {
     type Value = Small;
 
     fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -215,7 +215,7 @@ impl<'de> Visitor<'de> for Inner<'_> {
         let (mut kept, mut total) = (Vec::new(), 0);
         let most = self.keep.elements;
         while kept.len() < most {
-            let Some(element) = list.next_element_seed(self.inner())? else { break };
+            let Some(element) = list.next_element_seed(self.next_level())? else { break };
             kept.push(element);
             total += 1;
         }
@@ -241,8 +241,10 @@ impl<'de> Visitor<'de> for Inner<'_> {
             }
             // Each entry of the document has a limit of its own, so that a large one cannot crowd out a wanted one.
             let value = match self.depth {
-                0 => map.next_value_seed(Inner { keep: self.keep, left: &mut MAX_VALUES.clone(), depth: 1 })?,
-                _ => map.next_value_seed(self.inner())?,
+                0 => {
+                    map.next_value_seed(NestedValue { keep: self.keep, remaining: &mut MAX_VALUES.clone(), depth: 1 })?
+                }
+                _ => map.next_value_seed(self.next_level())?,
             };
             object.set(&key, value);
         }
