@@ -246,7 +246,7 @@ fn ground_truth_is_compared_where_it_exists_and_the_number_is_said() {
     assert!(commas.windows(2).all(|pair| pair[0] == pair[1]), "{csv}");
     fs::remove_dir_all(workplace.path("photos")).unwrap();
     fs::create_dir(workplace.path("photos")).unwrap();
-    workplace.refused(1, line, &["photos", "no such file, nor one of another picture"]);
+    workplace.refused(1, line, &["photos", "no such file, and no photograph of any other view"]);
 }
 
 #[test]
