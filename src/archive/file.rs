@@ -56,7 +56,7 @@ pub struct ArchiveSize {
     pub cloud: u64,
     /// Bytes of the deformation field.
     pub field: u64,
-    /// All other bytes.
+    /// Number of all other bytes.
     pub rest: u64,
 }
 

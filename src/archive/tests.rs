@@ -9,26 +9,26 @@ use super::*;
 use crate::deform::{Tensor, tap};
 
 /// Deterministic pseudo-random numbers.
-struct Random(u64);
+struct SeededNoise(u64);
 
-impl Random {
+impl SeededNoise {
     fn next(&mut self) -> f32 {
         self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
         (self.0 >> 40) as f32 / (1 << 23) as f32 - 1.0
     }
 }
 
-fn tensor(random: &mut Random, shape: &[usize]) -> Tensor {
-    let data = (0..shape.iter().product()).map(|_| random.next()).collect();
+fn tensor(noise: &mut SeededNoise, shape: &[usize]) -> Tensor {
+    let data = (0..shape.iter().product()).map(|_| noise.next()).collect();
     Tensor { shape: shape.to_vec(), data }
 }
 
 /// Returns a content of `count` Gaussians with tensors of every role.
 fn content(seed: u64, count: usize, sh_degree: usize) -> Content {
-    let mut random = Random(seed);
+    let mut noise = SeededNoise(seed);
     let mut cloud = Gaussians::zeros(count, sh_degree);
     for column in cloud.columns_mut(Columns::all()) {
-        column.planes_mut().iter_mut().for_each(|value| *value = 3.0 * random.next());
+        column.planes_mut().iter_mut().for_each(|value| *value = 3.0 * noise.next());
     }
     let mut content = Content { cloud, times: [0.0, 1.0], ..Content::default() };
     let plane = [1, 3, 7, 9];
@@ -44,7 +44,7 @@ fn content(seed: u64, count: usize, sh_degree: usize) -> Content {
         ("a.exact", &[2, 2, 2], Role::Exact),
         ("a.unread", &[4, 4], Role::Unread),
     ] {
-        content.tensors.insert(name.to_owned(), tensor(&mut random, shape));
+        content.tensors.insert(name.to_owned(), tensor(&mut noise, shape));
         content.field.insert(name.to_owned(), role);
     }
     let corners = Tensor { shape: vec![2, 3], data: vec![2.5, 2.0, 3.5, -2.5, -3.0, -2.0] };
@@ -264,7 +264,7 @@ fn malformed_tensors_are_refused_by_name() {
     let steps = some_steps(&whole, -4);
     for shape in [&[7][..], &[2, 1, 4, 4], &[1, 1, 0, 4]] {
         let mut odd = whole.clone();
-        odd.tensors.insert("a.plane.xy".to_owned(), tensor(&mut Random(1), shape));
+        odd.tensors.insert("a.plane.xy".to_owned(), tensor(&mut SeededNoise(1), shape));
         let message = encode(&odd, &steps).map(|_| ()).unwrap_err().to_string();
         assert!(message.contains("a.plane.xy") && message.contains(&format!("{shape:?}")), "{message}");
     }

@@ -32,7 +32,7 @@ pub enum Times {
 }
 
 impl Times {
-    /// Returns the text that [`Times::named`] parses to this value; `None` for [`Times::Own`].
+    /// Parses the value of `--times`: `names`, `none`, or the path of a table.
     pub fn named(text: &str) -> Times {
         match text {
             "names" => Times::Names,
@@ -41,7 +41,7 @@ impl Times {
         }
     }
 
-    /// What [`Times::named`] takes; none of the cameras' own.
+    /// Returns the text that [`Times::named`] parses to this value; `None` for [`Times::Own`].
     pub fn name(&self) -> Option<String> {
         match self {
             Times::Own => None,

@@ -16,12 +16,17 @@ const FRAMES: usize = 2 * FRAME_BLOCK + 5;
 /// Source that covers every encoding of a tile: positions are noise in the first Gaussian block (zstd cannot compress
 /// it) and curves in the others; opacities change only in the second frame block; rotations are constant in the last
 /// Gaussian block; scales and colors never change.
-struct Made(SequenceInfo);
+struct EncodingSource(SequenceInfo);
 
-impl Made {
-    fn new() -> Made {
+impl EncodingSource {
+    fn new() -> EncodingSource {
         let varying = Columns::POSITION | Columns::ROTATION | Columns::OPACITY;
-        Made(SequenceInfo { count: COUNT, times: (0..FRAMES).map(|t| t as f64).collect(), sh_degree: 1, varying })
+        EncodingSource(SequenceInfo {
+            count: COUNT,
+            times: (0..FRAMES).map(|t| t as f64).collect(),
+            sh_degree: 1,
+            varying,
+        })
     }
 
     fn pack(&self, compression: Compression) -> (tempfile::TempDir, Container) {
@@ -52,29 +57,32 @@ impl Made {
             let to = out.column_mut(column);
             to.resize(ids.len());
             for c in 0..to.width() {
-                to.plane_mut(c).iter_mut().zip(ids.iter()).for_each(|(x, id)| *x = Made::value(column, id, c, frame));
+                to.plane_mut(c)
+                    .iter_mut()
+                    .zip(ids.iter())
+                    .for_each(|(x, id)| *x = EncodingSource::value(column, id, c, frame));
             }
         }
         out
     }
 }
 
-impl FrameSource for Made {
+impl FrameSource for EncodingSource {
     fn info(&self) -> &SequenceInfo {
         &self.0
     }
 
     fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>> {
-        Ok(Box::new(MadeReader(self, ids.iter().map(|id| id as u32).collect())))
+        Ok(Box::new(EncodingReader(self, ids.iter().map(|id| id as u32).collect())))
     }
 }
 
-struct MadeReader<'a>(&'a Made, Vec<u32>);
+struct EncodingReader<'a>(&'a EncodingSource, Vec<u32>);
 
-impl BlockReader for MadeReader<'_> {
+impl BlockReader for EncodingReader<'_> {
     fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
-        let made = self.0.expected(&Ids::List(&self.1), frame, want);
-        want.iter().for_each(|column| *out.column_mut(column) = made.column(column).clone());
+        let source = self.0.expected(&Ids::List(&self.1), frame, want);
+        want.iter().for_each(|column| *out.column_mut(column) = source.column(column).clone());
         Ok(())
     }
 }
@@ -93,20 +101,20 @@ fn blocks(scattered: &[u32]) -> [Ids<'_>; 5] {
 
 #[test]
 fn frames_are_independent_of_order_and_of_held_frames() {
-    let made = Made::new();
+    let source = EncodingSource::new();
     let scattered = [COUNT as u32 - 1, 5, 6, 7, 2000, 4, 1024, 1023];
     for compression in [Compression::Zstd(1), Compression::Raw] {
-        let (_folder, container) = made.pack(compression);
+        let (_folder, container) = source.pack(compression);
         for ids in blocks(&scattered) {
             for held in [1, 3, FRAME_BLOCK, usize::MAX] {
                 let mut reader = container.open(ids.clone()).unwrap();
                 reader.expect(&ReadPlan::every().holding(held));
                 for k in 0..3 * FRAMES / 2 {
                     let frame = if k < FRAMES { k } else { hash_id(k as u64) as usize % FRAMES };
-                    let want = if k % 7 == 0 { Columns::all() } else { made.info().varying };
+                    let want = if k % 7 == 0 { Columns::all() } else { source.info().varying };
                     let mut got = Gaussians::zeros(0, 1);
                     reader.read(frame, want, &mut got).unwrap();
-                    let expected = made.expected(&ids, frame, want);
+                    let expected = source.expected(&ids, frame, want);
                     assert!(got == expected, "{compression:?}, {ids:?}, holding {held}: frame {frame} is wrong");
                 }
             }
@@ -116,10 +124,10 @@ fn frames_are_independent_of_order_and_of_held_frames() {
 
 #[test]
 fn a_reader_keeps_no_more_than_allowed() {
-    let made = Made::new();
-    let varying = made.info().varying.width(1);
+    let source = EncodingSource::new();
+    let varying = source.info().varying.width(1);
     let scattered: Vec<u32> = (0..COUNT as u32).step_by(3).collect();
-    let (_folder, container) = made.pack(Compression::Zstd(1));
+    let (_folder, container) = source.pack(Compression::Zstd(1));
     for ids in blocks(&scattered) {
         for held in [1, 3, FRAME_BLOCK] {
             let mut reader = TileReader::new(&container, &ids);
@@ -161,38 +169,38 @@ fn all_tiles(container: &Container) -> (u64, u64) {
 }
 
 /// Reads every frame in Gaussian blocks, as a scan does, and compares positions.
-fn scan(made: &Made, container: &Container) {
+fn scan(source: &EncodingSource, container: &Container) {
     (0..COUNT.div_ceil(GAUSSIAN_BLOCK)).into_par_iter().for_each(|block| {
         let ids = Ids::Range(block * GAUSSIAN_BLOCK..COUNT.min((block + 1) * GAUSSIAN_BLOCK));
         let mut reader = container.open(ids.clone()).unwrap();
         let mut got = Gaussians::zeros(0, 1);
         for frame in 0..FRAMES {
-            let want = if frame == 0 { Columns::all() } else { made.info().varying };
+            let want = if frame == 0 { Columns::all() } else { source.info().varying };
             reader.read(frame, want, &mut got).unwrap();
-            assert!(got.position == made.expected(&ids, frame, Columns::POSITION).position, "{ids:?}, frame {frame}");
+            assert!(got.position == source.expected(&ids, frame, Columns::POSITION).position, "{ids:?}, frame {frame}");
         }
     });
 }
 
 #[test]
 fn a_scan_reads_each_stored_byte_once() {
-    let made = Made::new();
+    let source = EncodingSource::new();
     for compression in [Compression::Zstd(1), Compression::Raw] {
-        let (_folder, container) = made.pack(compression);
+        let (_folder, container) = source.pack(compression);
         assert_eq!(container.reads(), Reads::default());
         let (tiles, bytes) = all_tiles(&container);
         let once = Reads { bytes, tiles, states: (COUNT * FRAMES) as u64 };
-        scan(&made, &container);
+        scan(&source, &container);
         assert_eq!(container.reads(), once, "{compression:?}");
         // Raw tiles have been verified by the first scan.
-        scan(&made, &container);
+        scan(&source, &container);
         assert_eq!(container.reads() - once, once, "{compression:?}, again");
     }
 }
 
 #[test]
 fn each_tile_is_read_once_for_all_planned_frames() {
-    let made = Made::new();
+    let source = EncodingSource::new();
     let scattered = [COUNT as u32 - 1, 5, 6, 7, 2000, 4, 1024, 1023];
     let wanted = [0, 3, 9, 30, 31, 33, 64, 65, 68];
     for compression in [Compression::Zstd(1), Compression::Raw] {
@@ -201,13 +209,13 @@ fn each_tile_is_read_once_for_all_planned_frames() {
             // The three frame blocks have 5, 1 and 3 of these frames. With at most 2 frames decoded together they are
             // read 3 + 1 + 2 times.
             for (held, times) in [(usize::MAX, 3), (5, 3), (2, 6)] {
-                let (_folder, container) = made.pack(compression);
+                let (_folder, container) = source.pack(compression);
                 let mut reader = container.open(ids.clone()).unwrap();
                 reader.expect(&ReadPlan::new(wanted).holding(held));
                 let mut got = Gaussians::zeros(0, 1);
                 for frame in wanted {
                     reader.read(frame, Columns::POSITION, &mut got).unwrap();
-                    assert!(got.position == made.expected(&ids, frame, Columns::POSITION).position);
+                    assert!(got.position == source.expected(&ids, frame, Columns::POSITION).position);
                 }
                 let tiles = container.reads().tiles;
                 assert!(
@@ -222,12 +230,12 @@ fn each_tile_is_read_once_for_all_planned_frames() {
 
 #[test]
 fn held_tiles_are_read_once_and_have_the_same_values() {
-    let made = Made::new();
+    let source = EncodingSource::new();
     let scattered = [COUNT as u32 - 1, 5, 6, 7, 2000, 4, 1024, 1023];
     for compression in [Compression::Zstd(1), Compression::Raw] {
-        let whole = made.pack(compression).1.decoded_bytes();
+        let whole = source.pack(compression).1.decoded_bytes();
         for capacity in [0, whole / 3, whole] {
-            let (_folder, container) = made.pack(compression);
+            let (_folder, container) = source.pack(compression);
             container.hold_decoded(capacity);
             for ids in blocks(&scattered) {
                 for wanted in [ReadPlan::every(), ReadPlan::every().holding(1), ReadPlan::new([7, 8, 40])] {
@@ -236,16 +244,16 @@ fn held_tiles_are_read_once_and_have_the_same_values() {
                     for frame in [0, 7, 8, 40, FRAMES - 1, 7] {
                         let mut got = Gaussians::zeros(0, 1);
                         reader.read(frame, Columns::all(), &mut got).unwrap();
-                        let expected = made.expected(&ids, frame, Columns::all());
+                        let expected = source.expected(&ids, frame, Columns::all());
                         assert!(got == expected, "{compression:?}, {ids:?}, {capacity} bytes: frame {frame} is wrong");
                     }
                 }
             }
-            scan(&made, &container);
+            scan(&source, &container);
             let read = container.reads().bytes;
             let (_, all) = all_tiles(&container);
             assert!(capacity < whole || read == all, "{read} bytes read, of {all}");
-            scan(&made, &container);
+            scan(&source, &container);
             let again = container.reads().bytes - read;
             assert!(
                 if capacity == whole { again == 0 } else { again > 0 },

@@ -15,12 +15,12 @@ const MEMO_ENTRY_BYTES: usize = 32;
 
 /// Counter of allocated bytes that refuses allocations beyond the limit before they are made.
 #[derive(Debug)]
-struct MemoryCounter {
+struct AllocationCounter {
     limit: u64,
     taken: u64,
 }
 
-impl MemoryCounter {
+impl AllocationCounter {
     /// Counts `bytes` that are about to be allocated; `at` is the position in the pickle that requires them.
     fn take(&mut self, bytes: usize, at: usize) -> Result<(), Wrong> {
         let taken = self.taken.saturating_add(bytes as u64);
@@ -52,7 +52,7 @@ pub(super) struct PickleMachine<'a> {
     bytes: &'a [u8],
     at: usize,
     instructions: u32,
-    memory_counter: MemoryCounter,
+    allocations: AllocationCounter,
     nodes: Vec<Node>,
     /// Nesting depth of each node when it was last changed; 0 for a scalar. If a container grows later, the depths of
     /// the nodes around it are not updated: code that follows the nodes counts depth itself.
@@ -70,7 +70,7 @@ impl<'a> PickleMachine<'a> {
             bytes,
             at: 0,
             instructions: 0,
-            memory_counter: MemoryCounter { limit: memory, taken: 0 },
+            allocations: AllocationCounter { limit: memory, taken: 0 },
             nodes: Vec::new(),
             depths: Vec::new(),
             frames: Vec::new(),
@@ -102,7 +102,7 @@ impl<'a> PickleMachine<'a> {
             0x80 => drop(self.take_bytes::<1>()?),
             0x95 => {
                 self.take_bytes::<8>()?;
-                self.memory_counter.reserve(&mut self.frames, 1, start)?;
+                self.allocations.reserve(&mut self.frames, 1, start)?;
                 self.frames.push(start..self.at);
             }
             b'.' => return self.pop().map(Some),
@@ -231,9 +231,9 @@ impl<'a> PickleMachine<'a> {
 
     /// Adds a node and pushes it onto the stack.
     fn push(&mut self, node: Node, depth: u8) -> Result<(), Wrong> {
-        self.memory_counter.reserve(&mut self.nodes, 1, self.at)?;
-        self.memory_counter.reserve(&mut self.depths, 1, self.at)?;
-        self.memory_counter.reserve(&mut self.stack, 1, self.at)?;
+        self.allocations.reserve(&mut self.nodes, 1, self.at)?;
+        self.allocations.reserve(&mut self.depths, 1, self.at)?;
+        self.allocations.reserve(&mut self.stack, 1, self.at)?;
         self.stack.push(self.nodes.len() as NodeId);
         self.nodes.push(node);
         self.depths.push(depth);
@@ -271,7 +271,7 @@ impl<'a> PickleMachine<'a> {
         if self.marks.len() >= usize::from(MAX_DEPTH) {
             return Err(self.too_deep());
         }
-        self.memory_counter.reserve(&mut self.marks, 1, start)?;
+        self.allocations.reserve(&mut self.marks, 1, start)?;
         self.marks.push(self.stack.len());
         Ok(())
     }
@@ -311,7 +311,7 @@ impl<'a> PickleMachine<'a> {
         let mut elements = Vec::new();
         if first < self.stack.len() {
             let count = self.stack.len() - first;
-            self.memory_counter.take(ALLOCATION_BYTES + count * size_of::<NodeId>(), self.at)?;
+            self.allocations.take(ALLOCATION_BYTES + count * size_of::<NodeId>(), self.at)?;
             elements.reserve_exact(count);
             elements.extend(self.stack.drain(first..));
         }
@@ -333,7 +333,7 @@ impl<'a> PickleMachine<'a> {
         let top = self.container(first)?;
         match &mut self.nodes[top] {
             Node::List(list) => {
-                self.memory_counter.reserve(list, self.stack.len() - first, start)?;
+                self.allocations.reserve(list, self.stack.len() - first, start)?;
                 list.extend(self.stack.drain(first..));
             }
             // The elements of an object that behaves like a list are not needed.
@@ -352,7 +352,7 @@ impl<'a> PickleMachine<'a> {
         }
         match &mut self.nodes[top] {
             Node::Dict(items) | Node::Called { items, .. } => {
-                self.memory_counter.reserve(items, pairs.len(), start)?;
+                self.allocations.reserve(items, pairs.len(), start)?;
                 items.extend(pairs.iter().map(|&[key, value]| (key, value)));
             }
             _ => return Err(Wrong::at(start, "an item of what is no dict")),
@@ -365,7 +365,7 @@ impl<'a> PickleMachine<'a> {
     fn store_in_memo(&mut self, key: u32) -> Result<(), Wrong> {
         let top = self.stack.last().copied().filter(|_| self.stack.len() > self.floor());
         let top = top.ok_or_else(|| self.missing())?;
-        self.memory_counter.take(MEMO_ENTRY_BYTES, self.at)?;
+        self.allocations.take(MEMO_ENTRY_BYTES, self.at)?;
         self.memo.insert(key, top);
         Ok(())
     }
@@ -374,7 +374,7 @@ impl<'a> PickleMachine<'a> {
     fn push_from_memo(&mut self, start: usize, key: u32) -> Result<(), Wrong> {
         let known = self.memo.get(&key).copied();
         let known = known.ok_or_else(|| Wrong::at(start, format!("what was never remembered, {key}")))?;
-        self.memory_counter.reserve(&mut self.stack, 1, start)?;
+        self.allocations.reserve(&mut self.stack, 1, start)?;
         self.stack.push(known);
         Ok(())
     }
@@ -425,7 +425,7 @@ impl<'a> PickleMachine<'a> {
         let length = self.length(length_bytes)?;
         let start = self.at;
         self.take_slice(length)?;
-        self.memory_counter.take(ALLOCATION_BYTES + (self.at - start), start)?;
+        self.allocations.take(ALLOCATION_BYTES + (self.at - start), start)?;
         let text = std::str::from_utf8(&self.bytes[start..self.at]);
         let text = text.map_err(|_| Wrong::at(start, "a text that is not UTF-8"))?;
         self.push(Node::Text(text.into()), 0)
@@ -441,7 +441,7 @@ impl<'a> PickleMachine<'a> {
     /// GLOBAL: reads module and name as two lines.
     fn global(&mut self, start: usize) -> Result<(), Wrong> {
         let (module, name) = (self.line()?, self.line()?);
-        self.memory_counter.take(ALLOCATION_BYTES + module.len() + 1 + name.len(), start)?;
+        self.allocations.take(ALLOCATION_BYTES + module.len() + 1 + name.len(), start)?;
         let text = |line: Range<usize>| {
             std::str::from_utf8(&self.bytes[line.clone()])
                 .map_err(|_| Wrong::at(line.start, "a name that is not UTF-8"))
@@ -457,7 +457,7 @@ impl<'a> PickleMachine<'a> {
         let (Node::Text(module), Node::Text(name)) = (&self.nodes[module as usize], &self.nodes[name as usize]) else {
             return Err(Wrong::at(start, "something of a module without its name"));
         };
-        self.memory_counter.take(ALLOCATION_BYTES + module.len() + 1 + name.len(), start)?;
+        self.allocations.take(ALLOCATION_BYTES + module.len() + 1 + name.len(), start)?;
         let global = [module, ".", name].concat();
         self.push(Node::Global(global.into()), 0)
     }
