@@ -95,8 +95,8 @@ impl TimeLineSegment<'_> {
 }
 
 impl Planes {
-    /// Writes features and derivatives (by axis) of the Gaussians at `[x, y, z]` (by axis, at most [`LANES`] long). Other
-    /// lanes are unspecified.
+    /// Writes features and derivatives (by axis) of the Gaussians at `[x, y, z]`, slices of at most [`LANES`] values.
+    /// Other lanes are unspecified.
     #[inline(always)]
     pub(super) fn features_with_slopes(
         &self,
