@@ -32,7 +32,7 @@ impl CacheDir {
             Err(error) if error.kind() != io::ErrorKind::AlreadyExists => {
                 Err(Error::io("create the work folder", folder)(error))
             }
-            _ if !folder.is_dir() => Err(Error::usage(format!("{}: is no folder", folder.shown()))),
+            _ if !folder.is_dir() => Err(Error::usage(format!("{}: expected a folder, found a file", folder.shown()))),
             _ => {
                 remove_leftovers(folder, ENDING);
                 Ok(CacheDir { folder: folder.to_owned(), context: CacheKey::new(&()), about })
@@ -72,7 +72,7 @@ impl CacheDir {
             // One shard per key is enough. The input of a damaged shard is unknown.
             if let Entry::Vacant(new) = found.entry(name.key.clone()) {
                 let piece = CacheEntry::open(&self.folder.join(name.file()), &name.key)?;
-                new.insert(piece.map_or_else(|_| "nobody knows".to_owned(), |piece| piece.about().to_owned()));
+                new.insert(piece.map_or_else(|_| "an unknown input".to_owned(), |piece| piece.about().to_owned()));
             }
         }
         Ok(found.into_values().collect())
@@ -83,7 +83,7 @@ impl CacheDir {
     pub(super) fn read<T: DeserializeOwned>(&self, name: &EntryName, damaged: impl Fn(String)) -> Result<Option<T>> {
         let Some(piece) = self.open_piece(name, &damaged)? else { return Ok(None) };
         let found = piece.value();
-        let wrong = |error| damaged(format!("{} holds something else ({error}): computed again", name.file()));
+        let wrong = |error| damaged(format!("{} has unexpected contents ({error}): computed again", name.file()));
         Ok(found.map_err(wrong).ok())
     }
 
@@ -93,7 +93,7 @@ impl CacheDir {
         let at = self.folder.join(name.file());
         let spill = |piece: CacheEntry| {
             let (file, start) = piece.into_file();
-            Spill::of(file, start, at)
+            Spill::from_file(file, start, at)
         };
         Ok(self.open_piece(name, &damaged)?.map(spill))
     }

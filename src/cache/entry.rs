@@ -176,7 +176,7 @@ impl EntryHeader {
             bytes[start..start + length].iter().rev().fold(0u128, |number, &byte| number << 8 | u128::from(byte))
         };
         if bytes[..8] != MAGIC {
-            return Err("it is no piece".to_owned());
+            return Err("it is not a result of this program".to_owned());
         }
         if number(8, 4) != u128::from(VERSION) {
             return Err(format!("version {}, expected {VERSION}", number(8, 4)));
@@ -196,7 +196,7 @@ impl CacheEntry {
         let mut file = File::open(path).map_err(Error::io("open", path))?;
         let length = file.metadata().map_err(failed)?.len();
         if length < HEADER as u64 {
-            return Ok(Err(format!("{length} bytes, of a header of {HEADER}")));
+            return Ok(Err(format!("{length} bytes, expected at least {HEADER}")));
         }
         let mut bytes = [0; HEADER];
         file.read_exact(&mut bytes).map_err(failed)?;
@@ -209,12 +209,12 @@ impl CacheEntry {
             return Ok(Err(format!("{length} bytes, expected {}", u128::from(start) + u128::from(content))));
         }
         if key != format!("{own:032x}") {
-            return Ok(Err("it is another piece than its name says".to_owned()));
+            return Ok(Err("its key does not match its file name".to_owned()));
         }
         let mut found = Xxh3::new();
         hash_rest(&mut file, path, &mut found)?;
         if found.digest() != hash {
-            return Ok(Err("its bytes are not those that were written".to_owned()));
+            return Ok(Err("its checksum does not match".to_owned()));
         }
         let mut about = vec![0; text as usize];
         file.seek(SeekFrom::Start(HEADER as u64)).and_then(|_| file.read_exact(&mut about)).map_err(failed)?;

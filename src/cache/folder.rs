@@ -81,7 +81,7 @@ pub fn text(listed: &[Listed]) -> String {
         }
     }
     if listed.is_empty() {
-        out.push_str("nothing is kept here\n");
+        out.push_str("no results are stored here\n");
     }
     out
 }

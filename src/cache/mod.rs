@@ -150,7 +150,7 @@ impl Cache {
         match self.part {
             None => Ok(()),
             Some(part) => Err(Error::ShardDone(format!(
-                "part {part}: nothing to do; what comes next, {stage}, is not divided: run without --part"
+                "part {part}: nothing left to do; the next stage, {stage}, is not divided: run without --part"
             ))),
         }
     }
@@ -224,7 +224,9 @@ impl Cache {
     /// Returns `whole`, the full result of `stage`. Ends a run of shard 1/1, which is complete then.
     fn complete<T>(&self, stage: &str, whole: T) -> Result<T> {
         match self.part {
-            Some(Shard::WHOLE) => Err(Error::ShardDone(format!("{stage}: part {} is done; it is all", Shard::WHOLE))),
+            Some(Shard::WHOLE) => {
+                Err(Error::ShardDone(format!("{stage}: part {} is done; it is the whole stage", Shard::WHOLE)))
+            }
             _ => Ok(whole),
         }
     }
@@ -250,7 +252,7 @@ impl Cache {
                 self.say_of_others(place, stage, key)?;
                 return Ok(1);
             };
-            self.say(format!("{stage}: missing of {of} parts, and computed here: {}", missing(parts, of)));
+            self.say(format!("{stage}: of {of} parts these are missing and computed here: {}", missing(parts, of)));
             return Ok(of);
         };
         let (_, of) = part.numbers();
@@ -281,8 +283,8 @@ impl Cache {
     fn say_of_others(&self, place: &CacheDir, stage: &str, key: CacheKey) -> Result<()> {
         for other in place.others(stage, key)? {
             self.say(format!(
-                "{stage}: parts that are there are of another input, recipe, version or kind of processor, and are not \
-                 used; they belong to {other}"
+                "{stage}: parts in the work folder are not used because they come from another input, recipe, program version or \
+                 kind of processor; they belong to {other}"
             ));
         }
         Ok(())

@@ -34,7 +34,7 @@ pub struct SpillWriter {
 
 impl Spill {
     /// Returns the content of `file` from byte `start` on.
-    pub(super) fn of(file: File, start: u64, at: PathBuf) -> Spill {
+    pub(super) fn from_file(file: File, start: u64, at: PathBuf) -> Spill {
         Spill { file, start, at }
     }
 

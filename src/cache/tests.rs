@@ -79,7 +79,7 @@ fn stored_shard_is_not_recomputed_missing_ones_are_named() {
     let work = open(folder.path(), None);
     let (found, computed) = squares(&work, 12);
     assert_eq!((found.unwrap(), computed), (plainly(12), vec![0, 1, 6, 7, 10, 11]));
-    assert_eq!(work.take_notes(), ["squares: missing of 6 parts, and computed here: 1, 4, 6"]);
+    assert_eq!(work.take_notes(), ["squares: of 6 parts these are missing and computed here: 1, 4, 6"]);
     // The undivided result is stored now.
     assert!(squares(&open(folder.path(), Some("1/2")), 12).0.is_ok());
 }
@@ -180,7 +180,7 @@ fn undivided_stage_ends_a_run_of_a_shard() {
     let folder = tempfile::tempdir().unwrap();
     let of_part = |work: &Cache| work.known("alone", CacheKey::new(&1), || work.not_divided("alone").map(|()| 5u8));
     let message = of_part(&open(folder.path(), Some("1/2"))).unwrap_err().to_string();
-    assert!(message.contains("what comes next, alone, is not divided"), "{message}");
+    assert!(message.contains("the next stage, alone, is not divided"), "{message}");
     assert_eq!(of_part(&open(folder.path(), None)).unwrap(), 5);
     assert_eq!(of_part(&open(folder.path(), Some("1/2"))).unwrap(), 5);
 }
@@ -211,7 +211,7 @@ fn invalid_or_vanished_folder_is_an_error_that_names_it() {
     let folder = tempfile::tempdir().unwrap();
     fs::write(folder.path().join("work"), "a file").unwrap();
     let message = Cache::open(&asked(folder.path(), None), String::new()).unwrap_err().to_string();
-    assert!(message.contains("is no folder"), "{message}");
+    assert!(message.contains("expected a folder"), "{message}");
     fs::remove_file(folder.path().join("work")).unwrap();
     let work = open(folder.path(), None);
     fs::remove_dir(folder.path().join("work")).unwrap();

@@ -115,11 +115,13 @@ impl FieldSummary {
     /// Returns the reason for the precision of the field as text.
     pub(crate) fn why(&self) -> String {
         let FieldSummary { pictures, rounding, result, least, .. } = self;
-        let from = |psnr: f64, what: &str| format!("{} from {what}", decibels_text(psnr, 1));
-        let result = result.map_or(String::new(), |result| format!(", {}", from(result, "the original's to these")));
+        let against = |psnr: f64, what: &str| format!("{} {what}", decibels_text(psnr, 1));
+        let result = result.map_or(String::new(), |psnr| {
+            format!(", {}", against(psnr, "of the result with the exact field against the original"))
+        });
         format!(
-            "{pictures} pictures with it are {}{result}; at least {least:.1} dB were asked for",
-            from(*rounding, "those with the exact field")
+            "PSNR over {pictures} views: {}{result}; at least {least:.1} dB against the exact field required",
+            against(*rounding, "against the exact field")
         )
     }
 }
@@ -162,8 +164,8 @@ impl BandsSummary {
         let of = |(degree, apart): &(usize, f64)| format!("{} at degree {degree}", decibels_text(*apart, 1));
         let tried: Vec<String> = tried.iter().map(of).collect();
         format!(
-            "{pictures} pictures are {} from those with all bands, {} from the original's to these; at least \
-             {least:.1} dB were asked for",
+            "PSNR over {pictures} views: {} against all degrees, {} of the result with all degrees against the original; at \
+             least {least:.1} dB against all degrees required",
             tried.join(", "),
             decibels_text(*result, 1)
         )

@@ -70,7 +70,7 @@ pub struct Foreseen {
 pub fn foresee(request: &Request) -> Result<Foreseen> {
     if request.input.is_stream() {
         return Err(Error::usage(
-            "--dry-run: what a stream would take shows only once it has passed\n  give a file or folder; --explain says \
+            "--dry-run: the cost of a stream is known only after it has ended\n  give a file or folder; --explain says \
              how many frames there is memory for",
         ));
     }
@@ -115,11 +115,15 @@ pub fn foresee(request: &Request) -> Result<Foreseen> {
 /// Returns a text that tells how the number of Gaussians in the output is determined.
 fn size_by(request: &Request) -> String {
     match (&request.goal, &request.target) {
-        (Some(Goal::Quality(Quality::Psnr(least))), _) => format!("the fewest with pictures of {least} dB"),
-        (Some(Goal::Quality(_)), _) => "the fewest that lose no more against the photographs".to_owned(),
-        (Some(Goal::Bytes(most)), _) => format!("the best in {most} bytes"),
-        (None, Some(_)) => "as asked for".to_owned(),
-        (None, None) => "what the recipe keeps, which pictures decide".to_owned(),
+        (Some(Goal::Quality(Quality::Psnr(least))), _) => {
+            format!("the smallest number with {least} dB PSNR against the original, found by a search")
+        }
+        (Some(Goal::Quality(Quality::Loss { most, .. })), _) => {
+            format!("the smallest number that loses at most {most} dB PSNR against the photographs, found by a search")
+        }
+        (Some(Goal::Bytes(most)), _) => format!("as many as fit {most} bytes"),
+        (None, Some(_)) => "as requested".to_owned(),
+        (None, None) => "as many as pass the thresholds of the recipe, known only after scoring".to_owned(),
     }
 }
 
@@ -145,7 +149,7 @@ impl Foreseen {
             self.sh_degree
         );
         let CameraSummary { origin, cameras, pairs } = &self.cameras;
-        let _ = writeln!(out, "cameras: {origin} ({cameras} cameras, {pairs} pictures)");
+        let _ = writeln!(out, "cameras: {origin} ({cameras} cameras, {pairs} views)");
         let _ = match self.gaussians {
             Some(count) => {
                 let percent = 100.0 * count as f64 / self.gaussians_in.max(1) as f64;

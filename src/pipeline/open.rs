@@ -70,13 +70,13 @@ pub fn open_to_measure(
     scene.follow(&plan);
     // Reads of the calibration are not part of the plan, so they are counted before it.
     let reads = scene.source().reads();
-    foretell(&mut scene, &plan, &stages, MeasuredOnArrival::default(), options, journal)?;
+    send_forecast(&mut scene, &plan, &stages, MeasuredOnArrival::default(), options, journal)?;
     journal.opened("read", start, scene.source().info().count, reads);
     Ok((scene, stages, None))
 }
 
 /// Sends the plan and the time forecast as messages, if the user asked for them.
-fn foretell(
+fn send_forecast(
     scene: &mut Scene,
     plan: &Plan,
     stages: &RunPlan,
@@ -109,10 +109,10 @@ fn receive_measured(
 ) -> Result<(Scene, RunPlan, Option<Measured>)> {
     let has_cameras = loaded.is_some();
     let count = stream.header().count;
-    let of_rig = loaded.clone().unwrap_or_else(|| cameras::virtual_rig(DVec3::ZERO, 1.0));
+    let assumed_rig = loaded.clone().unwrap_or_else(|| cameras::virtual_rig(DVec3::ZERO, 1.0));
     let block = frame_block(stream.header());
     let header = *stream.header();
-    let counting = |frames| Workload::of_stream(&header, block, &of_rig, frames);
+    let counting = |frames| Workload::of_stream(&header, block, &assumed_rig, frames);
     let work = counting(0);
     let stages = plan(InputMeta { gaussians: count, has_cameras, own_output: OWN_OUTPUT }, &work)?;
     let Measure { scan, visible, .. } = &stages.measure;
@@ -128,21 +128,22 @@ fn receive_measured(
     let measures = fit(Verbosity::Nothing, Some(visible.is_some())).is_ok();
     let memory = fit(options.memory.tell, measures.then_some(visible.is_some()))?;
     if options.memory.tell == Verbosity::Time {
-        let text = format!("memory: at most {}; nobody knows how many frames will arrive", size(memory.peak()));
+        let text =
+            format!("memory: at most {}; the number of frames is unknown until the stream ends", size(memory.peak()));
         options.events.send(Message::Plan(&text));
     }
     let receive = |budget: u64, measuring: Option<bool>, frames: u64| {
         let limits = memory.limits;
         Plan::closest(work, budget, |work, _| vec![receiving(work, &limits, held, measuring, frames)]).peak()
     };
-    let mut room = FrameQuota::new(options.memory, |budget, frames| {
+    let mut quota = FrameQuota::new(options.memory, |budget, frames| {
         let later = Plan::closest(counting(frames), budget, |work, limits| stages.estimates(work, limits));
         later.peak().max(receive(budget, None, frames))
     });
     let to_measure =
         FrameQuota::new(options.memory, |budget, frames| receive(budget, Some(visible.is_some()), frames)).most;
     if options.memory.tell == Verbosity::Plan {
-        let most = room.most;
+        let most = quota.most;
         let text =
             format!("frames: at most {most} fit the memory limit; up to {to_measure} are measured while they arrive");
         options.events.send(Message::Plan(&text));
@@ -154,8 +155,8 @@ fn receive_measured(
     }
     let mut measuring: Option<Measuring<'_>> = None;
     let streamed = Streamed::receive(stream, &options.scratch_folder(), &options.events, |held| {
-        room.admit(held.len())?;
-        if room.arrived() > to_measure {
+        quota.admit(held.len())?;
+        if quota.arrived() > to_measure {
             measuring = None;
             return Ok(());
         }
@@ -178,16 +179,16 @@ fn receive_measured(
     let counted = Budget { tell: Verbosity::Nothing, ..options.memory };
     let later = Plan::fit(scene.workload(), counted, &options.events, |work, limits| stages.estimates(work, limits))?;
     scene.follow(&later);
-    if measures && measuring.is_none() && room.arrived() > 0 {
+    if measures && measuring.is_none() && quota.arrived() > 0 {
         let note = format!(
-            "statistics were taken from the packed frames, not as they arrived: there is memory for {to_measure} that way"
+            "statistics were taken from the packed frames, not as they arrived: memory suffices for measuring {to_measure} of them on arrival"
         );
         scene.notes.push(note);
     }
     let mut arrived = None;
     if let Some(measuring) = measuring {
         let complete = ScanPlan::new(&scan.recipe, &scene.source().info().times, &scene.schedule)?;
-        let found = match measuring.wrong(&complete, &scene) {
+        let found = match measuring.failed_assumption(&complete, &scene) {
             None => {
                 let found = measuring.finish(&complete);
                 // The frames were measured with these Gaussians before they proved not to be finite.
@@ -207,7 +208,7 @@ fn receive_measured(
         }
     }
     let measured = arrived.as_ref().map(Measured::kinds).unwrap_or_default();
-    foretell(&mut scene, &later, &stages, measured, options, journal)?;
+    send_forecast(&mut scene, &later, &stages, measured, options, journal)?;
     Ok((scene, stages, arrived))
 }
 
@@ -262,7 +263,7 @@ impl<'a> Measuring<'a> {
     }
 
     /// Returns which assumption proved wrong, if any.
-    fn wrong(&self, complete: &ScanPlan, scene: &Scene) -> Option<&'static str> {
+    fn failed_assumption(&self, complete: &ScanPlan, scene: &Scene) -> Option<&'static str> {
         if !complete.finishes(self.plan) {
             return Some("the frames are not evenly spaced in time");
         }

@@ -67,22 +67,22 @@ impl RunPlan {
         let fits =
             |plan: &RunPlan| Plan::fits(*work, request.input.memory, |work, limits| plan.estimates(work, limits));
         let least = |plan: &RunPlan| Plan::closest(*work, 1, |work, limits| plan.estimates(work, limits)).peak();
-        let whole = with(MemoryFallback::Nothing)?;
-        if whole.refine.is_none() || fits(&whole) {
-            return Ok(whole);
+        let full_plan = with(MemoryFallback::Nothing)?;
+        if full_plan.refine.is_none() || fits(&full_plan) {
+            return Ok(full_plan);
         }
-        let of_whole = least(&whole);
-        let constant = with(MemoryFallback::ConstantInTime { required_bytes: of_whole })?;
-        let of_constant = least(&constant);
-        if of_constant < of_whole && fits(&constant) {
+        let full_bytes = least(&full_plan);
+        let constant = with(MemoryFallback::ConstantInTime { required_bytes: full_bytes })?;
+        let constant_bytes = least(&constant);
+        if constant_bytes < full_bytes && fits(&constant) {
             return Ok(constant);
         }
-        let low_degree = with(MemoryFallback::WithoutHarmonics { required_bytes: of_constant })?;
+        let low_degree = with(MemoryFallback::WithoutHarmonics { required_bytes: constant_bytes })?;
         if work.sh_degree > 0 && fits(&low_degree) {
             return Ok(low_degree);
         }
         let unrefined = with(MemoryFallback::WithoutRefinement { required_bytes: least(&low_degree) })?;
-        Ok(if fits(&unrefined) { unrefined } else { whole })
+        Ok(if fits(&unrefined) { unrefined } else { full_plan })
     }
 
     fn empty(measure: Measure, gaussians: usize) -> RunPlan {
@@ -108,9 +108,19 @@ impl RunPlan {
         let user =
             UserOverrides { keep: ids(&request.keep_ids)?, drop: ids(&request.drop_ids)?, keep_box: request.keep_box };
         let prunes = *only != Only::Merge;
-        let looks = Visible::from_recipe(&recipe.scan, input.has_cameras).is_some();
-        let mut planning =
-            Planning { request, input, output, target, user, looks, prunes, merges: false, refine: None, fallback };
+        let renders_views = Visible::from_recipe(&recipe.scan, input.has_cameras).is_some();
+        let mut planning = Planning {
+            request,
+            input,
+            output,
+            target,
+            user,
+            renders_views,
+            prunes,
+            merges: false,
+            refine: None,
+            fallback,
+        };
         let refine = RefineStage::from_recipe(recipe, planning.part(), planning.prunes_by_views());
         planning.refine = refine.and_then(|refine| match fallback {
             MemoryFallback::Nothing => Some(refine),
@@ -149,7 +159,7 @@ impl RunPlan {
         limits: &Limits,
         measured: MeasuredOnArrival,
     ) -> Vec<ResourceEstimate> {
-        self.estimates_of(self.estimate_input(work, limits, measured), |_| true)
+        self.estimates_where(self.estimate_input(work, limits, measured), |_| true)
     }
 
     /// Returns the resource estimates of the stages that are still to run, without stages that may turn out to be
@@ -162,7 +172,7 @@ impl RunPlan {
         hardly_seen: f64,
     ) -> Vec<ResourceEstimate> {
         let input = self.estimate_input(work, limits, measured);
-        self.estimates_of(input, |stage| !stage.may_be_skipped(input, hardly_seen))
+        self.estimates_where(input, |stage| !stage.may_be_skipped(input, hardly_seen))
     }
 
     fn estimate_input<'a>(
@@ -175,15 +185,15 @@ impl RunPlan {
         EstimateInput { work, limits, left, measured }
     }
 
-    fn estimates_of(&self, input: EstimateInput<'_>, runs: impl Fn(&dyn Stage) -> bool) -> Vec<ResourceEstimate> {
-        let of = |phase: Phase| -> Vec<ResourceEstimate> {
+    fn estimates_where(&self, input: EstimateInput<'_>, runs: impl Fn(&dyn Stage) -> bool) -> Vec<ResourceEstimate> {
+        let phase_estimates = |phase: Phase| -> Vec<ResourceEstimate> {
             self.stages.in_phase(phase).filter(|stage| runs(*stage)).flat_map(|stage| stage.estimates(input)).collect()
         };
         let reduce = match &self.search {
-            Some(search) => vec![search.estimate(input, &of(Phase::Reduce))],
-            None => of(Phase::Reduce),
+            Some(search) => vec![search.estimate(input, &phase_estimates(Phase::Reduce))],
+            None => phase_estimates(Phase::Reduce),
         };
-        [of(Phase::Rank), reduce, of(Phase::Write)].concat()
+        [phase_estimates(Phase::Rank), reduce, phase_estimates(Phase::Write)].concat()
     }
 
     /// Returns whether the amount of work depends on results of stages, which makes time estimates imprecise.
@@ -239,7 +249,7 @@ fn checked_output(request: &Request, own: OutputKind) -> Result<OutputKind> {
     let Request { goal, archive_psnr, .. } = request;
     if goal.is_some() && (request.only == Only::Merge || request.target.is_some()) {
         return Err(Error::usage(
-            "a quality or a size on disk is found by pruning: not with --merge-only, nor beside a target",
+            "a quality or a size on disk is reached by pruning: it cannot be combined with --merge-only or a target count or ratio",
         ));
     }
     if request.kind.is_none() {
@@ -255,12 +265,12 @@ fn checked_output(request: &Request, own: OutputKind) -> Result<OutputKind> {
     }
     match goal {
         Some(Goal::Quality(Quality::Loss { .. })) if is_archive => Err(Error::usage(
-            "the size of an archive is found by --target-ratio, --target-count, --min-psnr or --target-size\n  \
-             give one of these, or write a model folder",
+            "--max-loss cannot be used for an archive\n  \
+             give --target-ratio, --target-count, --min-psnr or --target-size, or write a model folder",
         )),
-        Some(Goal::Bytes(_)) if archive_psnr.is_some() => {
-            Err(Error::usage("--archive-psnr and --target-size both say how coarse: expected one of them"))
-        }
+        Some(Goal::Bytes(_)) if archive_psnr.is_some() => Err(Error::usage(
+            "--archive-psnr and --target-size both determine the quantization: expected only one of them",
+        )),
         _ => Ok(kind),
     }
 }
@@ -322,7 +332,8 @@ mod tests {
             plan.stages.record_left_out(&work, &Limits::NONE, &mut journal);
             let left_out =
                 |what: &str| journal.left_out.iter().find(|left| left.what == what).map(|left| left.why.clone());
-            let whats = ["refining along time", "refining of harmonics above the first", "refinement"];
+            let whats =
+                ["time-varying deltas of refinement", "refinement of SH coefficients above degree 0", "refinement"];
             let [time, bands, all] = whats.map(left_out);
             assert_eq!(
                 plan.refine.as_ref().is_some_and(|refine| refine.knots > 0),
@@ -336,17 +347,17 @@ mod tests {
             | MemoryFallback::WithoutRefinement { required_bytes } => required_bytes,
             MemoryFallback::Nothing => 0,
         };
-        let whole = Plan::closest(work, 1, everything("default")).peak();
-        assert_eq!(within(whole).0, MemoryFallback::Nothing);
-        let (spared, degree, named, none) = within(whole - 1);
+        let full_plan = Plan::closest(work, 1, everything("default")).peak();
+        assert_eq!(within(full_plan).0, MemoryFallback::Nothing);
+        let (spared, degree, named, none) = within(full_plan - 1);
         assert_eq!(
             (spared, degree, none),
-            (MemoryFallback::ConstantInTime { required_bytes: whole }, Some(ALL_HARMONICS), None)
+            (MemoryFallback::ConstantInTime { required_bytes: full_plan }, Some(ALL_HARMONICS), None)
         );
-        assert!(named.unwrap().contains(&format!("{}MiB", whole.div_ceil(1 << 20))));
-        let (spared, ..) = (1..).map(|k| within(whole - k * (1 << 20))).find(|found| found.1 == Some(0)).unwrap();
+        assert!(named.unwrap().contains(&format!("{}MiB", full_plan.div_ceil(1 << 20))));
+        let (spared, ..) = (1..).map(|k| within(full_plan - k * (1 << 20))).find(|found| found.1 == Some(0)).unwrap();
         let all = least(spared);
-        assert!(matches!(spared, MemoryFallback::WithoutHarmonics { .. }) && all < whole, "{spared:?}");
+        assert!(matches!(spared, MemoryFallback::WithoutHarmonics { .. }) && all < full_plan, "{spared:?}");
         assert!(matches!(within(all).0, MemoryFallback::ConstantInTime { .. }));
         let (spared, degree, named, none) = within(all - 1);
         assert_eq!((spared, degree, none), (MemoryFallback::WithoutHarmonics { required_bytes: all }, Some(0), None));

@@ -42,7 +42,7 @@ pub struct Planning<'a> {
     /// Decisions of the user about single Gaussians: ids and boxes to keep or drop.
     pub user: UserOverrides,
     /// Whether views of the scene are rendered to measure the contribution of every Gaussian.
-    pub looks: bool,
+    pub renders_views: bool,
     /// Whether Gaussians are pruned by rank, beside those that the user drops.
     pub prunes: bool,
     /// Whether survivors are merged.
@@ -68,7 +68,7 @@ impl Planning<'_> {
 
     /// Returns whether Gaussians are ranked by rendered views and removed.
     pub fn prunes_by_views(&self) -> bool {
-        self.looks && self.prunes
+        self.renders_views && self.prunes
     }
 }
 
@@ -100,9 +100,14 @@ impl MemoryFallback {
     pub(super) fn left_out(self) -> Vec<(&'static str, u64)> {
         match self {
             MemoryFallback::Nothing => Vec::new(),
-            MemoryFallback::ConstantInTime { required_bytes } => vec![("refining along time", required_bytes)],
+            MemoryFallback::ConstantInTime { required_bytes } => {
+                vec![("time-varying deltas of refinement", required_bytes)]
+            }
             MemoryFallback::WithoutHarmonics { required_bytes } => {
-                vec![("refining along time", required_bytes), ("refining of harmonics above the first", required_bytes)]
+                vec![
+                    ("time-varying deltas of refinement", required_bytes),
+                    ("refinement of SH coefficients above degree 0", required_bytes),
+                ]
             }
             MemoryFallback::WithoutRefinement { required_bytes } => vec![("refinement", required_bytes)],
         }

@@ -13,7 +13,7 @@ use crate::scene::photographs::Photographs;
 use crate::source::FrameSource;
 
 /// Images that renders of a model are compared with.
-pub(super) enum With<'a> {
+pub(super) enum Comparison<'a> {
     /// Renders of the original: targets, and the indices of the views among them.
     Original(&'a Targets, Vec<usize>),
     /// Photographs of the scene.
@@ -26,7 +26,7 @@ pub(super) struct QualityMeter<'a> {
     cameras: &'a [Camera],
     /// Views in order of frames; the flag tells whether a view is held back.
     pictures: Vec<(Picture, bool)>,
-    with: With<'a>,
+    comparison: Comparison<'a>,
 }
 
 impl<'a> QualityMeter<'a> {
@@ -38,16 +38,16 @@ impl<'a> QualityMeter<'a> {
         scene: &'a Scene,
         cameras: &'a [Camera],
         pictures: Vec<(Picture, bool)>,
-        with: With<'a>,
+        comparison: Comparison<'a>,
     ) -> Result<QualityMeter<'a>> {
         let held = pictures.iter().filter(|picture| picture.1).count();
         if held == 0 || held == pictures.len() {
             let found = pictures.len();
             return Err(Error::usage(format!(
-                "a quality is searched on some pictures and reported by others: expected 4 or more, found {found}"
+                "a search for a quality uses some views to search and others to report: expected 4 or more views, found {found}"
             )));
         }
-        Ok(QualityMeter { scene, cameras, pictures, with })
+        Ok(QualityMeter { scene, cameras, pictures, comparison })
     }
 
     /// Returns the mean PSNR of renders of `source`, dB: on the views held back if `held`, otherwise on the views for
@@ -63,12 +63,12 @@ impl<'a> QualityMeter<'a> {
         show([Subject::all(source)], self.cameras, &pictures, Batch::of_frame(&self.scene.limits), |views| {
             let first = found.len();
             let of_view = |(place, view): (usize, &ViewStates<'_, 1>)| {
-                match &self.with {
-                    With::Photographs(photographs) => {
+                match &self.comparison {
+                    Comparison::Photographs(photographs) => {
                         let picture = view.render(0, background);
                         Ok(psnr(&picture, &photographs.read(view.picture, view.camera, background)?))
                     }
-                    With::Original(targets, numbers) => {
+                    Comparison::Original(targets, numbers) => {
                         // Rendered like the targets.
                         let picture = render(view.states[0], view.camera, background);
                         Ok(decibels(mean_square(&picture, &targets.values(numbers[places[first + place]])?)))
@@ -83,13 +83,13 @@ impl<'a> QualityMeter<'a> {
     }
 
     /// Returns the number of views for the search.
-    pub(super) fn searched(&self) -> usize {
+    pub(super) fn search_view_count(&self) -> usize {
         self.pictures.iter().filter(|picture| !picture.1).count()
     }
 
     /// Returns the names of the views held back, made of frame and view. A view between the cameras of the scene is
     /// named by its frame.
-    pub(super) fn held(&self) -> Vec<String> {
+    pub(super) fn held_back_names(&self) -> Vec<String> {
         let name = |picture: &Picture| match picture.view {
             u32::MAX => format!("t{:03}_between", picture.frame),
             _ => picture.name(),

@@ -6,13 +6,13 @@
 //! never used by the search and gives the reported figure (method.md, section 6.3).
 
 use super::planning::Planning;
-use super::quality_meter::{QualityMeter, With};
+use super::quality_meter::{Comparison, QualityMeter};
 use super::request::{Goal, Quality};
 use super::stage::{EstimateInput, Phase, RunState};
 use super::stages::bands::ShDegreeStage;
 use super::stages::choose::CLUSTERED;
 use super::stages::field::FieldPrecisionStage;
-use super::stages::reference_views::LEFT_BY_SEARCH;
+use super::stages::reference_views::ARCHIVE_HEADROOM;
 use super::summary::GoalSummary;
 use crate::cache::CacheKey;
 use crate::compressed_model::CompressedModel;
@@ -37,20 +37,20 @@ use crate::source::FrameSource;
 /// Name of the stage.
 const NAME: &str = "search";
 /// Fraction of the Gaussians that is tried first.
-const FIRST: f64 = 0.2;
+const FIRST_FRACTION: f64 = 0.2;
 /// Usual number of sizes that are tried, for estimates.
 const SIZES_USUALLY_TRIED: f64 = 4.0;
 /// Maximum number of sizes that are tried.
-const MOST_TRIED: usize = 8;
+const MAX_SIZES: usize = 8;
 /// Ratio of two sizes up to which they count as equal, so that the search ends.
-const SAME_SIZE: f64 = 1.04;
+const SAME_SIZE_RATIO: f64 = 1.04;
 /// Approximate cost of halving the number of Gaussians: PSNR in dB, and the factor by which a loss grows. The search
 /// derives its guesses from it.
-const HALVING: (f64, f64) = (4.5, 3.0);
+const COST_OF_HALVING: (f64, f64) = (4.5, 3.0);
 /// Maximum surplus of quality of an accepted size, in halvings of the number of Gaussians.
-const CLOSE: f64 = 0.03;
+const MAX_SURPLUS: f64 = 0.03;
 /// Smallest loss that the search distinguishes, dB.
-const LEAST_LOSS: f64 = 1e-3;
+const MIN_LOSS: f64 = 1e-3;
 /// Interval of held-back views among those with photographs: every fourth is held back.
 const HELD_EVERY: usize = 4;
 
@@ -83,7 +83,7 @@ impl SearchStage {
         let Planning { request, output, .. } = *planning;
         let Some(Goal::Quality(quality)) = &request.goal else { return None };
         let searched = match quality {
-            Quality::Psnr(least) if output == OutputKind::Archive => Quality::Psnr(least + LEFT_BY_SEARCH),
+            Quality::Psnr(least) if output == OutputKind::Archive => Quality::Psnr(least + ARCHIVE_HEADROOM),
             other => other.clone(),
         };
         let field = FieldPrecisionStage::from_request(request, output).map(|stage| stage.margin);
@@ -99,7 +99,7 @@ impl SearchStage {
 
     /// Returns the parameters of the search as text for display.
     pub(super) fn parameters(&self) -> String {
-        format!("search: {} sizes at most, for {} {}", MOST_TRIED, self.name(), self.goal())
+        format!("search: {} sizes at most, for {} {}", MAX_SIZES, self.name(), self.goal())
     }
 
     /// Returns the estimate of the search. `repeated` are the estimates of the stages that run for every size. Memory
@@ -157,20 +157,20 @@ impl SearchStage {
             let (best, tried) = self.bracket(&mut trial, &meter)?;
             if best.value.is_nan() {
                 return Err(Error::usage(format!(
-                    "--{}: the PSNR of pictures cannot be measured: expected numbers in every pixel, found NaN in some\n  \
+                    "--{}: the PSNR of renders cannot be measured: expected numbers in every pixel, found NaN in some\n  \
                      --non-finite drop removes the Gaussians that are not finite",
                     self.name().replace('_', "-")
                 )));
             }
             let result = scene.input.reduced(&best.result)?;
-            let summary = self.summary(&best, self.value(&meter, &*result, scene, true)?, meter.held(), tried);
+            let summary = self.summary(&best, self.value(&meter, &*result, scene, true)?, meter.held_back_names(), tried);
             drop(result);
-            let (count, does) = (best.result.len(), self.spare(summary.searched) >= 0.0);
+            let (count, is_met) = (best.result.len(), self.surplus(summary.searched) >= 0.0);
             journal.left_out.extend(best.journal.left_out);
             journal.notes.extend(best.journal.notes);
             (journal.field, journal.bands) = (best.journal.field, best.journal.bands);
             journal.refined = best.journal.refined;
-            journal.notes.push(note(&summary, meter.searched(), count, does));
+            journal.notes.push(note(&summary, meter.search_view_count(), count, is_met));
             Ok(((best.result, AsToml(summary)), count))
         });
         let (result, AsToml(mut goal)) = found?;
@@ -194,20 +194,20 @@ impl SearchStage {
             Some((of, photographs)) => {
                 journal.notes.push(format!("{} held-out pictures have photographs", of.len()));
                 let of = of.into_iter().enumerate().map(|(k, of)| (of, k % HELD_EVERY == HELD_EVERY - 1));
-                QualityMeter::new(scene, &scene.rig.cameras, of.collect(), With::Photographs(photographs))
+                QualityMeter::new(scene, &scene.rig.cameras, of.collect(), Comparison::Photographs(photographs))
             }
             None => {
                 let mut numbers = [&parts.apart[..], &parts.held[..]].concat();
                 numbers.sort_unstable();
                 let of = |&k: &usize| (targets.pictures[k], parts.held.contains(&k));
                 let of = numbers.iter().map(of).collect();
-                QualityMeter::new(scene, &targets.cameras, of, With::Original(targets, numbers))
+                QualityMeter::new(scene, &targets.cameras, of, Comparison::Original(targets, numbers))
             }
         }
     }
 
     /// Returns the cache key of everything that the search depends on.
-    fn key(&self, scene: &Scene, scored: &Scored, ranked: &Ranking, like: &CompressedModel) -> Result<CacheKey> {
+    fn key(&self, scene: &Scene, scored: &Scored, ranked: &Ranking, template: &CompressedModel) -> Result<CacheKey> {
         let (asked, folder) = match &self.searched {
             Quality::Psnr(least) => (*least, None),
             Quality::Loss { most, photographs } => (*most, Some(photographs)),
@@ -221,7 +221,7 @@ impl SearchStage {
             (asked, files, self.pictures, self.margins[0], self.margins[1], refine),
             &scored.protected,
             ranked,
-            like,
+            template,
         )))
     }
 
@@ -258,27 +258,27 @@ impl SearchStage {
         let mut best: Option<TriedSize> = None;
         // Sizes, each with its surplus in halvings: `low` fails, `high` passes. `None`: not tried.
         let (mut low, mut high) = ((least.saturating_sub(1), None), (all, None));
-        let mut next = FIRST * all as f64;
-        while tried.len() < MOST_TRIED && high.0 - low.0 > 1 && high.0 as f64 > SAME_SIZE * low.0 as f64 {
+        let mut next = FIRST_FRACTION * all as f64;
+        while tried.len() < MAX_SIZES && high.0 - low.0 > 1 && high.0 as f64 > SAME_SIZE_RATIO * low.0 as f64 {
             let size = (next.round() as usize).clamp(low.0 + 1, high.0 - 1);
             let now = self.try_size(trial, meter, size)?;
-            let spare = self.spare(now.value);
+            let surplus = self.surplus(now.value);
             tried.push((size, now.value));
-            if spare >= 0.0 {
-                (high, best) = ((size, Some(spare)), Some(now));
-                if spare <= CLOSE {
+            if surplus >= 0.0 {
+                (high, best) = ((size, Some(surplus)), Some(now));
+                if surplus <= MAX_SURPLUS {
                     break;
                 }
             } else {
-                low = (size, Some(spare));
+                low = (size, Some(surplus));
             }
             next = match (low, high) {
                 ((low, Some(below)), (high, Some(above))) => {
                     // Slightly above the size at which the line between both surpluses crosses zero.
-                    let part = ((0.5 * CLOSE - below) / (above - below)).clamp(0.1, 0.9);
+                    let part = ((0.5 * MAX_SURPLUS - below) / (above - below)).clamp(0.1, 0.9);
                     low as f64 * (high as f64 / low as f64).powf(part)
                 }
-                _ => size as f64 * (0.5 * CLOSE - spare).clamp(-2.0, 2.0).exp2(),
+                _ => size as f64 * (0.5 * MAX_SURPLUS - surplus).clamp(-2.0, 2.0).exp2(),
             };
         }
         let best = match best {
@@ -315,12 +315,12 @@ impl SearchStage {
 
     /// Returns the surplus of quality of `value` over the goal, in approximate halvings of the number of Gaussians.
     /// Negative if the goal is missed.
-    fn spare(&self, value: f64) -> f64 {
+    fn surplus(&self, value: f64) -> f64 {
         match self.searched {
             // Renders that are not finite never pass.
             _ if value.is_nan() => f64::NEG_INFINITY,
-            Quality::Loss { most, .. } => (most / value.max(LEAST_LOSS)).ln() / HALVING.1.ln(),
-            Quality::Psnr(least) => (value - least) / HALVING.0,
+            Quality::Loss { most, .. } => (most / value.max(MIN_LOSS)).ln() / COST_OF_HALVING.1.ln(),
+            Quality::Psnr(least) => (value - least) / COST_OF_HALVING.0,
         }
     }
 
@@ -352,18 +352,18 @@ impl SearchStage {
     }
 }
 
-/// Returns a note about the result of the search for display. `searched` is the number of views of the search, `does`
+/// Returns a note about the result of the search for display. `searched` is the number of views of the search, `is_met`
 /// tells whether the result has the requested quality.
-fn note(summary: &GoalSummary, searched: usize, gaussians: usize, does: bool) -> String {
+fn note(summary: &GoalSummary, searched: usize, gaussians: usize, is_met: bool) -> String {
     let GoalSummary { name, asked, searched: by_searched, held, held_pictures, tried } = summary;
     let (sizes, others) = (tried.len(), held_pictures.len());
-    let (at, unit) = if name == "max_loss" { ("most", "dB lost against photographs") } else { ("least", "dB") };
-    let found = match does {
-        true => format!("of {sizes} sizes tried {gaussians} Gaussians are the fewest that do"),
-        false => format!("none of {sizes} sizes tried does, and everything that may stay is written"),
+    let (at, unit) = if name == "max_loss" { ("most", "dB loss against photographs") } else { ("least", "dB PSNR") };
+    let found = match is_met {
+        true => format!("{gaussians} Gaussians are the smallest of {sizes} tried sizes that reach this"),
+        false => format!("none of {sizes} tried sizes reaches this; all Gaussians that may stay are written"),
     };
     format!(
-        "at {at} {asked} {unit} asked for: {found}; {by_searched:.2} dB by the {searched} pictures searched on, \
-         {held:.2} dB by {others} held back (goal.held_pictures in the summary)"
+        "search for at {at} {asked} {unit}: {found}; {by_searched:.2} dB on the {searched} views of the search, \
+         {held:.2} dB on {others} other views (goal.held_pictures in the summary)"
     )
 }

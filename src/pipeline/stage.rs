@@ -27,7 +27,7 @@ use crate::scene::Scene;
 use crate::statistics::pass::Scanned;
 
 /// Fraction of the Gaussians that ranking leaves in a search without refinement.
-const RANKED_BY_SEARCH: f64 = 0.02;
+const SEARCH_RANK_FRACTION: f64 = 0.02;
 
 /// Phase of a run that a stage belongs to.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -139,7 +139,7 @@ impl CountPlan {
     /// the number that its smallest size needs.
     pub fn after_ranking(&self, wanted: usize, all: usize) -> usize {
         let smallest =
-            if self.refinement_starts_at.is_some() { 0 } else { (RANKED_BY_SEARCH * all as f64).ceil() as usize };
+            if self.refinement_starts_at.is_some() { 0 } else { (SEARCH_RANK_FRACTION * all as f64).ceil() as usize };
         self.before_refinement(if self.searches { smallest } else { wanted }, all)
     }
 
@@ -156,10 +156,10 @@ impl CountPlan {
             }
             (Some(wanted), None) => format!("counts: {alone} {}; refinement removes none", share(wanted)),
             (None, Some(_)) => format!(
-                "counts: ranking leaves {} or more, refinement removes the rest; how many stay is found on the way",
+                "counts: ranking leaves {} or more, refinement removes the rest; the number that stays is found during the run",
                 share(self.before_refinement(0, all))
             ),
-            (None, None) => format!("counts: {alone} as many as are found on the way; refinement removes none"),
+            (None, None) => format!("counts: {alone} a number that is found during the run; refinement removes none"),
         }
     }
 }

@@ -188,11 +188,11 @@ pub enum Detail {
 }
 
 /// Number of notes that are shown with [`Detail::Most`].
-const NOTES: usize = 2;
+const SHOWN_NOTES: usize = 2;
 
 /// Formats a number of views for display.
-fn pictures(count: usize) -> String {
-    format!("{count} picture{}", if count == 1 { "" } else { "s" })
+fn view_count(count: usize) -> String {
+    format!("{count} view{}", if count == 1 { "" } else { "s" })
 }
 
 /// Version of the schema; grows when a field is removed or changes its meaning.
@@ -273,7 +273,7 @@ impl Summary {
         let mut out = String::new();
         // Writing to a String cannot fail.
         let _ = match detail {
-            Detail::All => self.write_course(&mut out),
+            Detail::All => self.write_stages(&mut out),
             Detail::Most => Ok(()),
         };
         let _ = self.write_result(&mut out, detail);
@@ -281,7 +281,7 @@ impl Summary {
     }
 
     /// Writes input, cameras, stages and omitted stages.
-    fn write_course(&self, out: &mut String) -> std::fmt::Result {
+    fn write_stages(&self, out: &mut String) -> std::fmt::Result {
         let input = &self.input;
         writeln!(
             out,
@@ -294,7 +294,7 @@ impl Summary {
         )?;
         writeln!(
             out,
-            "cameras: {} ({} cameras, {} pictures)",
+            "cameras: {} ({} cameras, {} views)",
             self.cameras.origin, self.cameras.cameras, self.cameras.pairs
         )?;
         for stage in &self.stages {
@@ -334,24 +334,24 @@ impl Summary {
         writeln!(out, "kept    {kept} of {all} Gaussians ({:.1}%)", percent(kept as u64, all as u64))?;
         let [after, before] = [self.output_bytes, input.bytes].map(|bytes| ByteSize(bytes).display().si().to_string());
         writeln!(out, "size    {after} of {before} ({:.1}%)", percent(self.output_bytes, input.bytes))?;
-        writeln!(out, "cost    {}", self.cost())?;
+        writeln!(out, "quality {}", self.quality_text())?;
         if let Some(archive) = &self.archive {
-            write!(out, "        its archive's pictures are {:.2} dB from those of the result before", archive.psnr)?;
+            write!(out, "        archive: {:.2} dB PSNR against the result before quantization", archive.psnr)?;
             // If the result before quantization equals the original, the loss equals the PSNR that is already shown.
             match archive.level < PSNR_CAP_DB {
-                true => writeln!(out, ", and lose {:.2} dB against the original's", archive.loss)?,
+                true => writeln!(out, "; {:.2} dB less than that against the original", archive.loss)?,
                 false => writeln!(out)?,
             }
         }
-        let (seconds, peak) = self.taken();
+        let (seconds, peak) = self.time_and_memory();
         let memory = peak.map_or(String::new(), |bytes| format!(", at most {} MiB of memory", bytes >> 20));
         writeln!(out, "took    {}{memory}", duration(seconds))?;
         if !self.output.is_empty() {
-            writeln!(out, "lies in {}", Path::new(&self.output).shown())?;
+            writeln!(out, "output  {}", Path::new(&self.output).shown())?;
         }
         let shown = match detail {
             Detail::All => self.notes.len(),
-            Detail::Most => self.notes.len().min(NOTES),
+            Detail::Most => self.notes.len().min(SHOWN_NOTES),
         };
         for note in &self.notes[..shown] {
             writeln!(out, "note    {note}")?;
@@ -364,29 +364,37 @@ impl Summary {
     }
 
     /// Returns wall-clock seconds of all stages that were computed, and the largest memory of all stages, bytes.
-    fn taken(&self) -> (f64, Option<u64>) {
+    fn time_and_memory(&self) -> (f64, Option<u64>) {
         let seconds = self.stages.iter().filter(|stage| !stage.kept).map(|stage| stage.seconds).sum();
         (seconds, self.stages.iter().filter_map(|stage| stage.peak_memory_bytes).max())
     }
 
     /// Returns a text with the PSNR of the result against the original, if a stage measured it.
-    fn cost(&self) -> String {
+    fn quality_text(&self) -> String {
         let to = |psnr: f64, by: &str| match psnr {
-            same if same >= PSNR_CAP_DB => format!("no difference in {by}"),
-            _ => format!("pictures {} from the original's ({by})", decibels_text(psnr, 1)),
+            same if same >= PSNR_CAP_DB => format!("no difference from the original in {by}"),
+            _ => format!("{} against the original (PSNR, {by})", decibels_text(psnr, 1)),
         };
         let bands = self.bands.as_ref().map(|bands| (bands.result, bands.pictures));
         let field = self.field.as_ref().and_then(|field| Some((field.result?, field.pictures)));
         let refined = self.refined.map(|refined| (refined.result, refined.pictures));
         match (&self.goal, bands.or(field).or(refined)) {
             (Some(goal), _) if goal.name == "max_loss" => {
-                format!("{:.2} dB against photographs held back, {} asked for", goal.held, goal.asked)
+                format!(
+                    "{:.2} dB less PSNR than the original against photographs that the search did not use; at most {} dB requested",
+                    goal.held, goal.asked
+                )
             }
-            (Some(goal), _) => {
-                to(goal.held, &format!("{} held back; {} dB asked for", pictures(goal.held_pictures.len()), goal.asked))
-            }
-            (None, Some((psnr, count))) if psnr.is_finite() => to(psnr, &pictures(count)),
-            _ => "not measured; `splatsieve evaluate` compares pictures".to_owned(),
+            (Some(goal), _) => to(
+                goal.held,
+                &format!(
+                    "{} that the search did not use; {} dB requested",
+                    view_count(goal.held_pictures.len()),
+                    goal.asked
+                ),
+            ),
+            (None, Some((psnr, count))) if psnr.is_finite() => to(psnr, &view_count(count)),
+            _ => "not measured; `splatsieve evaluate` measures it".to_owned(),
         }
     }
 }

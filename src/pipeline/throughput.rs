@@ -23,19 +23,19 @@ use crate::scene::Scene;
 use crate::source::{Ids, ReadPlan};
 
 /// Maximum time of a calibration as a fraction of the expected time of the run.
-const PART: f64 = 0.04;
+const MAX_TIME_FRACTION: f64 = 0.04;
 /// Maximum time of a calibration on all threads, seconds.
-const MOST_SECONDS: f64 = 1.0;
+const MAX_SECONDS: f64 = 1.0;
 /// Number of frames that are read of each block of Gaussians; more if blocks store more frames together.
-const FRAMES: u64 = 16;
+const FRAMES_PER_BLOCK: u64 = 16;
 /// Number of views that each thread renders in each way (contribution, removal error, image).
-const PICTURES: usize = 2;
+const VIEWS_PER_THREAD: usize = 2;
 /// PSNR, dB, above which the loss by pruning alone may leave nothing to refine
 /// ([`crate::refinement::CLOSE_ENOUGH`]).
-const HARDLY_LOST: f64 = 60.0;
+const CLOSE_PSNR: f64 = 60.0;
 
 /// Minimum expected time of a run that is calibrated, seconds.
-const SHORT: f64 = 2.0;
+const MIN_RUN_SECONDS: f64 = 2.0;
 
 /// Returns the expected time and memory of `stages` with the memory plan `plan`, without statistics that are `measured`
 /// already. Calibrates first unless the run is short. The scene must follow the plan already; its throughput is set to
@@ -51,7 +51,7 @@ pub(super) fn forecast(
 ) -> Result<Forecast> {
     let work = scene.workload();
     let expected = core_seconds(&stages.remaining_estimates(&work, &scene.limits, measured)) / work.threads as f64;
-    let found = if expected < SHORT { Calibration::NONE } else { Calibration::measure(scene, expected)? };
+    let found = if expected < MIN_RUN_SECONDS { Calibration::NONE } else { Calibration::measure(scene, expected)? };
     scene.pace = found.pace;
     let work = scene.workload();
     let shortest = stages.shortest_estimates(&work, &scene.limits, measured, found.hardly_seen);
@@ -82,19 +82,19 @@ impl Calibration {
         if work.gaussians == 0 || work.frames == 0 {
             return Ok(Calibration::NONE);
         }
-        let room = (PART * expected).min(MOST_SECONDS) * work.threads as f64;
-        let mut spent = Spent::default();
-        let states = states(scene, &work, room, &mut spent)?;
+        let budget = (MAX_TIME_FRACTION * expected).min(MAX_SECONDS) * work.threads as f64;
+        let mut spent = MeasuredTime::default();
+        let states = measure_states(scene, &work, budget, &mut spent)?;
         let machine = Throughput { states, look: states, remove: states, render: states, processors: None };
         let work = Workload { pace: machine, ..work };
-        let each = PICTURES as f64 * work.threads as f64;
-        let pictures = [LOOK, REMOVE, RENDER].map(|way| work.picturing(each, work.count(), way));
-        let takes = work.reading(work.count(), work.input.frame_block.max(1) as f64)
+        let views_per_way = VIEWS_PER_THREAD as f64 * work.threads as f64;
+        let pictures = [LOOK, REMOVE, RENDER].map(|way| work.picturing(views_per_way, work.count(), way));
+        let needed_seconds = work.reading(work.count(), work.input.frame_block.max(1) as f64)
             + pictures.iter().sum::<f64>()
             + pictures[2];
         let mut found = Calibration { pace: machine, hardly_seen: 0.0 };
-        if takes <= room && work.pictures > 0 {
-            found.look_at(scene, pictures, &mut spent)?;
+        if needed_seconds <= budget && work.pictures > 0 {
+            found.render_views(scene, pictures, &mut spent)?;
         }
         found.pace.processors = spent.processors(work.threads);
         Ok(found)
@@ -102,39 +102,41 @@ impl Calibration {
 
     /// Renders views of one frame and updates throughput and `hardly_seen`. `expected` holds the core-seconds that the
     /// contribution, the removal error and the images are expected to take.
-    fn look_at(&mut self, scene: &Scene, expected: [f64; 3], spent: &mut Spent) -> Result<()> {
+    fn render_views(&mut self, scene: &Scene, expected: [f64; 3], spent: &mut MeasuredTime) -> Result<()> {
         let schedule = &scene.schedule;
         let middle = schedule.iter().count() / 2;
         let seen = schedule.iter().enumerate().filter(|(_, views)| !views.is_empty());
         let Some((frame, views)) = seen.min_by_key(|(frame, _)| frame.abs_diff(middle)) else { return Ok(()) };
         let state = gather_all(scene.source(), frame, Columns::all())?;
         let threads = rayon::current_num_threads();
-        let camera =
-            |k: usize| &schedule.cameras[views[k * views.len() / (PICTURES * threads) % views.len()].1 as usize];
+        let camera = |k: usize| {
+            &schedule.cameras[views[k * views.len() / (VIEWS_PER_THREAD * threads) % views.len()].1 as usize]
+        };
         let renderers: Vec<_> = (0..threads).map(|_| Mutex::new(Renderer::new())).collect();
-        let each = |visit: &(dyn Fn(&mut Renderer, usize, &Camera) + Sync)| {
+        let on_all_threads = |visit: &(dyn Fn(&mut Renderer, usize, &Camera) + Sync)| {
             (0..threads).into_par_iter().for_each(|thread| {
                 let mut renderer = renderers[thread].lock().unwrap_or_else(PoisonError::into_inner);
-                (0..PICTURES).for_each(|k| visit(&mut renderer, thread, camera(thread * PICTURES + k)));
+                (0..VIEWS_PER_THREAD).for_each(|k| visit(&mut renderer, thread, camera(thread * VIEWS_PER_THREAD + k)));
             });
         };
         // The first views also allocate the buffers of the renderers, so they are not timed.
-        each(&|renderer, _, camera| _ = renderer.render(&state, camera, scene.background));
+        on_all_threads(&|renderer, _, camera| _ = renderer.render(&state, camera, scene.background));
         let [look, remove, render] = expected;
         let pace = &mut self.pace;
         let looked = spent.on(|| {
-            each(&|renderer, _, camera| {
+            on_all_threads(&|renderer, _, camera| {
                 renderer.contribution(&state, camera, NonZeroU32::MIN, &mut Contribution::new(state.len()));
             });
         });
         let errors: Vec<_> = (0..threads).map(|_| Mutex::new(RemovalError::new(state.len(), 0.0))).collect();
         let removed = spent.on(|| {
-            each(&|renderer, thread, camera| {
+            on_all_threads(&|renderer, thread, camera| {
                 let mut errors = errors[thread].lock().unwrap_or_else(PoisonError::into_inner);
                 renderer.removal_error(&state, camera, scene.background, &mut errors);
             });
         });
-        let rendered = spent.on(|| each(&|renderer, _, camera| _ = renderer.render(&state, camera, scene.background)));
+        let rendered =
+            spent.on(|| on_all_threads(&|renderer, _, camera| _ = renderer.render(&state, camera, scene.background)));
         for (measured, expected, pace) in
             [(looked, look, &mut pace.look), (removed, remove, &mut pace.remove), (rendered, render, &mut pace.render)]
         {
@@ -142,17 +144,18 @@ impl Calibration {
         }
         let mut sum = RemovalError::new(state.len(), 0.0);
         errors.into_iter().for_each(|of| sum.merge(&of.into_inner().unwrap_or_else(PoisonError::into_inner)));
-        let pixels: f64 = (0..PICTURES * threads).map(camera).map(|c| f64::from(c.width) * f64::from(c.height)).sum();
+        let pixels: f64 =
+            (0..VIEWS_PER_THREAD * threads).map(camera).map(|c| f64::from(c.width) * f64::from(c.height)).sum();
         self.hardly_seen = hardly_seen(sum.sum, 3.0 * pixels);
         Ok(())
     }
 }
 
-/// Returns the fraction of the Gaussians with the smallest `errors` whose sum keeps views within [`HARDLY_LOST`].
+/// Returns the fraction of the Gaussians with the smallest `errors` whose sum keeps views within [`CLOSE_PSNR`].
 /// `errors` are in units of [`RemovalError::UNIT`]; `values` is the number of color values that were rendered.
 fn hardly_seen(mut errors: Vec<u64>, values: f64) -> f64 {
     errors.sort_unstable();
-    let most = values * 10f64.powf(-HARDLY_LOST / 10.0) / RemovalError::UNIT;
+    let most = values * 10f64.powf(-CLOSE_PSNR / 10.0) / RemovalError::UNIT;
     let mut sum = 0.0;
     let few = errors.iter().take_while(|&&error| {
         sum += error as f64;
@@ -162,14 +165,14 @@ fn hardly_seen(mut errors: Vec<u64>, values: f64) -> f64 {
 }
 
 /// Measures the reading of frame states. Returns the measured core-seconds divided by the expected ones, from 0.05 to
-/// 20; 1 where the system does not report processor time. `room` is the time that the calibration may take,
+/// 20; 1 where the system does not report processor time. `budget` is the time that the calibration may take,
 /// core-seconds.
-fn states(scene: &Scene, work: &Workload, room: f64, spent: &mut Spent) -> Result<f64> {
+fn measure_states(scene: &Scene, work: &Workload, budget: f64, spent: &mut MeasuredTime) -> Result<f64> {
     let source = scene.source();
-    let frames = work.frames.min(FRAMES.max(work.input.frame_block)) as usize;
+    let frames = work.frames.min(FRAMES_PER_BLOCK.max(work.input.frame_block)) as usize;
     let of_block = work.reading(BLOCK.min(source.info().count) as f64, frames as f64);
     let all = source.info().count.div_ceil(BLOCK);
-    let blocks = ((0.3 * room / of_block) as usize).clamp(1, 4 * work.threads as usize).min(all);
+    let blocks = ((0.3 * budget / of_block) as usize).clamp(1, 4 * work.threads as usize).min(all);
     // Most stages read every attribute but SH. Readers are opened before the clock starts because stages open them once
     // for many frames.
     let columns = Columns::all().difference(Columns::SH);
@@ -195,12 +198,12 @@ fn states(scene: &Scene, work: &Workload, room: f64, spent: &mut Spent) -> Resul
 
 /// Time that measuring took: seconds of all processors, and wall-clock seconds.
 #[derive(Debug, Default)]
-struct Spent {
+struct MeasuredTime {
     processors: f64,
     wall: f64,
 }
 
-impl Spent {
+impl MeasuredTime {
     /// Runs `work` and returns its processor time in seconds; `None` where the system does not report it.
     fn on(&mut self, work: impl FnOnce()) -> Option<f64> {
         let clock = Clock::start();

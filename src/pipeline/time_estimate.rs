@@ -8,15 +8,15 @@ use crate::progress::duration;
 
 /// Range of measured core-seconds relative to expected ones after a calibration: lowest and highest ratio on three
 /// trained models at several sizes (`scripts/estimate.py`), slightly widened.
-const OFF: [f64; 2] = [0.5, 1.6];
+const ERROR_RANGE: [f64; 2] = [0.5, 1.6];
 /// Range of the same ratio without a calibration.
-const OFF_UNMEASURED: [f64; 2] = [0.25, 4.0];
+const ERROR_RANGE_UNCALIBRATED: [f64; 2] = [0.25, 4.0];
 /// Range of the same ratio for a search, whose number of refinements is not known in advance.
-const OFF_SEARCHING: [f64; 2] = [0.15, 2.5];
+const ERROR_RANGE_SEARCH: [f64; 2] = [0.15, 2.5];
 /// Minimum fraction of the processors that stages keep busy; some work is not divided among threads.
-const TOGETHER: f64 = 0.6;
+const MIN_UTILIZATION: f64 = 0.6;
 /// Time for starting, opening and writing in every run, seconds.
-const AT_LEAST: f64 = 0.5;
+const FIXED_SECONDS: f64 = 0.5;
 
 impl Forecast {
     /// Returns the forecast of stages with the estimates `needs`. `least` is the number of core-seconds if all stages
@@ -30,16 +30,16 @@ impl Forecast {
     ) -> Forecast {
         let likely = core_seconds(needs);
         let measured = work.pace.processors;
-        let off = match (searches, measured) {
-            (true, _) => OFF_SEARCHING,
-            (_, Some(_)) => OFF,
-            (_, None) => OFF_UNMEASURED,
+        let error_range = match (searches, measured) {
+            (true, _) => ERROR_RANGE_SEARCH,
+            (_, Some(_)) => ERROR_RANGE,
+            (_, None) => ERROR_RANGE_UNCALIBRATED,
         };
-        let core = Range { least: off[0] * least, likely, most: off[1] * likely + AT_LEAST };
+        let core = Range { least: error_range[0] * least, likely, most: error_range[1] * likely + FIXED_SECONDS };
         let threads = work.threads as f64;
-        let got = measured.unwrap_or(threads).min(threads);
-        let usual = (0.9 * got).max(1f64.min(got));
-        let fewest = (TOGETHER * got).max(1f64.min(got));
+        let processors = measured.unwrap_or(threads).min(threads);
+        let usual = (0.9 * processors).max(1f64.min(processors));
+        let fewest = (MIN_UTILIZATION * processors).max(1f64.min(processors));
         Forecast {
             seconds: Range { least: core.least / threads, likely: core.likely / usual, most: core.most / fewest },
             core_seconds: core,
@@ -64,11 +64,11 @@ impl Forecast {
             _ => writeln!(
                 out,
                 "time: about {}, {} to {} on {threads} threads; {} to {} core-seconds",
-                rounded(seconds.likely),
-                rounded(seconds.least),
-                rounded(seconds.most),
-                digits(core.least),
-                digits(core.most)
+                approximate_time(seconds.likely),
+                approximate_time(seconds.least),
+                approximate_time(seconds.most),
+                two_digits(core.least),
+                two_digits(core.most)
             ),
         };
         if tell == Verbosity::Plan {
@@ -86,7 +86,7 @@ pub(super) fn core_seconds(needs: &[ResourceEstimate]) -> f64 {
 }
 
 /// Formats `value` with two significant digits; more would suggest a precision that a forecast does not have.
-fn digits(value: f64) -> String {
+fn two_digits(value: f64) -> String {
     match value {
         ..0.95 => format!("{value:.1}"),
         ..100.0 => format!("{value:.0}"),
@@ -98,9 +98,9 @@ fn digits(value: f64) -> String {
 }
 
 /// Formats an approximate time in seconds with about two significant digits.
-fn rounded(seconds: f64) -> String {
+fn approximate_time(seconds: f64) -> String {
     match seconds {
-        ..60.0 => format!("{} s", digits(seconds)),
+        ..60.0 => format!("{} s", two_digits(seconds)),
         ..600.0 => duration((seconds / 10.0).round() * 10.0),
         _ => duration((seconds / 60.0).round() * 60.0),
     }
@@ -141,8 +141,8 @@ mod tests {
     #[test]
     fn approximate_values_are_formatted_with_two_digits() {
         for (value, text) in [(0.44, "0.4"), (9.6, "10"), (47.4, "47"), (1234.0, "1200"), (99.7, "100")] {
-            assert_eq!(digits(value), text);
+            assert_eq!(two_digits(value), text);
         }
-        assert_eq!([42.4, 127.0, 4000.0].map(rounded), ["42 s", "2 min 10 s", "1 h 07 min"]);
+        assert_eq!([42.4, 127.0, 4000.0].map(approximate_time), ["42 s", "2 min 10 s", "1 h 07 min"]);
     }
 }

@@ -23,8 +23,9 @@ use crate::pipeline::planning::Planning;
 use crate::pipeline::request::Goal;
 use crate::pipeline::stage::{Archived, EstimateInput, Phase, RunState, Stage, StageList};
 use crate::pipeline::stages::reference_views::{
-    ADDED, ArchiveTarget, BYTES_ADDED, BYTES_HALVINGS, HALVINGS, LEFT_BY_SEARCH, PIXEL, QualityTarget, ROUNDS,
-    ReferenceViews, balanced, bisected, check_met, measurable, pictures,
+    ARCHIVE_HEADROOM, ArchiveTarget, BALANCING_ROUNDS, BYTES_OCTAVE_HALVINGS, BYTES_OCTAVE_RANGE, BYTES_PER_PIXEL,
+    OCTAVE_HALVINGS, OCTAVE_RANGE, QualityTarget, ReferenceViews, bisect, check_measurable, check_met, pictures,
+    step_change,
 };
 use crate::pipeline::summary::ArchiveSummary;
 use crate::render;
@@ -33,10 +34,10 @@ use crate::scene::Scene;
 /// Name of the stage.
 const NAME: &str = "archive";
 /// Maximum step in standard deviations of a group's values; a coarser one would erase the values.
-const COARSEST: f64 = 4.0;
+const MAX_STEP: f64 = 4.0;
 /// Octaves added to the initial steps to estimate the size of an archive without rendering. With this value, the number
 /// of Gaussians that fits leaves 0.5 and 1.2 dB for quantization on two trained models.
-const GUESSED: f64 = 3.3;
+const ESTIMATE_OCTAVES: f64 = 3.3;
 
 /// Stage that makes an archive.
 #[derive(Debug, Clone, PartialEq)]
@@ -68,8 +69,8 @@ impl Stage for ArchiveStage {
         if let Some(goal) = &mut run.goal {
             (goal.searched, goal.held) = (goal.searched - archive.loss, goal.held - archive.loss);
             run.journal.notes.push(format!(
-                "{LEFT_BY_SEARCH} dB of what was searched for were left for the archive, which takes {:.2}: at least {} dB \
-                 asked for, {:.2} dB by the pictures searched on, {:.2} dB by those held back",
+                "archive: quantization costs {:.2} dB of the {ARCHIVE_HEADROOM} dB that the search reserved for it; at least \
+                 {} dB PSNR requested, {:.2} dB on the views of the search, {:.2} dB on the other views",
                 archive.loss, goal.asked, goal.searched, goal.held
             ));
         }
@@ -95,7 +96,7 @@ impl ValueGroup {
 
     /// Returns the initial number of steps per standard deviation of the values. These steps are finer than most final
     /// ones.
-    fn first(&self) -> f64 {
+    fn initial_steps(&self) -> f64 {
         match self {
             ValueGroup::Attribute(0) => 512.0,
             ValueGroup::Attribute(_) => 24.0,
@@ -111,7 +112,7 @@ impl ArchiveStage {
         let whole = work.state(Columns::all());
         let count = pictures(work.pixels);
         // About forty groups are quantized in every round, and all together in each halving.
-        let looked = count as f64 * (2.0 * HALVINGS as f64 + ROUNDS as f64 * 40.0);
+        let looked = count as f64 * (2.0 * OCTAVE_HALVINGS as f64 + BALANCING_ROUNDS as f64 * 40.0);
         ResourceEstimate {
             stage: NAME,
             reads: 1.0,
@@ -124,16 +125,16 @@ impl ArchiveStage {
                 ("contents", 4 * whole),
             ],
             fixed: vec![
-                ("pictures", PIXEL * (2 * count + work.threads) * work.pixels),
+                ("pictures", BYTES_PER_PIXEL * (2 * count + work.threads) * work.pixels),
                 ("strips", work.threads * render::STRIP_BYTES as u64),
                 ("fields", 4 * work.input.fixed),
                 // Archives of frames also encode a few blocks.
-                ("blocks", bounds::storing(work).iter().map(|part| part.1).sum()),
+                ("blocks", bounds::storing_memory(work).iter().map(|part| part.1).sum()),
             ],
         }
     }
 
-    /// Makes an archive of `reduction` that meets `asked`.
+    /// Makes an archive of `compressed` that meets `asked`.
     ///
     /// # Errors
     /// Fails if the input cannot be archived, if values or renders are not finite, if frames cannot be read, or if the
@@ -141,24 +142,24 @@ impl ArchiveStage {
     pub fn archive(
         &self,
         scene: &Scene,
-        reduction: &CompressedModel,
+        compressed: &CompressedModel,
         asked: ArchiveTarget,
         journal: &mut Journal,
     ) -> Result<(Archived, ArchiveSummary)> {
-        let key = scene.work.key(&(self.psnr, asked, reduction));
-        let (archived, AsToml(summary)) = journal.kept_stage(NAME, reduction.len(), scene, key, |_| {
+        let key = scene.work.key(&(self.psnr, asked, compressed));
+        let (archived, AsToml(summary)) = journal.kept_stage(NAME, compressed.len(), scene, key, |_| {
             let (archived, summary) = match scene.input.archives_frames() {
                 true => {
-                    let left = scene.input.reduced(reduction)?;
+                    let left = scene.input.reduced(compressed)?;
                     let (bounds, summary) = bounds::find(scene, &*left, self.psnr, asked)?;
                     (Archived::Frames(bounds), summary)
                 }
                 false => {
-                    let (encoded, summary) = self.make(scene, reduction, asked)?;
+                    let (encoded, summary) = self.make(scene, compressed, asked)?;
                     (Archived::Content(encoded), summary)
                 }
             };
-            Ok(((archived, AsToml(summary)), reduction.len()))
+            Ok(((archived, AsToml(summary)), compressed.len()))
         })?;
         Ok((archived, summary))
     }
@@ -166,67 +167,68 @@ impl ArchiveStage {
     fn make(
         &self,
         scene: &Scene,
-        reduction: &CompressedModel,
+        compressed: &CompressedModel,
         asked: ArchiveTarget,
     ) -> Result<(Encoded, ArchiveSummary)> {
-        let mut content = scene.input.content(reduction)?;
-        let looks = ReferenceViews::new(scene, &*scene.input.decode_frames(&content)?)?;
+        let mut content = scene.input.content(compressed)?;
+        let reference_views = ReferenceViews::new(scene, &*scene.input.decode_frames(&content)?)?;
         let original = ReferenceViews::new(scene, scene.source())?;
-        let level = measurable(looks.psnr(scene.source())?)?;
-        let aim = QualityTarget::new(self.psnr, asked, level);
-        let asked = aim.close(level);
+        let level = check_measurable(reference_views.psnr(scene.source())?)?;
+        let quality_target = QualityTarget::new(self.psnr, asked, level);
+        let asked = quality_target.required_psnr(level);
         let mut grids = Grids::from_content(&content);
         let mut measured = Vec::new();
-        for _ in 0..ROUNDS {
-            measured = grids.balance(scene, &looks, &mut content, 10f64.powf(-0.1 * asked))?;
+        for _ in 0..BALANCING_ROUNDS {
+            measured = grids.balance(scene, &reference_views, &mut content, 10f64.powf(-0.1 * asked))?;
         }
         let encoded = |added: f64| archive::encode(&content, &grids.steps(added));
-        let looked_at = |encoded: Encoded| -> Result<(Encoded, [f64; 2])> {
+        let measure_views = |encoded: Encoded| -> Result<(Encoded, [f64; 2])> {
             let (decoded, _) = archive::decode(&encoded.bytes, &scene.path, ReadLimit::NONE)?;
             let shown = scene.input.decode_frames(&decoded)?;
-            Ok((encoded, [looks.psnr(&*shown)?, level - original.psnr(&*shown)?]))
+            Ok((encoded, [reference_views.psnr(&*shown)?, level - original.psnr(&*shown)?]))
         };
-        let (encoded, [psnr, loss]) = match aim {
+        let (encoded, [psnr, loss]) = match quality_target {
             QualityTarget::Bytes(most) => {
                 // Take the finest steps that fit.
                 let fits = |finer: f64| Ok(Some(encoded(-finer)?).filter(|found| found.bytes.len() as u64 <= most));
-                looked_at(match bisected(BYTES_ADDED.map(|added| -added), BYTES_HALVINGS, fits)? {
+                measure_views(match bisect(BYTES_OCTAVE_RANGE.map(|added| -added), BYTES_OCTAVE_HALVINGS, fits)? {
                     Some(best) => best,
-                    None => coarsest(encoded(BYTES_ADDED[0])?, most, reduction.len())?,
+                    None => check_coarsest(encoded(BYTES_OCTAVE_RANGE[0])?, most, compressed.len())?,
                 })?
             }
             QualityTarget::Close(_) | QualityTarget::Loss(_) => {
-                let best = bisected(ADDED, HALVINGS, |added| {
-                    Ok(Some(looked_at(encoded(added)?)?).filter(|&(_, found)| aim.does(found, asked)))
+                let best = bisect(OCTAVE_RANGE, OCTAVE_HALVINGS, |added| {
+                    Ok(Some(measure_views(encoded(added)?)?)
+                        .filter(|&(_, found)| quality_target.is_met_by(found, asked)))
                 })?;
-                best.map_or_else(|| looked_at(encoded(ADDED[0])?), Ok)?
+                best.map_or_else(|| measure_views(encoded(OCTAVE_RANGE[0])?), Ok)?
             }
         };
-        check_met(aim, asked, psnr)?;
+        check_met(quality_target, asked, psnr)?;
         let (parts, bits) = (encoded.parts, encoded.bits.clone());
         Ok((encoded, ArchiveSummary { asked, psnr, level, loss, parts: Some(parts), bounds: None, bits, measured }))
     }
 }
 
-/// Returns the estimated bytes of an archive of `reduction`, with steps or bounds that do not depend on renders.
+/// Returns the estimated bytes of an archive of `compressed`, with steps or bounds that do not depend on renders.
 ///
 /// # Errors
 /// Fails if the input cannot be archived or values are not finite.
-pub fn bytes(scene: &Scene, reduction: &CompressedModel) -> Result<u64> {
+pub fn bytes(scene: &Scene, compressed: &CompressedModel) -> Result<u64> {
     if scene.input.archives_frames() {
-        return bounds::bytes(scene, &*scene.input.reduced(reduction)?);
+        return bounds::bytes(scene, &*scene.input.reduced(compressed)?);
     }
-    let content = scene.input.content(reduction)?;
-    Ok(archive::encode(&content, &Grids::from_content(&content).steps(GUESSED))?.bytes.len() as u64)
+    let content = scene.input.content(compressed)?;
+    Ok(archive::encode(&content, &Grids::from_content(&content).steps(ESTIMATE_OCTAVES))?.bytes.len() as u64)
 }
 
 /// Returns the coarsest archive of `gaussians` Gaussians if it has at most `most` bytes, otherwise an error.
-fn coarsest(encoded: Encoded, most: u64, gaussians: usize) -> Result<Encoded> {
+fn check_coarsest(encoded: Encoded, most: u64, gaussians: usize) -> Result<Encoded> {
     let least = encoded.bytes.len();
     if least as u64 > most {
         return Err(Error::usage(format!(
-            "--target-size: an archive of {gaussians} Gaussians has {least} bytes on the coarsest grids; expected at least \
-             that, found {most}"
+            "--target-size: expected at least {least} bytes, the size of an archive of {gaussians} Gaussians with the \
+             coarsest quantization, found {most}"
         )));
     }
     Ok(encoded)
@@ -247,7 +249,7 @@ impl Grids {
     fn from_content(content: &Content) -> Grids {
         let groups = groups(content);
         let deviations: Vec<f64> = groups.iter().map(|group| deviation(content, group)).collect();
-        let first = |(group, deviation): (&ValueGroup, &f64)| (deviation / group.first()).log2();
+        let first = |(group, deviation): (&ValueGroup, &f64)| (deviation / group.initial_steps()).log2();
         let octaves = groups.iter().zip(&deviations).map(first).collect();
         let space = archive::space(content);
         let offsets = archive::offsets(&content.field, &content.tensors, &content.cloud.position, space, content.times);
@@ -259,7 +261,7 @@ impl Grids {
         let mut steps = Steps::default();
         for (group, octave) in self.groups.iter().zip(&self.octaves) {
             match group {
-                ValueGroup::Attribute(k) => steps.cloud[*k] = eighths(octave + added),
+                ValueGroup::Attribute(k) => steps.cloud[*k] = nearest_step(octave + added),
                 ValueGroup::Tensor(name) => _ = steps.field.0.insert(name.clone(), self.tensor(name, octave + added)),
             }
         }
@@ -267,7 +269,7 @@ impl Grids {
     }
 
     fn tensor(&self, name: &str, octave: f64) -> TensorSteps {
-        TensorSteps { step: eighths(octave), channels: self.offsets.get(name).cloned().unwrap_or_default() }
+        TensorSteps { step: nearest_step(octave), channels: self.offsets.get(name).cloned().unwrap_or_default() }
     }
 
     /// Measures the squared error and the bits of every group. Sets the steps so that the error of each group is
@@ -276,11 +278,11 @@ impl Grids {
     fn balance(
         &mut self,
         scene: &Scene,
-        looks: &ReferenceViews<'_>,
+        reference_views: &ReferenceViews<'_>,
         content: &mut Content,
         error: f64,
     ) -> Result<Vec<(String, f64, f64, f64)>> {
-        let errors = self.errors(scene, looks, content)?;
+        let errors = self.errors(scene, reference_views, content)?;
         let fine = archive::encode(content, &self.steps(0.0))?.bits;
         let coarse = archive::encode(content, &self.steps(0.5))?.bits;
         let bits = |of: &BTreeMap<String, f64>, group: &ValueGroup| of.get(group.name()).copied().unwrap_or(0.0);
@@ -293,24 +295,24 @@ impl Grids {
         let mut measured = Vec::with_capacity(self.groups.len());
         for (g, group) in self.groups.iter().enumerate() {
             measured.push((group.name().to_owned(), self.octaves[g], errors[g], bits(&fine, group)));
-            let by = balanced(error * saved[g] / all, errors[g]);
-            let coarsest = (COARSEST * self.deviations[g]).log2();
+            let by = step_change(error * saved[g] / all, errors[g]);
+            let coarsest = (MAX_STEP * self.deviations[g]).log2();
             self.octaves[g] = (self.octaves[g] + by).min(coarsest);
         }
         Ok(measured)
     }
 
     /// Returns the squared errors of renders with one group quantized and all others exact. Leaves `content` unchanged.
-    fn errors(&self, scene: &Scene, looks: &ReferenceViews<'_>, content: &mut Content) -> Result<Vec<f64>> {
+    fn errors(&self, scene: &Scene, reference_views: &ReferenceViews<'_>, content: &mut Content) -> Result<Vec<f64>> {
         let space = archive::space(content);
         let one = |(group, &octave): (&ValueGroup, &f64)| -> Result<f64> {
             match group {
                 ValueGroup::Attribute(k) => {
                     let before = content.cloud.clone();
                     let mut steps = [0; ATTRIBUTES.len()];
-                    steps[*k] = eighths(octave);
+                    steps[*k] = nearest_step(octave);
                     archive::round_cloud(&mut content.cloud, &steps, &[*k]);
-                    let found = looks.error(&*scene.input.decode_frames(content)?);
+                    let found = reference_views.error(&*scene.input.decode_frames(content)?);
                     content.cloud = before;
                     found
                 }
@@ -319,7 +321,7 @@ impl Grids {
                     let steps = self.tensor(name, octave);
                     let rounded = archive::rounded(&before, role, &steps, &content.cloud.position, space);
                     content.tensors.insert(name.clone(), rounded);
-                    let found = looks.error(&*scene.input.decode_frames(content)?);
+                    let found = reference_views.error(&*scene.input.decode_frames(content)?);
                     content.tensors.insert(name.clone(), before);
                     found
                 }
@@ -358,6 +360,6 @@ fn deviation(content: &Content, group: &ValueGroup) -> f64 {
 }
 
 /// Returns the nearest step on the grid of eighths of octaves.
-fn eighths(octave: f64) -> i32 {
+fn nearest_step(octave: f64) -> i32 {
     ((8.0 * octave).round() as i32).clamp(*STEPS.start(), *STEPS.end())
 }

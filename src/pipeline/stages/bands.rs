@@ -2,7 +2,7 @@
 //!
 //! Memory: one state of the original, two of the result, and three rendered views.
 
-use super::field::{PICTURES, least};
+use super::field::{COMPARED_VIEWS, least};
 use crate::compressed_model::CompressedModel;
 use crate::error::Result;
 use crate::journal::Journal;
@@ -26,7 +26,7 @@ use crate::source::FrameSource;
 const NAME: &str = "bands";
 
 /// Name of the omitted work if all SH degrees have to stay.
-const WHAT: &str = "fewer bands of spherical harmonics";
+const DROPPED_DEGREES: &str = "lower SH degree";
 
 /// Returns the highest SH degree of a result of `scene` if the user asks for degrees up to `degree`.
 pub(crate) fn highest(scene: &Scene, degree: usize, journal: &mut Journal) -> usize {
@@ -34,11 +34,11 @@ pub(crate) fn highest(scene: &Scene, degree: usize, journal: &mut Journal) -> us
     match scene.input.needs_all_bands() {
         _ if degree >= all => all,
         Some(why) => {
-            journal.leave_out(WHAT, why);
+            journal.leave_out(DROPPED_DEGREES, why);
             all
         }
         None => {
-            journal.notes.push(format!("harmonics above degree {degree} of {all} go, as asked for"));
+            journal.notes.push(format!("SH coefficients above degree {degree} of {all} are dropped, as requested"));
             degree
         }
     }
@@ -75,7 +75,7 @@ impl Stage for ShDegreeStage {
         let (count, key) = (result.len(), scene.work.key(&(self.margin, &result)));
         run.result = run
             .journal
-            .kept_stage(NAME, count, scene, key, |journal| Ok((self.drop_some(scene, result, journal)?, count)))?;
+            .kept_stage(NAME, count, scene, key, |journal| Ok((self.lower_degree(scene, result, journal)?, count)))?;
         Ok(())
     }
 }
@@ -100,7 +100,7 @@ impl ShDegreeStage {
             ("held", held + of_left(left, held)),
             ("pictures", PICTURE_ON_ALL_THREADS),
         ];
-        let pictures = if work.sh_degree > 0 { (PICTURES as u64).min(work.pictures) } else { 0 };
+        let pictures = if work.sh_degree > 0 { (COMPARED_VIEWS as u64).min(work.pictures) } else { 0 };
         ResourceEstimate {
             stage: NAME,
             seconds: work.reading(work.count(), 2.0 * pictures as f64)
@@ -112,27 +112,34 @@ impl ShDegreeStage {
         }
     }
 
-    /// Returns `reduction` with the lowest SH degree at which renders change no more than allowed.
+    /// Returns `compressed` with the lowest SH degree at which renders change no more than allowed.
     ///
     /// # Errors
     /// Fails if frames cannot be read.
-    fn drop_some(&self, scene: &Scene, reduction: CompressedModel, journal: &mut Journal) -> Result<CompressedModel> {
+    fn lower_degree(
+        &self,
+        scene: &Scene,
+        compressed: CompressedModel,
+        journal: &mut Journal,
+    ) -> Result<CompressedModel> {
         let all = scene.source().info().sh_degree;
-        let pictures = spread(&scene.schedule, PICTURES, 1);
+        let pictures = spread(&scene.schedule, COMPARED_VIEWS, 1);
         let stay = match scene.input.needs_all_bands() {
-            _ if all == 0 => Some("colours are of degree 0"),
-            None if reduction.is_empty() || pictures.is_empty() => Some("there is nothing to be seen"),
+            _ if all == 0 => Some("colors have SH degree 0"),
+            None if compressed.is_empty() || pictures.is_empty() => {
+                Some("there are no Gaussians or no views to compare")
+            }
             why => why,
         };
         if let Some(why) = stay {
-            journal.leave_out(WHAT, why);
-            return Ok(reduction);
+            journal.leave_out(DROPPED_DEGREES, why);
+            return Ok(compressed);
         }
-        let source = scene.input.reduced(&reduction)?;
+        let source = scene.input.reduced(&compressed)?;
         let (mut found, mut tried, mut sh_degree) = ([0.0; 2], Vec::new(), all);
         // A lower degree is not tried after one that fails.
         while sh_degree > 0 && tried.len() == all - sh_degree {
-            let [result, apart] = without_bands(scene, &*source, sh_degree - 1, &pictures)?;
+            let [result, apart] = quality_without_degrees(scene, &*source, sh_degree - 1, &pictures)?;
             found = [result, least(result, self.margin)];
             tried.push((sh_degree - 1, apart));
             sh_degree -= usize::from(apart >= found[1]);
@@ -141,16 +148,21 @@ impl ShDegreeStage {
         let [result, least] = found;
         let found = BandsSummary { sh_degree, pictures: pictures.len(), tried, result, least };
         if sh_degree == all {
-            journal.leave_out(WHAT, found.why());
+            journal.leave_out(DROPPED_DEGREES, found.why());
         }
         journal.bands = Some(found);
-        Ok(CompressedModel { sh_degree, ..reduction })
+        Ok(CompressedModel { sh_degree, ..compressed })
     }
 }
 
 /// Returns two mean PSNRs over `pictures`, dB: `result` against the original, and `result` with SH coefficients up to
 /// `degree` against `result` with all.
-fn without_bands(scene: &Scene, result: &dyn FrameSource, degree: usize, pictures: &[Picture]) -> Result<[f64; 2]> {
+fn quality_without_degrees(
+    scene: &Scene,
+    result: &dyn FrameSource,
+    degree: usize,
+    pictures: &[Picture],
+) -> Result<[f64; 2]> {
     let progress = scene.events.task(NAME, "pictures", pictures.len() as u64);
     let mut sums = [0.0; 2];
     let subjects = [Subject::all(scene.source()), Subject::all(result)];

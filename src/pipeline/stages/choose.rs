@@ -1,9 +1,9 @@
 //! Stage `choose`: compares merging with pruning to the same count by renders, and keeps the better result.
 //!
 //! Merging improves quality on some scenes only (method.md, section 6.1). Memory: two states of one frame, of the
-//! original and of an alternative, and [`AT_ONCE`] rendered views.
+//! original and of an alternative, and [`VIEWS_PER_BATCH`] rendered views.
 
-use super::merge::Outcome;
+use super::merge::MergeOutcome;
 use crate::compressed_model::CompressedModel;
 use crate::error::Result;
 use crate::journal::Journal;
@@ -25,10 +25,10 @@ const NAME: &str = "choose";
 
 /// Number of scored views that are compared. The mean PSNR over them differs from that over all views by less than the
 /// alternatives usually differ from one another.
-const PICTURES: usize = 24;
+const COMPARED_VIEWS: usize = 24;
 
 /// Number of views of a frame that are rendered at a time.
-const AT_ONCE: usize = 4;
+const VIEWS_PER_BATCH: usize = 4;
 
 /// Bytes per Gaussian for clusters, twice while alternatives are compared, and for reading members.
 pub(crate) const CLUSTERED: u64 = 125;
@@ -54,9 +54,9 @@ impl Stage for Choose {
 
     fn run(&self, run: &mut RunState<'_>) -> Result<()> {
         let (scored, ranking) = (run.scored()?, run.ranking()?);
-        let merged = Outcome { reduction: run.take_result(), summary: run.merge.take() };
+        let merged = MergeOutcome { compressed: run.take_result(), summary: run.merge.take() };
         let found = self.choose(run.scene, &scored, &ranking, merged, &mut run.journal)?;
-        run.result = CompressedModel { sh_degree: run.template.sh_degree, ..found.reduction };
+        run.result = CompressedModel { sh_degree: run.template.sh_degree, ..found.compressed };
         run.merge = found.summary;
         Ok(())
     }
@@ -79,9 +79,9 @@ impl Choose {
             ("held", held + of_left(merging, held)),
             ("pictures", PICTURE_ON_ALL_THREADS),
         ];
-        let together = AT_ONCE.min(limits.pictures_together) as u64;
+        let together = VIEWS_PER_BATCH.min(limits.pictures_together) as u64;
         let pictures = render::STRIP_BYTES as u64 + 12 * work.pixels * (1 + together);
-        let frames = (PICTURES as u64).min(work.pictures);
+        let frames = (COMPARED_VIEWS as u64).min(work.pictures);
         // The original, and two alternatives of about half as many Gaussians.
         let made = work.picturing(frames as f64, 2.0 * work.count(), RENDER)
             + work.picturing(2.0 * frames as f64, 0.0, RENDER);
@@ -104,31 +104,31 @@ impl Choose {
         &self,
         scene: &Scene,
         scored: &Scored,
-        ranked: &Ranking,
-        merged: Outcome,
+        ranking: &Ranking,
+        merged: MergeOutcome,
         journal: &mut Journal,
-    ) -> Result<Outcome> {
-        let reduction = &merged.reduction;
-        let count = reduction.len();
-        if reduction.clusters.is_empty() {
+    ) -> Result<MergeOutcome> {
+        let compressed = &merged.compressed;
+        let count = compressed.len();
+        if compressed.clusters.is_empty() {
             return Ok(merged);
         }
-        let pruned = ranked.take(count);
-        let pictures = spread(&scene.schedule, PICTURES, VIEWS_AT_ONCE);
-        let key = scene.work.key(&(&pruned, reduction, &pictures));
+        let pruned = ranking.take(count);
+        let pictures = spread(&scene.schedule, COMPARED_VIEWS, VIEWS_AT_ONCE);
+        let key = scene.work.key(&(&pruned, compressed, &pictures));
         let [without, with]: [f64; 2] = journal
-            .kept_stage(NAME, count, scene, key, |_| Ok((mean_psnr(scene, &pruned, reduction, &pictures)?, count)))?;
+            .kept_stage(NAME, count, scene, key, |_| Ok((mean_psnr(scene, &pruned, compressed, &pictures)?, count)))?;
         if with > without {
             return Ok(merged);
         }
         let why = format!(
-            "at the same {count} Gaussians scoring pictures keep {} without it, {with:.2} with it",
+            "PSNR on scored views at the same {count} Gaussians: {} without merging, {with:.2} dB with merging",
             decibels_text(without, 2)
         );
         scene.events.send(Message::Discarded { stage: "merging", why: &why });
         journal.leave_out("merging", why);
-        let kept = if self.has_target { pruned } else { ranked.take(scored.selection.counts.kept) };
-        Ok(Outcome { reduction: CompressedModel::pruned(kept, &reduction.rule), summary: None })
+        let kept = if self.has_target { pruned } else { ranking.take(scored.selection.counts.kept) };
+        Ok(MergeOutcome { compressed: CompressedModel::pruned(kept, &compressed.rule), summary: None })
     }
 }
 
@@ -137,7 +137,7 @@ fn mean_psnr(scene: &Scene, pruned: &[u32], merged: &CompressedModel, pictures: 
     let result = scene.input.reduced(merged)?;
     let progress = scene.events.task(NAME, "pictures", pictures.len() as u64);
     let mut sums = [0.0; 2];
-    let pictures_together = AT_ONCE.min(scene.limits.pictures_together);
+    let pictures_together = VIEWS_PER_BATCH.min(scene.limits.pictures_together);
     let batch = Batch { pictures: pictures_together, ..Batch::of_frame(&scene.limits) };
     let subjects = [Subject::all(scene.source()), Subject::all(&*result)];
     show(subjects, &scene.schedule.cameras, pictures, batch, |views| {
@@ -165,8 +165,8 @@ mod tests {
     use crate::recipe::Recipe;
 
     /// Returns the mean PSNR over the views by which the stage chooses.
-    fn quality(scene: &Scene, reduction: &CompressedModel) -> f64 {
-        mean_psnr(scene, &[], reduction, &spread(&scene.schedule, PICTURES, VIEWS_AT_ONCE)).unwrap()[1]
+    fn quality(scene: &Scene, compressed: &CompressedModel) -> f64 {
+        mean_psnr(scene, &[], compressed, &spread(&scene.schedule, COMPARED_VIEWS, VIEWS_AT_ONCE)).unwrap()[1]
     }
 
     /// Returns the merged model of a scene, the result of the choice, and the journal.
@@ -175,14 +175,14 @@ mod tests {
         scored: &Scored,
         recipe: &Recipe,
         target: Option<usize>,
-    ) -> (CompressedModel, Outcome, Journal) {
+    ) -> (CompressedModel, MergeOutcome, Journal) {
         let merge = MergeStage { recipe: recipe.merge.clone(), scan: recipe.scan.clone(), prunes: true, target };
-        let (ranked, mut journal) = (scored.ranked(), Journal::default());
-        let survivors = target.map_or(scored.selection.counts.kept, |_| ranked.order().len());
-        let merged = merge.merge(scene, scored, &ranked, survivors, &mut journal).unwrap();
-        let before = merged.reduction.clone();
+        let (ranking, mut journal) = (scored.ranked(), Journal::default());
+        let survivors = target.map_or(scored.selection.counts.kept, |_| ranking.order().len());
+        let merged = merge.merge(scene, scored, &ranking, survivors, &mut journal).unwrap();
+        let before = merged.compressed.clone();
         let chosen =
-            Choose { has_target: target.is_some() }.choose(scene, scored, &ranked, merged, &mut journal).unwrap();
+            Choose { has_target: target.is_some() }.choose(scene, scored, &ranking, merged, &mut journal).unwrap();
         (before, chosen, journal)
     }
 
@@ -194,14 +194,14 @@ mod tests {
         let scored = score_scene(&scene, &recipe, &UserOverrides::default());
         for target in [150, 600, 1200] {
             let (merged, chosen, journal) = chosen(&scene, &scored, &recipe, Some(target));
-            assert_eq!(chosen.reduction.len(), target);
-            let got = quality(&scene, &chosen.reduction);
+            assert_eq!(chosen.compressed.len(), target);
+            let got = quality(&scene, &chosen.compressed);
             let own = CompressedModel::pruned(scored.ranked().take(target), &recipe.merge);
             for other in [&merged, &own] {
                 let expected = quality(&scene, other);
                 assert!(got >= expected, "{target}: got {got} dB, an alternative has {expected}");
             }
-            let lost = !merged.clusters.is_empty() && chosen.reduction.clusters.is_empty();
+            let lost = !merged.clusters.is_empty() && chosen.compressed.clusters.is_empty();
             assert_eq!(journal.left_out.iter().any(|left| left.what == "merging"), lost);
         }
     }
@@ -218,6 +218,6 @@ mod tests {
         let survivors = scored.selection.counts.kept;
         let (merged, chosen, journal) = chosen(&scene, &scored, &recipe, None);
         assert!(merged.len() < survivors, "nothing merged");
-        assert_eq!((chosen.reduction.len(), journal.left_out.len()), (survivors, 1));
+        assert_eq!((chosen.compressed.len(), journal.left_out.len()), (survivors, 1));
     }
 }

@@ -23,7 +23,7 @@ use crate::scene::Scene;
 /// Name of the stage.
 const NAME: &str = "degree";
 /// Fraction of the optimization steps with which a degree is tried.
-const STEPS: f64 = 0.2;
+const TRIAL_STEPS: f64 = 0.2;
 
 /// Stage that chooses the SH degree.
 #[derive(Debug, Clone)]
@@ -36,7 +36,7 @@ pub(crate) struct Degree {
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     if let Some(refine) = planning.refine.as_ref().filter(|_| planning.chooses_degree()) {
         stages.set_open_ended();
-        stages.add(Phase::Rank, Degree { refine: refine.in_part(STEPS) });
+        stages.add(Phase::Rank, Degree { refine: refine.in_part(TRIAL_STEPS) });
     }
 }
 
@@ -64,7 +64,7 @@ impl Degree {
         ResourceEstimate { stage: NAME, seconds: degrees * need.seconds, reads: degrees * need.reads, ..need }
     }
 
-    /// Returns the entry of `fits`, sorted by decreasing SH degree, with the best validation PSNR. `like` gives all
+    /// Returns the entry of `fits`, sorted by decreasing SH degree, with the best validation PSNR. `template` gives all
     /// other settings of the model.
     ///
     /// # Errors
@@ -74,18 +74,18 @@ impl Degree {
         scene: &Scene,
         scored: &Scored,
         ranked: &Ranking,
-        like: &CompressedModel,
+        template: &CompressedModel,
         fits: &[ByteLimitFit],
         journal: &mut Journal,
     ) -> Result<ByteLimitFit> {
         let all = scored.count();
-        let key = scene.work.key(&(self.refine.key(), ranked, like, fits));
+        let key = scene.work.key(&(self.refine.key(), ranked, template, fits));
         journal.kept_stage(NAME, all, scene, key, |journal| {
             let targets = Targets::new(scene, self.refine.pictures)?;
             let mut tried: Vec<(ByteLimitFit, f64)> = Vec::new();
             for &fit in fits {
                 let first = self.refine.first(fit.gaussians, all).min(ranked.order().len());
-                let start = CompressedModel { sh_degree: fit.sh_degree, ..like.with(ranked.take(first)) };
+                let start = CompressedModel { sh_degree: fit.sh_degree, ..template.with(ranked.take(first)) };
                 let psnr = self.refine.closeness(NAME, scene, scored, &targets, &start, fit.gaussians)?;
                 let is_no_better = tried.last().is_some_and(|before| psnr <= before.1);
                 tried.push((fit, psnr));
@@ -97,12 +97,12 @@ impl Degree {
             let best = tried.iter().rev().max_by(|a, b| a.1.total_cmp(&b.1)).map_or(fits[0], |best| best.0);
             let of = |(fit, psnr): &(ByteLimitFit, f64)| {
                 let psnr = if psnr.is_nan() { "no number".to_owned() } else { format!("{psnr:.2}") };
-                format!("{} of degree {} {psnr}", fit.gaussians, fit.sh_degree)
+                format!("{} Gaussians of degree {}: {psnr}", fit.gaussians, fit.sh_degree)
             };
             let (count, tried) = (targets.parted(false).apart.len(), tried.iter().map(of).collect::<Vec<_>>().join(", "));
             journal.notes.push(format!(
-                "of the Gaussians that fit, those of SH degree {} show most: {count} pictures kept apart keep, dB, with {tried}, \
-                 refined in a fifth of the steps",
+                "SH degree {} gives the best quality within the byte limit; PSNR on {count} validation views after a fifth \
+                 of the optimization steps, dB: {tried}",
                 best.sh_degree
             ));
             Ok((best, best.gaussians))

@@ -25,7 +25,7 @@ use crate::source::FrameSource;
 /// Name of the stage.
 const NAME: &str = "field";
 /// Number of scored views that are compared.
-pub(crate) const PICTURES: usize = 12;
+pub(crate) const COMPARED_VIEWS: usize = 12;
 
 /// Stage that chooses the precision of the field of a result.
 #[derive(Debug, Clone)]
@@ -76,7 +76,7 @@ impl FieldPrecisionStage {
             ("readers", work.input.reader + of_left(left, work.input.reader)),
             ("pictures", PICTURE_ON_ALL_THREADS),
         ];
-        let pictures = (PICTURES as u64).min(work.pictures);
+        let pictures = (COMPARED_VIEWS as u64).min(work.pictures);
         ResourceEstimate {
             stage: NAME,
             seconds: work.reading(work.count(), 4.0 * pictures as f64)
@@ -92,23 +92,23 @@ impl FieldPrecisionStage {
         }
     }
 
-    /// Returns `reduction` with its field in half precision, if the input supports it and renders change no more than
+    /// Returns `compressed` with its field in half precision, if the input supports it and renders change no more than
     /// allowed. Otherwise returns it unchanged and records why.
     ///
     /// # Errors
     /// Fails if frames cannot be read.
-    fn round(&self, scene: &Scene, reduction: CompressedModel, journal: &mut Journal) -> Result<CompressedModel> {
+    fn round(&self, scene: &Scene, compressed: CompressedModel, journal: &mut Journal) -> Result<CompressedModel> {
         if !scene.input.can_round_field()? {
-            return Ok(reduction);
+            return Ok(compressed);
         }
         let what = "half precision of the field";
-        let pictures = spread(&scene.schedule, PICTURES, 1);
-        if reduction.is_empty() || pictures.is_empty() {
-            journal.leave_out(what, "there is nothing to be seen");
-            return Ok(reduction);
+        let pictures = spread(&scene.schedule, COMPARED_VIEWS, 1);
+        if compressed.is_empty() || pictures.is_empty() {
+            journal.leave_out(what, "there are no Gaussians or no views to compare");
+            return Ok(compressed);
         }
-        let halved = CompressedModel { field: Precision::Half, ..reduction.clone() };
-        let [exact, half] = [&reduction, &halved].map(|of| scene.input.reduced(of));
+        let halved = CompressedModel { field: Precision::Half, ..compressed.clone() };
+        let [exact, half] = [&compressed, &halved].map(|of| scene.input.reduced(of));
         let (exact, half) = (exact?, half?);
         let rounding = closeness(scene, [&*exact, &*half], &pictures)?;
         let result = match rounding >= CLOSE_ENOUGH {
@@ -123,7 +123,7 @@ impl FieldPrecisionStage {
             journal.leave_out(what, found.why());
         }
         journal.field = Some(found);
-        Ok(if fits { halved } else { reduction })
+        Ok(if fits { halved } else { compressed })
     }
 }
 

@@ -44,7 +44,7 @@ const NAME: &str = "merge";
 /// Name of the measurement of pairs in the cache; it can be divided into shards.
 pub(crate) const PAIRS: &str = "pairs";
 /// Minimum number of pairs whose measurement is divided.
-const DIVIDED: usize = 20_000;
+const MIN_DIVIDED_PAIRS: usize = 20_000;
 
 /// Bytes per Gaussian that may survive: id, state with base colors only, whether the state is finite, and merge class.
 /// Ids count twice because merging is tried on subsets.
@@ -52,15 +52,15 @@ const BYTES_PER_SURVIVOR: usize = 2 * size_of::<u32>() + size_of::<[f32; 14]>() 
 
 /// Assumed number of merge trials until the target is met, for the estimate of reads. The secant search usually needs
 /// fewer.
-const TRIALS: f64 = 16.0;
+const USUAL_TRIALS: f64 = 16.0;
 
 /// Number of Gaussians whose full state is in memory at a time while attributes that merging does not use are dropped.
-const GATHERED: usize = 16 * BLOCK;
+const GATHER_CHUNK: usize = 16 * BLOCK;
 
 /// Time per Gaussian, seconds: neighbors, tests and clusters (`benches/merge.rs`).
-const MERGING: f64 = 1e-5;
+const SECONDS_TO_MERGE: f64 = 1e-5;
 /// Approximate fraction of the Gaussians whose pairs are followed over the frames.
-const FOLLOWED: f64 = 0.3;
+const FOLLOWED_FRACTION: f64 = 0.3;
 
 /// Stage that merges.
 #[derive(Debug, Clone)]
@@ -77,9 +77,9 @@ pub(crate) struct MergeStage {
 
 /// Result of merging: the compressed model and the counts of the passes.
 #[derive(Serialize, Deserialize)]
-pub(crate) struct Outcome {
+pub(crate) struct MergeOutcome {
     /// Compressed model.
-    pub reduction: CompressedModel,
+    pub compressed: CompressedModel,
     /// Counts of every pass.
     pub summary: Option<MergeSummary>,
 }
@@ -102,8 +102,8 @@ pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     let why = match planning.request.only {
         Only::Prune => "--prune-only",
         _ if !has_passes => "the recipe has no merge pass",
-        _ if planning.request.goal.is_some() => "a quality or a size on disk is found by pruning",
-        _ => "refining what is left gains more at the same count (--no-refine merges)",
+        _ if planning.request.goal.is_some() => "a quality or a size on disk is reached by pruning alone",
+        _ => "refinement gives better quality at the same count (--no-refine merges instead)",
     };
     match has_passes {
         true => stages.leave_out_stage(what, why, move |work, limits| stage.need(work, limits)),
@@ -121,13 +121,13 @@ impl Stage for MergeStage {
     }
 
     fn shardable_units(&self, _: &Scene, _: &CountPlan) -> Vec<String> {
-        self.recipe.passes.iter().map(|_| format!("{PAIRS}: pairs of neighbours")).collect()
+        self.recipe.passes.iter().map(|_| format!("{PAIRS}: pairs of neighbors")).collect()
     }
 
     fn run(&self, run: &mut RunState<'_>) -> Result<()> {
         let (scored, ranking) = (run.scored()?, run.ranking()?);
         let found = self.merge(run.scene, &scored, &ranking, run.result.len(), &mut run.journal)?;
-        run.result = CompressedModel { sh_degree: run.template.sh_degree, ..found.reduction };
+        run.result = CompressedModel { sh_degree: run.template.sh_degree, ..found.compressed };
         run.merge = found.summary;
         Ok(())
     }
@@ -152,12 +152,13 @@ impl MergeStage {
         ];
         // States are read once. Every pass of every trial follows its pairs over all frames, twice: coinciding pairs
         // are merged first, if there are any.
-        let trials = if self.target.is_some() && self.prunes { TRIALS } else { 1.0 };
+        let trials = if self.target.is_some() && self.prunes { USUAL_TRIALS } else { 1.0 };
         let followed = 2.0 * trials * self.recipe.passes.len() as f64 * work.scattered_reads(work.frames, limits);
         ResourceEstimate {
             stage: NAME,
             reads: work.scattered_reads(1, limits) + followed,
-            seconds: MERGING * work.count() + FOLLOWED * work.reading(work.count(), work.frames as f64),
+            seconds: SECONDS_TO_MERGE * work.count()
+                + FOLLOWED_FRACTION * work.reading(work.count(), work.frames as f64),
             per_gaussian: [scored_memory(limits), per_gaussian].concat(),
             fixed: vec![("pairs", (limits.pairs_together as u64).saturating_mul(pairs)), work.arriving()],
         }
@@ -175,7 +176,7 @@ impl MergeStage {
         ranking: &Ranking,
         survivors: usize,
         journal: &mut Journal,
-    ) -> Result<Outcome> {
+    ) -> Result<MergeOutcome> {
         // Importances may have to be read from disk, so they are read only if the cache needs a key.
         let importance = scene.work.keeps().then(|| scored.importance()).transpose()?;
         let key = scene.work.key(&(
@@ -191,21 +192,21 @@ impl MergeStage {
                     None => trial.merge(&ranking.take(survivors), None)?,
                     Some(target) if !self.prunes => trial.merge_to(&ranking.take(survivors), target)?,
                     Some(target) => {
-                        let count = |m| Ok(trial.merge(&ranking.take(m), None)?.reduction.len());
+                        let count = |m| Ok(trial.merge(&ranking.take(m), None)?.compressed.len());
                         let m = bracket(target, survivors, count)?;
                         trial.merge_to(&ranking.take(m), target)?
                     }
                 };
                 drop(trial);
                 scene.work.not_divided(NAME)?;
-                let Outcome { reduction, summary } = &mut merged;
-                let proxies = scene.input.solve(&reduction.clusters, scored.reference, &self.recipe)?;
-                reduction.make(proxies);
+                let MergeOutcome { compressed, summary } = &mut merged;
+                let proxies = scene.input.solve(&compressed.clusters, scored.reference, &self.recipe)?;
+                compressed.make(proxies);
                 if let Some(summary) = summary {
-                    summary.deviation = reduction.proxies.deviation;
-                    summary.count(&reduction.clusters);
+                    summary.deviation = compressed.proxies.deviation;
+                    summary.count(&compressed.clusters);
                 }
-                let left = reduction.len();
+                let left = compressed.len();
                 Ok((merged, left))
             })
         };
@@ -298,9 +299,9 @@ impl<'a> Trial<'a> {
     }
 
     /// Merges `survivors` to exactly `target` Gaussians.
-    fn merge_to(&mut self, survivors: &[u32], target: usize) -> Result<Outcome> {
+    fn merge_to(&mut self, survivors: &[u32], target: usize) -> Result<MergeOutcome> {
         let merged = self.merge(survivors, Some(survivors.len() - target))?;
-        let left = merged.reduction.len();
+        let left = merged.compressed.len();
         if left > target {
             return Err(Error::usage(format!(
                 "a target of {target} Gaussians, but merging alone leaves {left} at the least\n  allow pruning, or looser merge passes"
@@ -310,13 +311,13 @@ impl<'a> Trial<'a> {
     }
 
     /// Merges `survivors` (increasing ids, all in the pool). Stops after `limit` joins.
-    fn merge(&mut self, survivors: &[u32], limit: Option<usize>) -> Result<Outcome> {
+    fn merge(&mut self, survivors: &[u32], limit: Option<usize>) -> Result<MergeOutcome> {
         let Trial { scored, merge, pool, states, classes, importance, meter, work, pairs_together, known, progress } =
             self;
         let [coverage, visibility] = &*importance;
         let survivors = Survivors {
             states,
-            rows: &places_of(survivors, pool),
+            rows: &indices_in(survivors, pool),
             importance: Importance { ids: pool, coverage, visibility },
             classes,
             extent: scored.reference.extent,
@@ -349,7 +350,7 @@ fn measure(
     asked: &RequestedPairs<'_>,
     merge: &recipe::MergeParams,
 ) -> Result<Vec<Likeness>> {
-    if !work.keeps() || pairs.len() < DIVIDED {
+    if !work.keeps() || pairs.len() < MIN_DIVIDED_PAIRS {
         return meter.measure(pool, reference, pairs, asked.reach, asked.is_part);
     }
     // Sort pairs by position, so that few shards read the same Gaussians.
@@ -375,7 +376,12 @@ fn measure(
 }
 
 /// Returns the compressed model and the counts for the groups in `merged`.
-fn outcome(survivors: &Survivors<'_>, merged: &Merged, reference_frame: usize, merge: &recipe::MergeParams) -> Outcome {
+fn outcome(
+    survivors: &Survivors<'_>,
+    merged: &Merged,
+    reference_frame: usize,
+    merge: &recipe::MergeParams,
+) -> MergeOutcome {
     let (groups, importance) = (&merged.groups, &survivors.importance);
     let id = |row: u32| importance.ids[row as usize];
     let clusters: Vec<Cluster> = groups
@@ -397,7 +403,10 @@ fn outcome(survivors: &Survivors<'_>, merged: &Merged, reference_frame: usize, m
     };
     summary.count(&clusters);
     let kept = groups.leaders().iter().map(|&row| id(row)).collect();
-    Outcome { reduction: CompressedModel { clusters, ..CompressedModel::pruned(kept, merge) }, summary: Some(summary) }
+    MergeOutcome {
+        compressed: CompressedModel { clusters, ..CompressedModel::pruned(kept, merge) },
+        summary: Some(summary),
+    }
 }
 
 /// Returns the states of the Gaussians `ids` (increasing) at `frame` with base colors only, and whether each full state
@@ -408,7 +417,7 @@ fn states_of(source: &dyn FrameSource, ids: &[u32], frame: usize) -> Result<(Gau
     if source.info().times.is_empty() {
         return Ok((states, finite));
     }
-    for (ids, start) in ids.chunks(GATHERED).zip((0..).step_by(GATHERED)) {
+    for (ids, start) in ids.chunks(GATHER_CHUNK).zip((0..).step_by(GATHER_CHUNK)) {
         let whole = gather(source, ids, frame, Columns::all())?;
         states.write_rows(start, &whole);
         for (row, finite) in finite[start..].iter_mut().take(ids.len()).enumerate() {
@@ -419,7 +428,7 @@ fn states_of(source: &dyn FrameSource, ids: &[u32], frame: usize) -> Result<(Gau
 }
 
 /// Returns the index of each of `ids` in `pool`. Both are increasing, and `ids` is a subset of `pool`.
-fn places_of(ids: &[u32], pool: &[u32]) -> Vec<u32> {
+fn indices_in(ids: &[u32], pool: &[u32]) -> Vec<u32> {
     let mut place = 0;
     ids.iter()
         .map(|&id| {
@@ -448,7 +457,7 @@ mod tests {
 
     #[test]
     fn places_follow_the_ids() {
-        assert_eq!(places_of(&[2, 5, 9], &[1, 2, 3, 5, 9]), [1, 3, 4]);
-        assert!(places_of(&[], &[4]).is_empty());
+        assert_eq!(indices_in(&[2, 5, 9], &[1, 2, 3, 5, 9]), [1, 3, 4]);
+        assert!(indices_in(&[], &[4]).is_empty());
     }
 }

@@ -12,41 +12,41 @@ use crate::scene::Scene;
 use crate::source::FrameSource;
 
 /// Minimum and maximum number of compared views; fewer if the views are large.
-const PICTURES: [u64; 2] = [4, 12];
+const VIEW_COUNTS: [u64; 2] = [4, 12];
 /// Maximum bytes of the renders of the result and of the original together, from which the number of views follows.
-const PICTURE_BYTES: u64 = 128 << 20;
+const MAX_VIEW_BYTES: u64 = 128 << 20;
 /// Maximum loss of an archive against the original if nothing is requested, dB.
-const LOSS: f64 = 0.5;
+const DEFAULT_LOSS: f64 = 0.5;
 /// PSNR of the result against the original, dB, above which pruning caused too little error to hide quantization noise.
 /// The archive then has to reach this PSNR against the result.
-const ENOUGH: f64 = 50.0;
+const ENOUGH_PSNR: f64 = 50.0;
 /// Surplus of quality that a search leaves for the archive, dB: a third of the squared error of pruning. At the best
 /// trade-off, errors are proportional to how fast bytes fall with them: about three times as fast for the number of
 /// Gaussians.
-pub(crate) const LEFT_BY_SEARCH: f64 = 1.2;
+pub(crate) const ARCHIVE_HEADROOM: f64 = 1.2;
 /// Maximum shortfall of an archive against its target, dB.
-const SHORT: f64 = 10.0;
+const MAX_SHORTFALL: f64 = 10.0;
 /// Bytes of a pixel of a rendered view.
-pub(crate) const PIXEL: u64 = 3 * size_of::<f32>() as u64;
+pub(crate) const BYTES_PER_PIXEL: u64 = 3 * size_of::<f32>() as u64;
 /// Number of times that errors and bits are measured.
-pub(crate) const ROUNDS: usize = 2;
+pub(crate) const BALANCING_ROUNDS: usize = 2;
 /// Maximum change of a step after one measurement, octaves.
-const FURTHEST: f64 = 2.5;
+const MAX_STEP_CHANGE: f64 = 2.5;
 /// Smallest squared error that is distinguished.
-const LEAST_ERROR: f64 = 1e-14;
+const MIN_ERROR: f64 = 1e-14;
 /// Range of the final change of all steps, octaves, from finer to coarser.
-pub(crate) const ADDED: [f64; 2] = [-2.0, 2.0];
+pub(crate) const OCTAVE_RANGE: [f64; 2] = [-2.0, 2.0];
 /// Number of times that this range is halved.
-pub(crate) const HALVINGS: usize = 6;
+pub(crate) const OCTAVE_HALVINGS: usize = 6;
 /// Range of the final change of all steps for a byte limit, octaves, from coarser to finer.
-pub(crate) const BYTES_ADDED: [f64; 2] = [4.0, -4.0];
-/// Number of times that [`BYTES_ADDED`] is halved.
-pub(crate) const BYTES_HALVINGS: usize = 10;
+pub(crate) const BYTES_OCTAVE_RANGE: [f64; 2] = [4.0, -4.0];
+/// Number of times that [`BYTES_OCTAVE_RANGE`] is halved.
+pub(crate) const BYTES_OCTAVE_HALVINGS: usize = 10;
 
 /// Returns the number of compared views of `pixels` pixels each.
 pub(crate) fn pictures(pixels: u64) -> u64 {
-    let [fewest, most] = PICTURES;
-    (PICTURE_BYTES / (2 * PIXEL * pixels.max(1))).clamp(fewest, most)
+    let [fewest, most] = VIEW_COUNTS;
+    (MAX_VIEW_BYTES / (2 * BYTES_PER_PIXEL * pixels.max(1))).clamp(fewest, most)
 }
 
 /// Request for an archive from the goal of the run, beside the option `--archive-psnr`.
@@ -79,14 +79,14 @@ impl QualityTarget {
             (_, ArchiveTarget::Bytes(most)) => QualityTarget::Bytes(most),
             (Some(psnr), _) => QualityTarget::Close(psnr),
             (None, ArchiveTarget::Loss(loss)) if loss > 0.0 => QualityTarget::Loss(loss),
-            (None, ArchiveTarget::Nothing) if level < ENOUGH => QualityTarget::Loss(LOSS),
-            _ => QualityTarget::Close(ENOUGH),
+            (None, ArchiveTarget::Nothing) if level < ENOUGH_PSNR => QualityTarget::Loss(DEFAULT_LOSS),
+            _ => QualityTarget::Close(ENOUGH_PSNR),
         }
     }
 
     /// Returns whether an archive with PSNR `psnr` against the result and loss `loss`, both in dB, meets the
-    /// requirement. `asked` is the value of [`close`](QualityTarget::close).
-    pub(crate) fn does(self, [psnr, loss]: [f64; 2], asked: f64) -> bool {
+    /// requirement. `asked` is the value of [`required_psnr`](QualityTarget::required_psnr).
+    pub(crate) fn is_met_by(self, [psnr, loss]: [f64; 2], asked: f64) -> bool {
         match self {
             QualityTarget::Loss(most) => loss <= most,
             QualityTarget::Close(_) | QualityTarget::Bytes(_) => psnr >= asked,
@@ -95,12 +95,12 @@ impl QualityTarget {
 
     /// Returns the PSNR against the result before quantization, dB, that the requirement implies for a result with the
     /// PSNR `level` against the original.
-    pub(crate) fn close(self, level: f64) -> f64 {
+    pub(crate) fn required_psnr(self, level: f64) -> f64 {
         match self {
             QualityTarget::Close(psnr) => psnr,
             // Squared errors of pruning and quantization add up.
             QualityTarget::Loss(loss) => level - 10.0 * (10f64.powf(0.1 * loss) - 1.0).log10(),
-            QualityTarget::Bytes(_) => QualityTarget::Loss(LEFT_BY_SEARCH).close(level.min(ENOUGH)),
+            QualityTarget::Bytes(_) => QualityTarget::Loss(ARCHIVE_HEADROOM).required_psnr(level.min(ENOUGH_PSNR)),
         }
     }
 }
@@ -115,23 +115,24 @@ pub(crate) struct ReferenceViews<'a> {
 impl ReferenceViews<'_> {
     pub(crate) fn new<'a>(scene: &'a Scene, source: &dyn FrameSource) -> Result<ReferenceViews<'a>> {
         let count = pictures(scene.workload().pixels) as usize;
-        let mut looks = ReferenceViews { scene, pictures: spread(&scene.schedule, count, 1), images: Vec::new() };
-        looks.images = looks.render(source, |_, image| image)?;
-        Ok(looks)
+        let mut reference_views =
+            ReferenceViews { scene, pictures: spread(&scene.schedule, count, 1), images: Vec::new() };
+        reference_views.images = reference_views.render(source, |_, image| image)?;
+        Ok(reference_views)
     }
 
     fn render<T: Send>(&self, source: &dyn FrameSource, of: impl Fn(usize, Image) -> T + Sync) -> Result<Vec<T>> {
-        let mut made = Vec::with_capacity(self.pictures.len());
+        let mut rendered = Vec::with_capacity(self.pictures.len());
         let batch = Batch::of_frame(&self.scene.limits);
         show([Subject::all(source)], &self.scene.schedule.cameras, &self.pictures, batch, |views| {
-            let first = made.len();
+            let first = rendered.len();
             let view = |(k, view): (usize, &crate::passes::ViewStates<'_, 1>)| {
                 of(first + k, render(view.states[0], view.camera, self.scene.background))
             };
-            made.par_extend(views.par_iter().enumerate().map(view));
+            rendered.par_extend(views.par_iter().enumerate().map(view));
             Ok(())
         })?;
-        Ok(made)
+        Ok(rendered)
     }
 
     /// Returns the mean PSNR of renders of `source` against the reference, dB.
@@ -151,10 +152,10 @@ impl ReferenceViews<'_> {
 ///
 /// # Errors
 /// Fails for NaN, which means that some pixels are NaN.
-pub(crate) fn measurable(psnr: f64) -> Result<f64> {
+pub(crate) fn check_measurable(psnr: f64) -> Result<f64> {
     if psnr.is_nan() {
         return Err(Error::usage(
-            "an archive is made by its pictures: expected numbers in every pixel, found NaN in some\n  \
+            "the quantization of an archive is chosen by renders: expected numbers in every pixel, found NaN in some\n  \
              --non-finite drop removes the Gaussians that are not finite; a .gseq holds them as they are",
         ));
     }
@@ -165,14 +166,14 @@ pub(crate) fn measurable(psnr: f64) -> Result<f64> {
 /// passes.
 ///
 /// # Errors
-/// Fails if the PSNR is more than [`SHORT`] below the smaller of `asked` and [`ENOUGH`]: then some values are so large
+/// Fails if the PSNR is more than [`MAX_SHORTFALL`] below the smaller of `asked` and [`ENOUGH_PSNR`]: then some values are so large
 /// that their grid cannot represent the others.
-pub(crate) fn check_met(aim: QualityTarget, asked: f64, found: f64) -> Result<()> {
-    let is_met = matches!(aim, QualityTarget::Bytes(_)) || found >= asked.min(ENOUGH) - SHORT;
+pub(crate) fn check_met(quality_target: QualityTarget, asked: f64, found: f64) -> Result<()> {
+    let is_met = matches!(quality_target, QualityTarget::Bytes(_)) || found >= asked.min(ENOUGH_PSNR) - MAX_SHORTFALL;
     match is_met {
         true => Ok(()),
         false => Err(Error::usage(format!(
-            "an archive's pictures cannot come as close to the result's as asked for: expected {asked:.1} dB, found {}\n  \
+            "an archive cannot reach the requested PSNR against the result before quantization: expected {asked:.1} dB, found {}\n  \
              some values may be far larger than all others: drop their Gaussians (--drop-ids), or write a .gseq",
             decibels_text(found, 1)
         ))),
@@ -181,7 +182,7 @@ pub(crate) fn check_met(aim: QualityTarget, asked: f64, found: f64) -> Result<()
 
 /// Returns the result of `of` at the largest number of a range for which it returns one, found by bisection with
 /// `halvings` steps. Returns `None` if no tried number has a result.
-pub(crate) fn bisected<T>(
+pub(crate) fn bisect<T>(
     [mut low, mut high]: [f64; 2],
     halvings: usize,
     of: impl Fn(f64) -> Result<Option<T>>,
@@ -198,7 +199,7 @@ pub(crate) fn bisected<T>(
 }
 
 /// Returns the octaves by which a step that causes the squared error `found` must grow to cause about `error`. The
-/// change is limited to [`FURTHEST`].
-pub(crate) fn balanced(error: f64, found: f64) -> f64 {
-    (0.5 * (error / found.max(LEAST_ERROR)).log2()).clamp(-FURTHEST, FURTHEST)
+/// change is limited to [`MAX_STEP_CHANGE`].
+pub(crate) fn step_change(error: f64, found: f64) -> f64 {
+    (0.5 * (error / found.max(MIN_ERROR)).log2()).clamp(-MAX_STEP_CHANGE, MAX_STEP_CHANGE)
 }

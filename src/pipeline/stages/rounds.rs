@@ -48,9 +48,9 @@ pub(crate) struct Rounds {
 }
 
 /// Value of [`Rounds::fewest`] if no size is requested.
-const FEWEST: f64 = 0.05;
+const MIN_LEFT: f64 = 0.05;
 /// Value of [`Rounds::usual`] if no size is requested.
-const USUAL: f64 = 0.5;
+const USUAL_LEFT: f64 = 0.5;
 
 /// Adds the stage if Gaussians are ranked by views.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
@@ -67,13 +67,13 @@ impl Stage for Rounds {
 
     fn parameters(&self) -> String {
         let (percent, Rounds { pictures, turns, .. }) = (100.0 * self.fraction, self);
-        format!("rounds: each leaves {percent:.0}% of the Gaussians, by a part of {turns} of {pictures} views")
+        format!("rounds: each keeps {percent:.0}% of the Gaussians, ranked on {pictures} views in {turns} groups")
     }
 
     fn shardable_units(&self, scene: &Scene, counts: &CountPlan) -> Vec<String> {
         let count = scene.source().info().count;
         let usual = (self.usual * count as f64).ceil() as usize;
-        self.divided(count, counts.after_ranking(usual, count))
+        self.shardable_rounds(count, counts.after_ranking(usual, count))
     }
 
     fn run(&self, run: &mut RunState<'_>) -> Result<()> {
@@ -98,7 +98,7 @@ impl Rounds {
             contrast_floor,
             ..
         } = *recipe;
-        let (fewest, usual) = (target.unwrap_or(FEWEST), target.unwrap_or(USUAL));
+        let (fewest, usual) = (target.unwrap_or(MIN_LEFT), target.unwrap_or(USUAL_LEFT));
         (fraction < 1.0).then_some(Rounds { fraction, pictures, turns, contrast_floor, fewest, usual })
     }
 
@@ -131,10 +131,10 @@ impl Rounds {
     }
 
     /// Returns the rounds that leave `fewest` of `count` Gaussians, one line each for display.
-    pub(crate) fn divided(&self, count: usize, fewest: usize) -> Vec<String> {
+    pub(crate) fn shardable_rounds(&self, count: usize, fewest: usize) -> Vec<String> {
         let of = |round: usize| self.pictures.div_ceil(if round == 0 { 1 } else { self.turns.max(1) });
         let rounds = 0..self.sizes(count, 0, fewest).len();
-        rounds.map(|round| format!("{}: {} pictures at most", name(round), of(round))).collect()
+        rounds.map(|round| format!("{}: {} views at most", entry_name(round), of(round))).collect()
     }
 
     /// Divides the views into groups (turns), by frames if there are enough frames, otherwise one by one.
@@ -166,7 +166,7 @@ impl Rounds {
         let is_free = |id: &u32| !scored.is_protected(*id);
         let mut state = RoundState {
             free: before.order().iter().copied().filter(is_free).collect(),
-            gone: Vec::new(),
+            removed: Vec::new(),
             errors: Vec::new(),
         };
         let first = state.free.len() + protected.len();
@@ -180,7 +180,7 @@ impl Rounds {
         let key = scene.work.key(&(self.fraction, self.contrast_floor, &turns, &before, protected));
         let mut done = 0;
         for round in (0..sizes.len()).rev().filter(|_| scene.work.keeps()) {
-            if let Some(found) = scene.work.find(&name(round), key.and(&round))? {
+            if let Some(found) = scene.work.find(&entry_name(round), key.and(&round))? {
                 (state, done) = (found, round + 1);
                 break;
             }
@@ -188,14 +188,14 @@ impl Rounds {
         let pictures =
             (done..sizes.len()).map(|round| looking(&turns, round).map(|turn| turns[turn].len()).sum::<usize>());
         let progress = scene.events.task(NAME, "pictures", pictures.sum::<usize>() as u64);
-        let RoundState { free, gone, .. } = journal.stage(NAME, first, scene.source(), |_| {
+        let RoundState { free, removed, .. } = journal.stage(NAME, first, scene.source(), |_| {
             for (round, &left) in sizes.iter().enumerate().skip(done) {
                 state = self.round(scene, scored, (state, &turns), round, (key, left), &progress)?;
             }
             let left = state.free.len() + protected.len();
             Ok((state, left))
         })?;
-        Ok(Ranking::new(protected.iter().copied().chain(free).chain(gone).collect()))
+        Ok(Ranking::new(protected.iter().copied().chain(free).chain(removed).collect()))
     }
 
     /// Returns how many of `free` Gaussians each round leaves, until at most `fewest` are left including the
@@ -243,7 +243,7 @@ impl Rounds {
             };
             looking.iter().map(of_turn).collect()
         };
-        scene.work.divided(&name(round), key.and(&round), units, compute, |parts| {
+        scene.work.divided(&entry_name(round), key.and(&round), units, compute, |parts| {
             for &turn in &looking {
                 ids.iter().for_each(|&id| state.errors[turn][id as usize] = 0);
             }
@@ -259,8 +259,8 @@ impl Rounds {
             // The sort is stable: ties keep the earlier order.
             state.free.sort_by_cached_key(|id| std::cmp::Reverse(error(id)));
             let mut worst = state.free.split_off(left);
-            worst.append(&mut state.gone);
-            state.gone = worst;
+            worst.append(&mut state.removed);
+            state.removed = worst;
             Ok(state)
         })
     }
@@ -272,13 +272,13 @@ struct RoundState {
     /// Survivors that are not protected, best first.
     free: Vec<u32>,
     /// Removed Gaussians, worst last.
-    gone: Vec<u32>,
+    removed: Vec<u32>,
     /// Removal error of every Gaussian by group of views, when the group was last rendered.
     errors: Vec<Vec<u64>>,
 }
 
 /// Returns the name of a round in the cache.
-fn name(round: usize) -> String {
+fn entry_name(round: usize) -> String {
     format!("{NAME}-{:02}", round + 1)
 }
 

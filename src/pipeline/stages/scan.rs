@@ -16,9 +16,9 @@ use crate::statistics::pass::{Scanned, scan_blocks, scan_units};
 pub(crate) const NAME: &str = "scan";
 
 /// Time to add a state to an accumulator, seconds (`benches/scan.rs`).
-const ACCUMULATING: f64 = 2e-8;
+const SECONDS_TO_ACCUMULATE: f64 = 2e-8;
 /// Time to project a state to a view, seconds (`benches/projection.rs`).
-const PROJECTING: f64 = 8e-9;
+const SECONDS_TO_PROJECT: f64 = 8e-9;
 
 /// Stage that scans.
 #[derive(Debug, Clone)]
@@ -40,7 +40,7 @@ impl ScanStage {
             seconds: work.pace.states
                 * work.count()
                 * work.frames as f64
-                * (ACCUMULATING + work.views as f64 * PROJECTING)
+                * (SECONDS_TO_ACCUMULATE + work.views as f64 * SECONDS_TO_PROJECT)
                 + work.reading(work.count(), work.frames as f64),
             per_gaussian: vec![("rows", 2 * Rows::BYTES_PER_GAUSSIAN as u64)],
             fixed: vec![

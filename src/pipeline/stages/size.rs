@@ -22,11 +22,11 @@ use crate::scene::Scene;
 /// Name of the stages.
 const NAME: &str = "size";
 /// Fraction of the byte limit that may remain unused.
-const FREE: f64 = 0.01;
+const MAX_UNUSED: f64 = 0.01;
 /// Maximum number of sizes that are written to measure their bytes.
-const MOST_TRIED: usize = 8;
+const MAX_TRIED: usize = 8;
 /// Number of views used to rank removals if the result exceeds the byte limit.
-const PICTURES: usize = 48;
+const RANKING_VIEWS: usize = 48;
 
 /// Adds the stage that finds how many Gaussians fit.
 pub(super) fn plan_count(planning: &Planning<'_>, stages: &mut StageList) {
@@ -57,9 +57,9 @@ impl Stage for CountByBytes {
     }
 
     fn run(&self, run: &mut RunState<'_>) -> Result<()> {
-        let like = CompressedModel { field: self.limit.field, ..run.template.clone() };
+        let template = CompressedModel { field: self.limit.field, ..run.template.clone() };
         let (present, recipe) = (run.scored()?.present(), run.recipe.len() as u64);
-        run.fits = self.limit.fits(run.scene, (&present, recipe), &like, self.drops_bands, &mut run.journal)?;
+        run.fits = self.limit.fits(run.scene, (&present, recipe), &template, self.drops_bands, &mut run.journal)?;
         run.target = run.fits.first().map(|fit| fit.gaussians);
         Ok(())
     }
@@ -87,7 +87,7 @@ impl Stage for ShrinkToBytes {
 #[derive(Debug, Clone)]
 struct ByteLimit {
     /// Stage that writes the files.
-    emit: Emit,
+    writer: Emit,
     /// Maximum number of bytes.
     most: u64,
     /// Assumed precision of the field: half precision if the field may be rounded.
@@ -99,10 +99,10 @@ impl ByteLimit {
         let Some(Goal::Bytes(most)) = planning.request.goal else { return None };
         let is_rounded = FieldPrecisionStage::from_request(planning.request, planning.output).is_some();
         let field = if is_rounded { Precision::Half } else { Precision::Exact };
-        Some(ByteLimit { emit: Emit::from_planning(planning), most, field })
+        Some(ByteLimit { writer: Emit::from_planning(planning), most, field })
     }
 
-    /// Returns the numbers of Gaussians `ids` that fit for the SH degree of `like` and, if degrees may be dropped, for
+    /// Returns the numbers of Gaussians `ids` that fit for the SH degree of `template` and, if degrees may be dropped, for
     /// every lower one, until all Gaussians fit. See [`ByteLimit::count`].
     ///
     /// # Errors
@@ -111,31 +111,31 @@ impl ByteLimit {
         &self,
         scene: &Scene,
         (ids, recipe): (&[u32], u64),
-        like: &CompressedModel,
+        template: &CompressedModel,
         drops: bool,
         journal: &mut Journal,
     ) -> Result<Vec<ByteLimitFit>> {
         let info = scene.source().info();
-        let highest = like.sh_degree.min(info.sh_degree);
+        let highest = template.sh_degree.min(info.sh_degree);
         let lowest = if drops && scene.input.needs_all_bands().is_none() { 0 } else { highest };
         let mut fits: Vec<ByteLimitFit> = Vec::new();
         for sh_degree in (lowest..=highest).rev() {
             if fits.last().is_some_and(|fit| fit.gaussians == ids.len()) {
                 break;
             }
-            let like = CompressedModel { sh_degree, ..like.clone() };
-            fits.push(ByteLimitFit { sh_degree, gaussians: self.count(scene, (ids, recipe), &like, journal)? });
+            let template = CompressedModel { sh_degree, ..template.clone() };
+            fits.push(ByteLimitFit { sh_degree, gaussians: self.count(scene, (ids, recipe), &template, journal)? });
         }
         Ok(fits)
     }
 
     /// Returns the cache key of everything that the bytes depend on, with a recipe of `recipe` bytes beside the result.
-    fn key(&self, scene: &Scene, recipe: u64, reduction: &CompressedModel) -> CacheKey {
-        scene.work.key(&(self.emit.kind, self.emit.merges, self.most, recipe, reduction))
+    fn key(&self, scene: &Scene, recipe: u64, compressed: &CompressedModel) -> CacheKey {
+        scene.work.key(&(self.writer.kind, self.writer.merges, self.most, recipe, compressed))
     }
 
     /// Returns how many of the Gaussians `ids`, evenly sampled, fit the limit, with the merge parameters and the field
-    /// of `like`.
+    /// of `template`.
     ///
     /// # Errors
     /// Fails if not even one fits, if frames cannot be read, or if a write fails.
@@ -143,33 +143,33 @@ impl ByteLimit {
         &self,
         scene: &Scene,
         (ids, recipe): (&[u32], u64),
-        like: &CompressedModel,
+        template: &CompressedModel,
         journal: &mut Journal,
     ) -> Result<usize> {
         let (all, most) = (ids.len(), self.most);
-        journal.kept_stage(NAME, all, scene, self.key(scene, recipe, like), |_| {
+        journal.kept_stage(NAME, all, scene, self.key(scene, recipe, template), |_| {
             let bytes = |count: usize| {
                 let kept = (0..count).map(|k| ids[k * all / count]).collect();
-                let some = like.with(kept);
-                match self.emit.kind {
+                let some = template.with(kept);
+                match self.writer.kind {
                     // The files beside an archive are neither stored nor sent with it, so they do not count.
                     OutputKind::Archive => archive::bytes(scene, &some),
-                    _ => self.emit.bytes(scene, &some, recipe),
+                    _ => self.writer.bytes(scene, &some, recipe),
                 }
             };
             let one = 1.min(all);
             let least = bytes(one)?;
             if least > most {
                 return Err(Error::usage(format!(
-                    "--target-size: an output of one Gaussian has {least} bytes, nearly all of what is not Gaussians; \
-                     expected at least that, found {most}"
+                    "--target-size: expected at least {least} bytes, the size of an output with one Gaussian (nearly all of it \
+                     is not Gaussians), found {most}"
                 )));
             }
             // Numbers of Gaussians with their bytes: `fits` is the largest that fits, `over` the smallest that does
             // not.
             let (mut fits, mut over) = ((one, least), None);
             let (mut next, mut overs) = (all, 0);
-            for _ in 0..MOST_TRIED {
+            for _ in 0..MAX_TRIED {
                 let found = bytes(next)?;
                 if found <= most {
                     (fits, overs) = ((next, found), 0);
@@ -177,7 +177,7 @@ impl ByteLimit {
                     (over, overs) = (Some((next, found)), overs + 1);
                 }
                 let Some(over) = over.filter(|over: &(usize, u64)| over.0 - fits.0 > 1) else { break };
-                if most - fits.1 <= (FREE * most as f64) as u64 {
+                if most - fits.1 <= (MAX_UNUSED * most as f64) as u64 {
                     break;
                 }
                 let part = (most - fits.1) as f64 / (over.1 - fits.1).max(1) as f64;
@@ -190,7 +190,7 @@ impl ByteLimit {
         })
     }
 
-    /// Removes the Gaussians of `reduction` with the lowest removal error until the result fits. This is needed because
+    /// Removes the Gaussians of `compressed` with the lowest removal error until the result fits. This is needed because
     /// refined values may compress worse than those by which the count was found. Protected Gaussians stay.
     ///
     /// # Errors
@@ -200,55 +200,55 @@ impl ByteLimit {
         &self,
         scene: &Scene,
         scored: &Scored,
-        mut reduction: CompressedModel,
+        mut compressed: CompressedModel,
         recipe: u64,
         journal: &mut Journal,
     ) -> Result<CompressedModel> {
-        let key = self.key(scene, recipe, &reduction).and(&scored.protected);
-        journal.kept_stage(NAME, reduction.len(), scene, key, |_| {
-            let bytes = |reduction: &CompressedModel| self.emit.bytes(scene, reduction, recipe);
-            let empty = bytes(&reduction.pick(&[]))?;
+        let key = self.key(scene, recipe, &compressed).and(&scored.protected);
+        journal.kept_stage(NAME, compressed.len(), scene, key, |_| {
+            let bytes = |compressed: &CompressedModel| self.writer.bytes(scene, compressed, recipe);
+            let empty = bytes(&compressed.pick(&[]))?;
             let mut tried = 0;
             loop {
-                let found = bytes(&reduction)?;
+                let found = bytes(&compressed)?;
                 if found <= self.most {
-                    let count = reduction.len();
-                    return Ok((reduction, count));
+                    let count = compressed.len();
+                    return Ok((compressed, count));
                 }
                 let protected = scored.protected.len();
-                if reduction.len() <= protected {
+                if compressed.len() <= protected {
                     return Err(Error::usage(format!(
-                        "--target-size: the {protected} Gaussians that are to be kept take {found} bytes with \
-                         everything beside them; expected at least that, found {}",
+                        "--target-size: expected at least {found} bytes, the size of an output with only the {protected} \
+                         Gaussians that are to be kept, found {}",
                         self.most
                     )));
                 }
                 let part = self.most.saturating_sub(empty) as f64 / found.saturating_sub(empty).max(1) as f64;
-                let left = next_size(reduction.len(), protected, part, tried);
+                let left = next_size(compressed.len(), protected, part, tried);
                 tried += 1;
-                let places = self.best(scene, scored, &reduction, left)?;
-                reduction = reduction.pick(&places);
+                let places = self.best(scene, scored, &compressed, left)?;
+                compressed = compressed.pick(&places);
             }
         })
     }
 
     /// Returns the indices of the `count` Gaussians that are protected or have the highest removal errors.
-    fn best(&self, scene: &Scene, scored: &Scored, reduction: &CompressedModel, count: usize) -> Result<Vec<u32>> {
-        let result = scene.input.reduced(reduction)?;
-        let places: Vec<u32> = (0..reduction.len() as u32).collect();
-        let pictures = spread(&scene.schedule, PICTURES, VIEWS_AT_ONCE);
+    fn best(&self, scene: &Scene, scored: &Scored, compressed: &CompressedModel, count: usize) -> Result<Vec<u32>> {
+        let result = scene.input.reduced(compressed)?;
+        let places: Vec<u32> = (0..compressed.len() as u32).collect();
+        let pictures = spread(&scene.schedule, RANKING_VIEWS, VIEWS_AT_ONCE);
         let looked_at = (&scene.schedule.cameras[..], &pictures[..]);
         let errors = removal_error(&*result, &places, looked_at, scene.background, 0.0, scene.limits, || ())?;
-        Ok(errors.most_missed(count, |place| scored.is_protected(reduction.kept[place])))
+        Ok(errors.most_missed(count, |place| scored.is_protected(compressed.kept[place])))
     }
 }
 
 /// Returns how many of `count` Gaussians to try next if the fraction `part` of their bytes is expected to fit, after
 /// `tried` sizes. `protected` Gaussians, fewer than `count`, stay. The result is less than `count`, and after
-/// [`MOST_TRIED`] sizes at most half of it, so that the search ends after at most 32 more sizes even if bytes follow no
+/// [`MAX_TRIED`] sizes at most half of it, so that the search ends after at most 32 more sizes even if bytes follow no
 /// line.
 fn next_size(count: usize, protected: usize, part: f64, tried: usize) -> usize {
-    let most = if tried < MOST_TRIED { count - 1 } else { count / 2 };
+    let most = if tried < MAX_TRIED { count - 1 } else { count / 2 };
     ((0.998 * part * count as f64) as usize).min(most).max(protected)
 }
 
@@ -268,7 +268,7 @@ mod tests {
                     assert!((protected..left).contains(&next), "{left} to {next}, {protected} protected, part {part}");
                     (left, tried) = (next, tried + 1);
                 }
-                assert!(tried <= MOST_TRIED + 33, "{tried} sizes of {count} tried");
+                assert!(tried <= MAX_TRIED + 33, "{tried} sizes of {count} tried");
             }
         }
     }

@@ -34,12 +34,12 @@ use crate::source::FrameSource;
 const NAME: &str = "emit";
 
 /// Usual fraction of the Gaussians that is written, for time estimates.
-const LEFT: f64 = 0.5;
+const USUAL_LEFT: f64 = 0.5;
 /// Time to encode and write a state, seconds (`benches/pack.rs`).
 pub const ENCODING: f64 = 3.5e-7;
 
 /// Assumed maximum bytes of the summary and a file header beside a result; long lists of files or notes may exceed it.
-const BESIDE: u64 = 16 << 10;
+const MAX_SUMMARY_BYTES: u64 = 16 << 10;
 
 /// Name of the file beside every result with all parameters of its run.
 pub const RECIPE: &str = "recipe.toml";
@@ -181,7 +181,7 @@ impl Emit {
         let is_solved = work.input.reduced > 0;
         let mut per_gaussian =
             [scored_memory(limits), vec![("kept", 40), ("result", of_left(left, work.input.reduced))]].concat();
-        let within = if self.kind == OutputKind::Archive { bounds::storing(work) } else { Vec::new() };
+        let within = if self.kind == OutputKind::Archive { bounds::storing_memory(work) } else { Vec::new() };
         let mut fixed = if within.is_empty() { work.writing() } else { within };
         match self.kind {
             OutputKind::Gseq if self.merges && !is_solved => {
@@ -220,21 +220,21 @@ impl Emit {
             false => parts as f64 * work.scattered_reads(work.frames, limits),
         };
         let frames = if is_solved && !self.kind.holds_frames() { 0.0 } else { work.frames as f64 };
-        let left = LEFT * work.count();
+        let left = USUAL_LEFT * work.count();
         let seconds = work.reading(left, frames) + left * frames * ENCODING;
         ResourceEstimate { stage: NAME, reads, seconds, per_gaussian, fixed }
     }
 
-    /// Returns the bytes of all files for `reduction` with a recipe of `recipe` bytes. Writes the result to a scratch
+    /// Returns the bytes of all files for `compressed` with a recipe of `recipe` bytes. Writes the result to a scratch
     /// folder and removes it again.
     ///
     /// # Errors
     /// Fails if frames cannot be read or a write fails.
-    pub fn bytes(&self, scene: &Scene, reduction: &CompressedModel, recipe: u64) -> Result<u64> {
+    pub fn bytes(&self, scene: &Scene, compressed: &CompressedModel, recipe: u64) -> Result<u64> {
         let folder = ScratchFolder::new(&scene.scratch)?;
         let path = folder.path().join("result");
-        let written = write_alone(&*scene.input, reduction, self.kind, &path, &scene.limits, &scene.events)?;
-        let beside = BESIDE + recipe + size_of::<i64>() as u64 * scene.source().info().count as u64;
+        let written = write_alone(&*scene.input, compressed, self.kind, &path, &scene.limits, &scene.events)?;
+        let beside = MAX_SUMMARY_BYTES + recipe + size_of::<i64>() as u64 * scene.source().info().count as u64;
         Ok(written + beside)
     }
 
@@ -246,26 +246,26 @@ impl Emit {
     fn write(
         &self,
         scene: &Scene,
-        reduction: &CompressedModel,
+        compressed: &CompressedModel,
         (map, archive): (&[Option<u32>], Option<&Archived>),
         recipe: &str,
         mut journal: Journal,
         summarize: impl FnOnce(Journal, Size) -> Summary,
     ) -> Result<Summary> {
         let mut write = |path: &Path| -> Result<Size> {
-            journal.stage(NAME, reduction.len(), scene.source(), |journal| {
+            journal.stage(NAME, compressed.len(), scene.source(), |journal| {
                 let size = match archive {
                     Some(Archived::Content(encoded)) => {
                         fs::write(path, &encoded.bytes).map_err(Error::io("write", path))?;
                         encoded.parts.into()
                     }
                     Some(Archived::Frames(bounds)) => {
-                        write_within(&*scene.input.reduced(reduction)?, *bounds, path, &scene.events)?;
+                        write_within(&*scene.input.reduced(compressed)?, *bounds, path, &scene.events)?;
                         Size::of_frames(fs::metadata(path).map_err(Error::io("read", path))?.len())
                     }
                     None => {
                         journal.notes.extend(scene.input.write(
-                            reduction,
+                            compressed,
                             self.kind,
                             path,
                             &scene.limits,
@@ -275,7 +275,7 @@ impl Emit {
                     }
                 };
                 journal.notes.extend(size.why_larger_than(&scene.input.size()?));
-                Ok((size, reduction.len()))
+                Ok((size, compressed.len()))
             })
         };
         let target = self.output.as_path();
@@ -301,13 +301,13 @@ impl Emit {
     }
 }
 
-/// Writes `reduction` as a result of `kind`, without files beside it. Returns its bytes.
+/// Writes `compressed` as a result of `kind`, without files beside it. Returns its bytes.
 ///
 /// # Errors
 /// Fails if frames cannot be read or a write fails.
 pub fn write_alone(
     input: &dyn InputModel,
-    reduction: &CompressedModel,
+    compressed: &CompressedModel,
     kind: OutputKind,
     path: &Path,
     limits: &Limits,
@@ -316,7 +316,7 @@ pub fn write_alone(
     if kind.is_folder() {
         fs::create_dir(path).map_err(Error::io("create", path))?;
     }
-    input.write(reduction, kind, path, limits, events)?;
+    input.write(compressed, kind, path, limits, events)?;
     Ok(input.size_written(kind, path)?.whole())
 }
 
