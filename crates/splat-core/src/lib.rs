@@ -120,3 +120,8 @@ impl SequenceInfo {
         Ok(SequenceInfo { times, ..self })
     }
 }
+
+/// Compiles the example of the README.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+mod readme {}

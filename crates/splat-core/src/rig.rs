@@ -35,12 +35,12 @@ pub struct Shot {
     pub image: Option<PathBuf>,
 }
 
-/// All cameras of a data set and their views.
+/// Cameras of a data set and all of their views.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Rig {
     /// Distinct cameras.
     pub cameras: Vec<Camera>,
-    /// All views, in the order of the camera file.
+    /// Views of all cameras, in the order of the camera file.
     pub shots: Vec<Shot>,
     /// Background color, linear RGB in [0, 1], if the camera file gives one.
     pub background: Option<[f32; 3]>,

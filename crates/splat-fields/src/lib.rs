@@ -45,3 +45,8 @@ pub use field::{Field, FieldConfig, Prepared, Scratch};
 pub use network::{Encoded, Network, PredictedMotion};
 pub use planes::{Box3, Tap, rows_before_zero, tap};
 pub use tensors::{Tensor, Tensors};
+
+/// Compiles the example of the README.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+mod readme {}

@@ -125,7 +125,7 @@ pub enum FileKind {
     CharacterDevice,
     /// Device that is read or written in blocks, such as a disk.
     BlockDevice,
-    /// Any other kind.
+    /// Kind that no other variant covers.
     Other,
 }
 
@@ -168,7 +168,7 @@ pub enum LimitSource {
     DataSize,
 }
 
-/// All memory limits that the system states.
+/// Memory limits that the system states.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct MemoryLimits {
     /// Limits outside the process: of the machine, then of control groups or job objects.
@@ -192,3 +192,8 @@ pub struct CutShortMessage {
     /// Text after the path, including its line break.
     pub after: &'static str,
 }
+
+/// Compiles the example of the README.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+mod readme {}

@@ -67,3 +67,8 @@ pub use renderer::{BYTES_PER_VISIBLE, Image, Renderer, STRIP_BYTES, contribution
 pub fn instructions() -> &'static str {
     blend::BlendKernel::fastest().name()
 }
+
+/// Compiles the example of the README.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+mod readme {}
