@@ -226,7 +226,7 @@ impl Checkpoint {
             if entry.data_start().checked_add(entry.size()).is_none_or(|end| end > file.len()) {
                 return Err(at("cut short"));
             }
-            match inside(entry.name()) {
+            match without_first_folder(entry.name()) {
                 PICKLE if entry.size() > MAX_PICKLE => {
                     let place = entry.name().to_owned();
                     return Err(Error::input(
@@ -443,7 +443,7 @@ impl Checkpoint {
             };
             let name = archive.by_index(index).map_err(|error| broken(&error))?.name().to_owned();
             let bytes = read_entry(&mut archive, &self.file, index).map_err(|error| broken(&error))?;
-            let what = match inside(&name).strip_prefix("data/") {
+            let what = match without_first_folder(&name).strip_prefix("data/") {
                 _ if index == self.pickle_index => CheckpointFile::Pickle,
                 Some(key) => CheckpointFile::Storage(key),
                 None => CheckpointFile::Other,
@@ -469,7 +469,7 @@ pub(crate) enum CheckpointFile<'a> {
 const PICKLE: &str = "data.pkl";
 
 /// Returns `name` without its first folder, which PyTorch names after the file or `archive`.
-fn inside(name: &str) -> &str {
+fn without_first_folder(name: &str) -> &str {
     name.split_once('/').map_or(name, |(_, rest)| rest)
 }
 
