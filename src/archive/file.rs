@@ -140,7 +140,7 @@ impl ArchiveHeader {
             return Err(Damage::new(
                 "byte 8",
                 format!("version {VERSION}"),
-                format!("version {found}: another splatsieve's"),
+                format!("version {found}, of another version of splatsieve"),
             ));
         }
         let Some(head) = head.get(..HEAD) else {
@@ -219,7 +219,7 @@ pub(super) fn check_size(bytes: Option<usize>, length: u64) -> std::result::Resu
     match bytes.map(|bytes| bytes as u64) {
         Some(bytes) if bytes <= most => Ok(()),
         bytes => {
-            let found = bytes.map_or("more than there are".to_owned(), |bytes| bytes.to_string());
+            let found = bytes.map_or("a number that overflows".to_owned(), |bytes| bytes.to_string());
             Err(Damage::new("table", format!("at most {most} bytes of content in {length}"), found))
         }
     }

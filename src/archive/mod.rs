@@ -102,7 +102,8 @@ pub fn encode(content: &Content, steps: &Steps) -> Result<Encoded> {
     let mut bits = BTreeMap::new();
     let (shape, cloud, order) = cloud::encode(&content.cloud, &steps.cloud, &mut bits);
     // Positions as a reader will decode them.
-    let stored = cloud::decode(&shape, &cloud).ok_or_else(|| Error::internal("a cloud does not come back"))?;
+    let stored =
+        cloud::decode(&shape, &cloud).ok_or_else(|| Error::internal("the encoded Gaussians cannot be decoded"))?;
     let readers = Readers { position: &stored.position, space: space(content), times: content.times };
     let entry = |(name, tensor): (&String, &Tensor)| {
         let role = content.field.get(name).copied().unwrap_or(Role::Unread);
@@ -111,7 +112,9 @@ pub fn encode(content: &Content, steps: &Steps) -> Result<Encoded> {
     let mut entries: Vec<TensorEntry> = content.tensors.iter().map(entry).collect();
     if let Some(entry) = entries.iter().find(|entry| !entry.is_sound()) {
         let TensorEntry { name, shape, .. } = entry;
-        return Err(Error::usage(format!("an archive holds no tensor such as {name} of shape {shape:?}")));
+        return Err(Error::usage(format!(
+            "an archive cannot hold tensor {name} of shape {shape:?}: its shape does not fit its use"
+        )));
     }
     let (field, exact) = field::encode(&mut entries, &content.tensors, &readers, &mut bits);
     let width = content.beside.len() / content.cloud.len().max(1);
@@ -162,9 +165,9 @@ pub fn check_head(head: &[u8], whole: u64, path: &Path, memory: ReadLimit) -> Re
 fn table(sections: &Sections, length: usize) -> std::result::Result<Table, Damage> {
     let table: Table = serde_json::from_slice(&sections.table)
         .map_err(|error| Damage::new("table", "a table of this version", error.to_string()))?;
-    let unsound = |place: &str| Damage::new(place, "numbers that go together", "others");
+    let unsound = |place: &str| Damage::new(place, "consistent numbers", "inconsistent ones");
     if !table.cloud.is_sound() {
-        return Err(unsound("table of the cloud"));
+        return Err(unsound("table of the Gaussians"));
     }
     if let Some(entry) = table.tensors.iter().find(|entry| !entry.is_sound()) {
         return Err(unsound(&format!("tensor {}", entry.name)));
@@ -184,8 +187,8 @@ fn decoded(
     parts: ArchiveSize,
 ) -> std::result::Result<(Content, ArchiveSize), Damage> {
     let Sections { cloud, field, blobs, .. } = sections;
-    let unsound = |place: &str| Damage::new(place, "numbers that go together", "others");
-    let cloud = cloud::decode(&table.cloud, &cloud).ok_or_else(|| unsound("cloud"))?;
+    let unsound = |place: &str| Damage::new(place, "consistent numbers", "inconsistent ones");
+    let cloud = cloud::decode(&table.cloud, &cloud).ok_or_else(|| unsound("Gaussians"))?;
 
     let count = |entry: &&TensorEntry| entry.role == Role::Exact;
     let exact = table.tensors.iter().filter(count).filter_map(TensorEntry::values).sum::<usize>() * 4;
@@ -267,7 +270,7 @@ fn check(content: &Content, steps: &Steps) -> Result<()> {
     let coarse = steps.cloud.iter().chain(steps.field.0.values().map(|steps| &steps.step));
     match coarse.into_iter().find(|step| !STEPS.contains(step)) {
         Some(step) => {
-            Err(Error::usage(format!("an archive has steps from {} to {}: {step}", STEPS.start(), STEPS.end())))
+            Err(Error::usage(format!("the steps of an archive are {} to {}; found {step}", STEPS.start(), STEPS.end())))
         }
         None => Ok(()),
     }

@@ -7,7 +7,7 @@ use glam::{DMat3, DVec3};
 use hashbrown::{DefaultHashBuilder, HashSet, HashTable};
 
 use super::fields::place;
-use super::{MAX_PICTURES, MAX_SIDE_PX};
+use super::{MAX_IMAGES, MAX_SIDE_PX};
 use crate::error::{Error, Result};
 use crate::limits::ReadLimit;
 use crate::model::{Camera, Rig, Shot, Split};
@@ -85,10 +85,10 @@ impl Assembly {
     /// There are too many images, or they take more memory than allowed.
     pub(super) fn begin(&mut self, file: &Path, count: usize) -> Result<()> {
         let total = self.rig.shots.len() + count;
-        if total > MAX_PICTURES {
-            return Err(Error::input(file, "", format!("at most {MAX_PICTURES} pictures"), total.to_string()));
+        if total > MAX_IMAGES {
+            return Err(Error::input(file, "", format!("at most {MAX_IMAGES} images"), total.to_string()));
         }
-        self.memory_counter.take(file, "", &format!("{count} pictures"), Rig::SHOT_BYTES * count as u64)?;
+        self.memory_counter.take(file, "", &format!("{count} images"), Rig::SHOT_BYTES * count as u64)?;
         self.rig.shots.reserve_exact(count);
         // Usually either every camera is new or few are. Reserved memory that stays unused costs nothing, but copying
         // the list would.
@@ -106,19 +106,19 @@ impl Assembly {
     ///
     /// # Panics
     /// If no file was begun.
-    pub(super) fn add(&mut self, picture: ListedImage) -> Result<()> {
+    pub(super) fn add(&mut self, listed: ListedImage) -> Result<()> {
         let path = &self.files.last().expect("a file was begun").0;
         let frame = self.taken;
         let wrong = |expected: String, found: String| Error::input(path, place(Some(frame)), expected, found);
         self.taken += 1;
-        if let Err((expected, found)) = check(&picture.camera) {
+        if let Err((expected, found)) = check(&listed.camera) {
             return Err(wrong(expected, found));
         }
-        let is_timed = *self.is_timed.get_or_insert(picture.time.is_some());
-        if picture.time.is_some() != is_timed {
-            return Err(wrong("a time for every picture or for none".into(), time_mismatch(is_timed).into()));
+        let is_timed = *self.is_timed.get_or_insert(listed.time.is_some());
+        if listed.time.is_some() != is_timed {
+            return Err(wrong("a time for every image or for none".into(), time_mismatch(is_timed).into()));
         }
-        let values = camera_bits(&picture.camera);
+        let values = camera_bits(&listed.camera);
         let (cameras, hasher) = (&mut self.rig.cameras, &self.hasher);
         let hash = hasher.hash_one(values);
         let found = self.known.find(hash, |&at| camera_bits(&cameras[at as usize]) == values).copied();
@@ -135,23 +135,23 @@ impl Assembly {
                     self.memory_counter.used -= copied;
                 }
                 let camera = cameras.len() as u32;
-                cameras.push(picture.camera);
+                cameras.push(listed.camera);
                 self.known.insert_unique(hash, camera, |&at| hasher.hash_one(camera_bits(&cameras[at as usize])));
                 camera
             }
         };
-        self.are_views_stated &= picture.view.is_some();
-        if !is_timed && !self.untimed.insert((camera, picture.split)) {
+        self.are_views_stated &= listed.view.is_some();
+        if !is_timed && !self.untimed.insert((camera, listed.split)) {
             return Ok(());
         }
-        let mut image = picture.image;
+        let mut image = listed.image;
         if let Some(image) = &mut image {
             image.shrink_to_fit();
             let bytes = image.as_os_str().len() as u64 + Rig::NAME_BYTES;
-            self.memory_counter.take(path, &place(Some(frame)), "the names of pictures", bytes)?;
+            self.memory_counter.take(path, &place(Some(frame)), "the names of images", bytes)?;
         }
-        let view = picture.view.unwrap_or(0);
-        self.rig.shots.push(Shot { view, camera, time: picture.time, split: picture.split, image });
+        let view = listed.view.unwrap_or(0);
+        self.rig.shots.push(Shot { view, camera, time: listed.time, split: listed.split, image });
         Ok(())
     }
 
@@ -173,7 +173,7 @@ impl Assembly {
     /// There are no images, or two images of one file have the same view, split and time.
     pub(super) fn finish(mut self, background: Option<[f32; 3]>, origin: String) -> Result<Rig> {
         if let (true, Some((path, _))) = (self.rig.shots.is_empty(), self.files.first()) {
-            return Err(Error::input(path, "", "at least one picture", "none"));
+            return Err(Error::input(path, "", "at least one image", "none"));
         }
         if !self.are_views_stated {
             self.rig.shots.iter_mut().for_each(|shot| shot.view = shot.camera);
@@ -195,7 +195,7 @@ impl Assembly {
                     return Err(Error::input(
                         path,
                         place(Some(at - first)),
-                        "one picture per view and time",
+                        "one image per view and time",
                         format!("view {view} at time {time} again, as in frame {}", before as usize - first),
                     ));
                 }
@@ -233,7 +233,7 @@ impl MemoryCounter {
 
 /// Returns the text for an image that differs from the first image in having a time.
 fn time_mismatch(timed: bool) -> &'static str {
-    if timed { "none here, but one in the first picture" } else { "one here, but none in the first picture" }
+    if timed { "none here, but one in the first image" } else { "one here, but none in the first image" }
 }
 
 /// Checks that a camera is valid; the error is (expected, found).
@@ -241,7 +241,7 @@ pub(super) fn check(camera: &Camera) -> std::result::Result<(), (String, String)
     let Camera { width, height, fx, fy, cx, cy, rotation, translation, near: _ } = camera;
     let side = 1..=MAX_SIDE_PX;
     if !side.contains(width) || !side.contains(height) {
-        return Err((format!("a picture of 1 to {MAX_SIDE_PX} pixels a side"), format!("{width} × {height}")));
+        return Err((format!("an image of 1 to {MAX_SIDE_PX} pixels a side"), format!("{width} × {height}")));
     }
     let usable = |focal: &f64| *focal > 0.0 && *focal <= MAX_FOCAL_PX;
     if !usable(fx) || !usable(fy) {

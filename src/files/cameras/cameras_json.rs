@@ -24,7 +24,7 @@ use std::path::Path;
 use super::CameraOptions;
 use super::assemble::{Assembly, ListedImage, from_camera_to_world, view_in_name};
 use super::fields::{CameraFields, place};
-use super::pictures::each_picture;
+use super::image_list::each_image;
 use super::times::{self, Times};
 use crate::error::Result;
 use crate::files::json::small::Small;
@@ -33,12 +33,12 @@ use crate::limits::ReadLimit;
 use crate::model::{Camera, Rig, Split};
 
 /// Keys of an image.
-const PICTURE: [&str; 11] = ["w2c", "split", "width", "height", "fx", "fy", "cx", "cy", "time", "image", "v"];
+const IMAGE_KEYS: [&str; 11] = ["w2c", "split", "width", "height", "fx", "fy", "cx", "cy", "time", "image", "v"];
 /// Keys of a camera.
-const CAMERA: [&str; 7] = ["width", "height", "fx", "fy", "img_name", "rotation", "position"];
+const CAMERA_KEYS: [&str; 7] = ["width", "height", "fx", "fy", "img_name", "rotation", "position"];
 
 /// Reads this project's own format. `outline` holds the keys outside the list of images.
-pub(super) fn load_per_picture(file: &Path, outline: &Small, memory: ReadLimit) -> Result<Rig> {
+pub(super) fn load_per_image(file: &Path, outline: &Small, memory: ReadLimit) -> Result<Rig> {
     let shared = CameraFields::new(file, None, outline)?;
     let background = shared.optional_vector("background")?;
     if background.is_some_and(|rgb| rgb.iter().any(|c| !(0.0..=1.0).contains(c))) {
@@ -46,15 +46,15 @@ pub(super) fn load_per_picture(file: &Path, outline: &Small, memory: ReadLimit) 
     }
     let mut assembly = Assembly::new(memory);
     assembly.begin(file, shared.list_len("frames")?)?;
-    each_picture(file, Some("frames"), &PICTURE, |index, frame| {
-        assembly.add(per_picture(file, CameraFields::new(file, Some(index), frame)?)?)
+    each_image(file, Some("frames"), &IMAGE_KEYS, |index, frame| {
+        assembly.add(per_image(file, CameraFields::new(file, Some(index), frame)?)?)
     })?;
     let background = background.map(|rgb| rgb.map(|c| c as f32));
     assembly.finish(background, shown_name(file))
 }
 
 /// Builds one image entry of this project's format.
-fn per_picture(file: &Path, own: CameraFields<'_>) -> Result<ListedImage> {
+fn per_image(file: &Path, own: CameraFields<'_>) -> Result<ListedImage> {
     let (rotation, translation) = own.pose("w2c")?;
     let split = match own.optional_text("split")? {
         None | Some("train") => Split::Train,
@@ -90,17 +90,12 @@ pub(super) fn load_per_camera(file: &Path, count: usize, options: &CameraOptions
     let mut times = Vec::new();
     if options.times != Times::Own {
         let mut names: Vec<Box<str>> = Vec::new();
-        each_picture(file, None, &["img_name"], |index, camera| {
+        each_image(file, None, &["img_name"], |index, camera| {
             let name = match camera.get("img_name") {
                 Some(Small::Text(name)) => name.clone(),
                 _ => "".into(),
             };
-            assembly.memory_counter().take(
-                file,
-                &place(Some(index)),
-                "the names of pictures",
-                name.len() as u64 + 96,
-            )?;
+            assembly.memory_counter().take(file, &place(Some(index)), "the names of images", name.len() as u64 + 96)?;
             names.push(name);
             Ok(())
         })?;
@@ -108,7 +103,7 @@ pub(super) fn load_per_camera(file: &Path, count: usize, options: &CameraOptions
         origin += &format!(" ({source})");
         times = given;
     }
-    each_picture(file, None, &CAMERA, |index, camera| {
+    each_image(file, None, &CAMERA_KEYS, |index, camera| {
         let time = times.get(index).copied().flatten();
         assembly.add(ListedImage { time, ..per_camera(file, CameraFields::new(file, Some(index), camera)?)? })
     })?;

@@ -16,7 +16,7 @@ use glam::{DMat3, DQuat, DVec3};
 use hashbrown::HashMap;
 
 use super::assemble::{Assembly, ListedImage, MemoryCounter};
-use super::{CameraOptions, MAX_PICTURES, MAX_SIDE_PX, Times, frames, times};
+use super::{CameraOptions, MAX_IMAGES, MAX_SIDE_PX, Times, frames, times};
 use crate::error::{Error, Result, ShowPath, quoted};
 use crate::files::names::shown_name;
 use crate::files::open::open_file;
@@ -81,10 +81,10 @@ pub(super) fn load(found: &Path, options: &CameraOptions) -> Result<Rig> {
     let mut listed = if binary { read_images(&images, counter)? } else { parse_images(&images, counter)? };
     // COLMAP lists images in the order in which it registered them.
     listed.sort_by(|a, b| natord::compare(&a.name, &b.name).then_with(|| a.name.cmp(&b.name)));
-    let pictures_in = pictures_folder(&folder);
-    let picture = |image: &ColmapImage| -> Result<ListedImage> {
+    let images_folder = find_images_folder(&folder);
+    let listed_image = |image: &ColmapImage| -> Result<ListedImage> {
         let wrong = |expected: String, found: String| {
-            Error::input(&images, format!("picture {}", quoted(&image.name)), expected, found)
+            Error::input(&images, format!("image {}", quoted(&image.name)), expected, found)
         };
         let lens = lenses
             .get(&image.camera)
@@ -109,30 +109,30 @@ pub(super) fn load(found: &Path, options: &CameraOptions) -> Result<Rig> {
             },
             time: None,
             split: split_of(&image.name),
-            image: Some(pictures_in.join(&*image.name)),
+            image: Some(images_folder.join(&*image.name)),
             view: None,
         })
     };
     if let (Some(first), Times::Own) = (frames::find(&folder), &options.times) {
         let frames = options.frames.unwrap_or_else(|| frames::count(&first.0, first.1));
-        if listed.len().saturating_mul(frames) > MAX_PICTURES {
+        if listed.len().saturating_mul(frames) > MAX_IMAGES {
             return Err(Error::usage(format!(
-                "{}: {} cameras × {frames} frames are more than {MAX_PICTURES} pictures",
+                "{}: {} cameras × {frames} frames are more than {MAX_IMAGES} images",
                 folder.shown(),
                 listed.len()
             )));
         }
         let origin = format!("{} (each of {frames} frames)", shown_name(&folder));
-        let pictures = listed.iter().map(picture).collect::<Result<Vec<_>>>()?;
+        let first_frame = listed.iter().map(listed_image).collect::<Result<Vec<_>>>()?;
         assembly.begin(&images, listed.len() * frames)?;
-        frames::repeat_for_frames(&pictures, &first, frames).try_for_each(|picture| assembly.add(picture))?;
+        frames::repeat_for_frames(&first_frame, &first, frames).try_for_each(|image| assembly.add(image))?;
         return assembly.finish(None, origin);
     }
     let names: Vec<Box<str>> = listed.iter().map(|image| image.name.clone()).collect();
     let (given, source) = times::resolve(&images, &names, &options.times, assembly.memory_counter())?;
     assembly.begin(&images, listed.len())?;
     for (index, image) in listed.iter().enumerate() {
-        assembly.add(ListedImage { time: given.get(index).copied().flatten(), ..picture(image)? })?;
+        assembly.add(ListedImage { time: given.get(index).copied().flatten(), ..listed_image(image)? })?;
     }
     let origin = shown_name(&folder);
     let origin = if source.is_empty() { origin } else { format!("{origin} ({source})") };
@@ -149,7 +149,7 @@ fn reconstruction_folder(found: &Path) -> Result<PathBuf> {
 }
 
 /// Returns the folder of the images: `images` beside `sparse`, or the data set's folder if there is none.
-fn pictures_folder(folder: &Path) -> PathBuf {
+fn find_images_folder(folder: &Path) -> PathBuf {
     let below = if folder.ends_with("sparse/0") { 2 } else { usize::from(folder.ends_with("sparse")) };
     let root = folder.ancestors().nth(below).unwrap_or(folder);
     Some(root.join("images")).filter(|images| images.is_dir()).unwrap_or_else(|| root.to_owned())
@@ -199,12 +199,12 @@ fn lens(
     }
     if distortion == 0 || values[distortion..].iter().any(|&value| value != 0.0) {
         return Err(wrong("a camera without distortion (SIMPLE_PINHOLE or PINHOLE)".into(), name.to_owned()).hint(
-            "undistort the pictures: colmap image_undistorter writes them with a reconstruction that is read here",
+            "undistort the images: colmap image_undistorter writes them with a reconstruction that splatsieve reads",
         ));
     }
     let side = |side: u64| u32::try_from(side).ok().filter(|side| (1..=MAX_SIDE_PX).contains(side));
     let (Some(w), Some(h)) = (side(width), side(height)) else {
-        return Err(wrong(format!("a picture of 1 to {MAX_SIDE_PX} pixels a side"), format!("{width} × {height}")));
+        return Err(wrong(format!("an image of 1 to {MAX_SIDE_PX} pixels a side"), format!("{width} × {height}")));
     };
     let intrinsics = match *values {
         [f, cx, cy] | [f, cx, cy, _] | [f, cx, cy, _, _] if distortion == 3 => [f, f, cx, cy],
@@ -264,7 +264,7 @@ fn parse_images(path: &Path, counter: &mut MemoryCounter) -> Result<Vec<ColmapIm
         }
         let camera = word().and_then(|word| word.parse().ok()).ok_or_else(wrong)?;
         let [w, x, y, z, tx, ty, tz] = values;
-        counter.take(path, &format!("line {number}"), "the pictures", IMAGE_BYTES + 2 * rest.len() as u64)?;
+        counter.take(path, &format!("line {number}"), "the images", IMAGE_BYTES + 2 * rest.len() as u64)?;
         let name = rest.into();
         images.push(ColmapImage { quaternion: [w, x, y, z], translation: [tx, ty, tz], camera, name });
         // The points that the image sees, on a line that may be empty.
@@ -295,7 +295,8 @@ impl<'a> Binary<'a> {
 
     /// Returns the error for a truncated file.
     fn truncated(&self, what: &str) -> Error {
-        self.wrong(what, format!("the end of the file, of {} bytes", self.len)).hint("it is cut short: copy it again")
+        self.wrong(what, format!("the end of the file, after {} bytes", self.len))
+            .hint("it is cut short: copy it again")
     }
 
     /// Reads `W` bytes; `what` names them in the error.
@@ -334,10 +335,10 @@ impl<'a> Binary<'a> {
         let most = MAX_NAME_BYTES.min(self.len - self.at);
         (&mut self.file).take(most).read_until(0, &mut bytes).map_err(Error::io("read", self.path))?;
         if bytes.pop() != Some(0) {
-            return Err(self.wrong(what, format!("none that ends within {MAX_NAME_BYTES} bytes")));
+            return Err(self.wrong(what, format!("a text of more than {MAX_NAME_BYTES} bytes, or one without an end")));
         }
         self.at += bytes.len() as u64 + 1;
-        String::from_utf8(bytes).map_err(|_| self.wrong(what, "a name that is no UTF-8"))
+        String::from_utf8(bytes).map_err(|_| self.wrong(what, "a name that is not UTF-8"))
     }
 
     /// Skips `bytes`; `None` stands for a number that overflowed and is an error.
@@ -377,10 +378,10 @@ fn read_images(path: &Path, counter: &mut MemoryCounter) -> Result<Vec<ColmapIma
     for _ in 0..file.u64("a number of images")? {
         file.u32("an image")?;
         let (quaternion, translation) = (file.f64s("a rotation")?, file.f64s("a translation")?);
-        let (camera, name) = (file.u32("a camera")?, file.text("a picture's name")?);
-        counter.take(path, &format!("byte {}", file.at), "the pictures", IMAGE_BYTES + 2 * name.len() as u64)?;
+        let (camera, name) = (file.u32("a camera")?, file.text("an image's name")?);
+        counter.take(path, &format!("byte {}", file.at), "the images", IMAGE_BYTES + 2 * name.len() as u64)?;
         let points = file.u64("a number of points")?;
-        file.skip(points.checked_mul(POINT_BYTES), "the points of a picture")?;
+        file.skip(points.checked_mul(POINT_BYTES), "the points of an image")?;
         images.push(ColmapImage { quaternion, translation, camera, name: name.into() });
     }
     Ok(images)

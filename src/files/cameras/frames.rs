@@ -38,24 +38,24 @@ pub(super) fn count(root: &Path, first: u32) -> usize {
     (first..=u32::MAX).take_while(|k| root.with_file_name(format!("{PREFIX}{k}")).is_dir()).count()
 }
 
-/// Returns `pictures`, which all show frame `first` in `root`, repeated at each of `frames` frames. The first image of
+/// Returns `images`, which all show frame `first` in `root`, repeated at each of `frames` frames. The first image of
 /// each frame is a test image.
 pub(super) fn repeat_for_frames<'a>(
-    pictures: &'a [ListedImage],
+    images: &'a [ListedImage],
     (root, first): &'a (PathBuf, u32),
     frames: usize,
 ) -> impl Iterator<Item = ListedImage> + 'a {
     let at = move |frame: usize| {
         let folder = root.with_file_name(format!("{PREFIX}{}", u64::from(*first) + frame as u64));
-        pictures.iter().enumerate().map(move |(k, picture)| {
-            let image = picture.image.as_ref().map(|image| {
+        images.iter().enumerate().map(move |(k, listed)| {
+            let image = listed.image.as_ref().map(|image| {
                 let whole = std::path::absolute(image).ok();
                 let below = whole.as_deref().and_then(|whole| whole.strip_prefix(root).ok());
                 below.map_or_else(|| image.clone(), |below| folder.join(below))
             });
             let time = (frames > 1).then(|| frame as f64 / frames as f64);
-            let split = if k == 0 { Split::Test } else { picture.split };
-            ListedImage { time, view: Some(k as u32), split, image, ..picture.clone() }
+            let split = if k == 0 { Split::Test } else { listed.split };
+            ListedImage { time, view: Some(k as u32), split, image, ..listed.clone() }
         })
     };
     (0..frames).flat_map(at)

@@ -13,7 +13,7 @@ use glam::{DMat3, DVec3};
 use npyz::{NpyFile, Order, TypeChar};
 
 use super::assemble::{Assembly, ListedImage, MemoryCounter, check, from_camera_to_world};
-use super::{CameraOptions, MAX_PICTURES, MAX_SIDE_PX};
+use super::{CameraOptions, MAX_IMAGES, MAX_SIDE_PX};
 use crate::error::ShowPath;
 use crate::error::{Error, Result};
 use crate::files::names::shown_name;
@@ -36,9 +36,9 @@ pub(super) fn load(file: &Path, options: &CameraOptions) -> Result<Rig> {
     let cameras =
         rows.iter().enumerate().map(|(index, row)| camera(file, index, row, options)).collect::<Result<Vec<_>>>()?;
     let frames = options.frames.unwrap_or(DEFAULT_FRAMES);
-    if frames.saturating_mul(cameras.len()) > MAX_PICTURES {
+    if frames.saturating_mul(cameras.len()) > MAX_IMAGES {
         return Err(Error::usage(format!(
-            "{}: {} cameras × {frames} frames are more than {MAX_PICTURES} pictures",
+            "{}: {} cameras × {frames} frames are more than {MAX_IMAGES} images",
             file.shown(),
             cameras.len()
         )));
@@ -48,20 +48,20 @@ pub(super) fn load(file: &Path, options: &CameraOptions) -> Result<Rig> {
         origin += &format!(" ({DEFAULT_FRAMES} frames, as in the original DyNeRF scenes)");
     }
     assembly.begin(file, frames * cameras.len())?;
-    pictures(&cameras, frames).try_for_each(|picture| assembly.add(picture))?;
+    listed_images(&cameras, frames).try_for_each(|image| assembly.add(image))?;
     assembly.finish(None, origin)
 }
 
 /// Returns one image per frame and camera, frame after frame.
-fn pictures(cameras: &[Camera], frames: usize) -> impl Iterator<Item = ListedImage> {
-    let picture = move |frame: usize, view: usize| ListedImage {
+fn listed_images(cameras: &[Camera], frames: usize) -> impl Iterator<Item = ListedImage> {
+    let listed_image = move |frame: usize, view: usize| ListedImage {
         camera: cameras[view].clone(),
         time: Some(frame as f64 / frames as f64),
         split: if view == 0 { Split::Test } else { Split::Train },
         image: None,
         view: Some(view as u32),
     };
-    (0..frames).flat_map(move |frame| (0..cameras.len()).map(move |view| picture(frame, view)))
+    (0..frames).flat_map(move |frame| (0..cameras.len()).map(move |view| listed_image(frame, view)))
 }
 
 /// Builds the camera of row `index`.
@@ -93,7 +93,7 @@ fn read_rows(file: &Path, counter: &mut MemoryCounter) -> Result<Vec<[f64; WIDTH
     let mut head = Vec::new();
     (&mut opened).take(HEAD).read_to_end(&mut head).map_err(Error::io("read", file))?;
     if !header_is_sound(&head, bytes) {
-        return Err(unreadable("a header that no array of numbers has".into()));
+        return Err(unreadable("a header that is not that of an array of numbers".into()));
     }
     opened.rewind().map_err(Error::io("read", file))?;
     let array = NpyFile::new(BufReader::new(opened)).map_err(|error| unreadable(error.to_string()))?;

@@ -11,7 +11,7 @@ use glam::{DMat3, DVec3};
 
 use super::assemble::{Assembly, ListedImage};
 use super::fields::{CameraFields, POSE, place};
-use super::pictures::outline;
+use super::image_list::outline;
 use crate::error::ShowPath;
 use crate::error::{Error, Result};
 use crate::files::json::lists::{Ask, JsonPlace, each_element};

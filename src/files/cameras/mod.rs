@@ -19,10 +19,10 @@ mod cameras_json;
 mod colmap;
 mod fields;
 mod frames;
+mod image_list;
 mod llff;
 mod meta_json;
 mod nerfies;
-mod pictures;
 mod times;
 mod transforms;
 mod virtual_rig;
@@ -38,14 +38,14 @@ use crate::files::json::small::Small;
 use crate::limits::ReadLimit;
 use crate::model::Rig;
 
-use pictures::outline;
+use image_list::outline;
 pub use times::Times;
 pub use virtual_rig::{surrounding_rig, virtual_rig};
 
 /// Largest image side in pixels. Above it, the number of pixels of one image approaches 2³².
 const MAX_SIDE_PX: u32 = 1 << 15;
 /// Maximum number of images of a rig.
-const MAX_PICTURES: usize = 1 << 24;
+const MAX_IMAGES: usize = 1 << 24;
 
 /// File names that are searched for in a folder; the first match wins. `transforms*.json` come before `cameras.json`
 /// because a 3DGS `cameras.json` beside them has lost the times.
@@ -125,9 +125,7 @@ pub fn load(path: &Path, options: &CameraOptions) -> Result<Rig> {
     let outline = outline(&file)?;
     match kind(&outline) {
         Some(Kind::Transforms) => timed().and_then(|()| transforms::load(&file, path.is_dir(), options)),
-        Some(Kind::PerPicture) => {
-            timed().and_then(|()| cameras_json::load_per_picture(&file, &outline, options.memory))
-        }
+        Some(Kind::PerImage) => timed().and_then(|()| cameras_json::load_per_image(&file, &outline, options.memory)),
         Some(Kind::PerCamera(count)) => cameras_json::load_per_camera(&file, count, options),
         Some(Kind::PerFrame) => timed().and_then(|()| meta_json::load(&file, path.is_dir(), options.memory)),
         None => Err(Error::input(
@@ -182,7 +180,7 @@ enum Kind {
     /// NeRF: camera to world, OpenGL axes.
     Transforms,
     /// This project's `cameras.json`: one entry per image.
-    PerPicture,
+    PerImage,
     /// 3DGS `cameras.json`: one entry per camera; holds their number.
     PerCamera(usize),
     /// Dynamic3DGaussians: one list of cameras per frame.
@@ -200,7 +198,7 @@ fn kind(outline: &Small) -> Option<Kind> {
     let Small::List(first, _) = outline.get("frames")? else { return None };
     let first = first.first()?;
     if first.get("w2c").is_some() {
-        Some(Kind::PerPicture)
+        Some(Kind::PerImage)
     } else if first.get("transform_matrix").is_some() {
         Some(Kind::Transforms)
     } else {
@@ -212,9 +210,7 @@ fn kind(outline: &Small) -> Option<Kind> {
 fn check_options(options: &CameraOptions) -> Result<()> {
     let side = 1..=MAX_SIDE_PX;
     if let Some((width, height)) = options.size.filter(|(w, h)| !side.contains(w) || !side.contains(h)) {
-        return Err(Error::usage(format!(
-            "picture size {width}x{height}: each side must be 1 to {MAX_SIDE_PX} pixels"
-        )));
+        return Err(Error::usage(format!("image size {width}x{height}: each side must be 1 to {MAX_SIDE_PX} pixels")));
     }
     if options.frames == Some(0) {
         return Err(Error::usage("frames 0: there must be at least one"));

@@ -18,7 +18,7 @@ use hashbrown::{HashMap, HashSet};
 use super::CameraOptions;
 use super::assemble::{Assembly, ListedImage, MemoryCounter, from_camera_to_world};
 use super::fields::CameraFields;
-use super::pictures::read_keys;
+use super::image_list::read_keys;
 use crate::error::{Error, Result, quoted};
 use crate::files::image::measure;
 use crate::files::json::lists::{Ask, JsonPlace, each_element, each_entry};
@@ -27,7 +27,7 @@ use crate::files::names::shown_name;
 use crate::model::{Rig, Split};
 
 /// Keys of a camera file.
-const CAMERA: [&str; 4] = ["image_size", "focal_length", "orientation", "position"];
+const CAMERA_KEYS: [&str; 4] = ["image_size", "focal_length", "orientation", "position"];
 /// Distance between training images in a data set that names no test images.
 const TRAIN_EVERY: usize = 4;
 
@@ -48,39 +48,39 @@ pub(super) fn load(file: &Path, options: &CameraOptions) -> Result<Rig> {
         if splits.is_empty() {
             continue;
         }
-        let picture = picture(folder, id, options)?;
+        let listed = listed_image(folder, id, options)?;
         for split in splits {
             let time = f64::from(warp) / latest;
-            assembly.add(ListedImage { time: Some(time), split, ..picture.clone() })?;
+            assembly.add(ListedImage { time: Some(time), split, ..listed.clone() })?;
         }
     }
     assembly.finish(None, shown_name(folder))
 }
 
 /// Keys of the lists of image names: all images, test images, training images.
-const LISTS: [&str; 3] = ["ids", "val_ids", "train_ids"];
+const LIST_KEYS: [&str; 3] = ["ids", "val_ids", "train_ids"];
 /// Bytes that a name takes in addition to its text, in its list and in two tables.
 const NAME_BYTES: u64 = 200;
 
 /// Reads the three lists of names of `file`. `train_ids` may be missing if `val_ids` is empty.
 fn names(file: &Path, counter: &mut MemoryCounter) -> Result<[Vec<Box<str>>; 3]> {
-    let outline = read_keys(file, &LISTS)?;
+    let outline = read_keys(file, &LIST_KEYS)?;
     let fields = CameraFields::new(file, None, &outline)?;
-    let held_out = fields.list_len(LISTS[1])?;
-    fields.list_len(LISTS[0])?;
+    let held_out = fields.list_len(LIST_KEYS[1])?;
+    fields.list_len(LIST_KEYS[0])?;
     if held_out > 0 {
-        fields.list_len(LISTS[2])?;
+        fields.list_len(LIST_KEYS[2])?;
     }
     let mut names = [const { Vec::new() }; 3];
-    each_element(file, Ask { keys: &LISTS, nested: false, wanted: &[] }, |JsonPlace { key, index, .. }, name| {
+    each_element(file, Ask { keys: &LIST_KEYS, nested: false, wanted: &[] }, |JsonPlace { key, index, .. }, name| {
         if index != names[key].len() {
-            return Err(Error::input(file, format!("key \"{}\"", LISTS[key]), "this key once", "twice"));
+            return Err(Error::input(file, format!("key \"{}\"", LIST_KEYS[key]), "this key once", "twice"));
         }
         let Small::Text(name) = name else {
-            let place = format!("key \"{}\", element {index}", LISTS[key]);
+            let place = format!("key \"{}\", element {index}", LIST_KEYS[key]);
             return Err(Error::input(file, place, "a list of names", name.describe()));
         };
-        counter.take(file, "", "the names of its pictures", name.len() as u64 + NAME_BYTES)?;
+        counter.take(file, "", "the names of its images", name.len() as u64 + NAME_BYTES)?;
         names[key].push(name);
         Ok(())
     })?;
@@ -89,7 +89,7 @@ fn names(file: &Path, counter: &mut MemoryCounter) -> Result<[Vec<Box<str>>; 3]>
 
 /// Reads the `warp_id` of each image.
 fn warps(file: &Path, ids: &[Box<str>], counter: &mut MemoryCounter) -> Result<Vec<u32>> {
-    counter.take(file, "", "the times of its pictures", 64 * ids.len() as u64)?;
+    counter.take(file, "", "the times of its images", 64 * ids.len() as u64)?;
     // A name may occur twice in `ids`.
     let mut places: HashMap<&str, u32> = HashMap::with_capacity(ids.len());
     let mut found = Vec::new();
@@ -109,7 +109,7 @@ fn warps(file: &Path, ids: &[Box<str>], counter: &mut MemoryCounter) -> Result<V
     })?;
     let warp = |id: &str| {
         let warp = places.get(id).and_then(|&place| found[place as usize]);
-        warp.ok_or_else(|| Error::input(file, "", format!("the picture {}", quoted(id)), "none of this name"))
+        warp.ok_or_else(|| Error::input(file, "", format!("the image {}", quoted(id)), "none of this name"))
     };
     ids.iter().map(|id| warp(id)).collect()
 }
@@ -137,9 +137,9 @@ fn splits(ids: &[Box<str>], val: &[Box<str>], train: &[Box<str>]) -> Vec<Vec<Spl
 
 /// Reads the camera of the image called `id`. Its size in pixels comes from `--size`, else from the image file, else it
 /// is half the size in the camera file.
-fn picture(folder: &Path, id: &str, options: &CameraOptions) -> Result<ListedImage> {
+fn listed_image(folder: &Path, id: &str, options: &CameraOptions) -> Result<ListedImage> {
     let file = folder.join("camera").join(format!("{id}.json"));
-    let document = read_keys(&file, &CAMERA)?;
+    let document = read_keys(&file, &CAMERA_KEYS)?;
     let own = CameraFields::new(&file, None, &document)?;
     let [width, height] = own.sides("image_size")?;
     let image = folder.join("rgb/2x").join(format!("{id}.png"));

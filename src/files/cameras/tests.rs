@@ -54,7 +54,7 @@ fn transforms(times: &[f64]) -> Value {
     json!({"camera_angle_x": 1.0, "w": 80, "h": 60, "frames": frames})
 }
 
-fn per_picture(times: &[f64]) -> Value {
+fn per_image(times: &[f64]) -> Value {
     let frame = |time: &f64| {
         json!({"v": 4, "time": time, "width": 80, "height": 60, "fx": 70.0, "fy": 71.0, "cx": 39.0, "cy": 31.0,
                "w2c": [[1, 0, 0, 0.5], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1]]})
@@ -121,7 +121,7 @@ fn transforms_and_cameras_json_give_the_same_cameras() {
             assert_eq!((a.cx, a.cy), (b.cx, b.cy));
         }
         let there = transforms.shots.iter().filter(|s| s.image.as_ref().is_some_and(|image| image.is_file())).count();
-        assert_eq!(there, fs::read_dir(model.join("test")).unwrap().count(), "every picture of test/ is found");
+        assert_eq!(there, fs::read_dir(model.join("test")).unwrap().count(), "every image of test/ is found");
     }
 }
 
@@ -157,7 +157,7 @@ fn val_is_held_out_if_there_is_no_test_split() {
     let with_test = [&files[..], &[("transforms_test.json", &test)]].concat();
     let rig = load(folder(&with_test).path(), &CameraOptions::default()).unwrap();
     assert_eq!((count(&rig, Split::Val), count(&rig, Split::Test), rig.held_out()), (2, 1, Some(Split::Test)));
-    let mut document = per_picture(&[0.0]);
+    let mut document = per_image(&[0.0]);
     document["frames"][0]["split"] = json!("val");
     assert_eq!(load_json("cameras.json", &document).unwrap().held_out(), Some(Split::Val));
 }
@@ -292,7 +292,7 @@ fn views_are_numbered_by_name_or_by_pose() {
 
 #[test]
 fn own_cameras_json_is_read_completely() {
-    let rig = load_json("cameras.json", &per_picture(&[0.0, 0.25])).unwrap();
+    let rig = load_json("cameras.json", &per_image(&[0.0, 0.25])).unwrap();
     assert_eq!(rig.background, Some([1.0, 0.5, 0.0]));
     assert_eq!(rig.cameras.len(), 1);
     let Camera { fx, fy, cx, cy, translation, .. } = rig.cameras[0];
@@ -367,7 +367,7 @@ fn malformed_pose_arrays_are_refused() {
         ("<f8", "False", "(34,)", ["[V, 17]", "[34]"]),
         ("<f8", "False", "(0, 17)", ["V at least 1", "[0, 17]"]),
         ("<f8", "False", "(9999999999, 17)", ["9999999999 rows", "bytes"]),
-        ("<f8", "False", "(9999999999, 9999999999)", ["NumPy array", "a header that no array of numbers has"]),
+        ("<f8", "False", "(9999999999, 9999999999)", ["NumPy array", "not that of an array of numbers"]),
         ("<f8", "False", "(3, 17)", ["3 rows", "data"]),
         ("<f8", "True", "(2, 17)", ["Fortran", "ascontiguousarray"]),
         ("|O", "False", "(2, 17)", ["float64 or float32", "O"]),
@@ -386,7 +386,7 @@ fn malformed_pose_arrays_are_refused() {
 fn errors_name_the_image_by_its_number() {
     let mut cases: Vec<(&str, Value, Vec<&str>)> = vec![
         ("time", json!("noon"), vec!["frame 1", "\"time\"", "noon"]),
-        ("time", Value::Null, vec!["frame 1", "a time for every picture"]),
+        ("time", Value::Null, vec!["frame 1", "a time for every image"]),
         ("time", json!(0.0), vec![]),
         ("fl_x", json!(0.0), vec!["frame 1", "focal", "0"]),
         ("fl_x", json!(-3), vec!["frame 1", "focal", "-3"]),
@@ -414,9 +414,9 @@ fn errors_name_the_image_by_its_number() {
             assert_refused("transforms.json", &document, &parts);
         }
     }
-    assert_refused("cameras.json", &per_picture(&[0.0, 0.5, 0.5]), &["frame 2", "view 4", "0.5", "frame 1"]);
-    assert_refused("cameras.json", &per_picture(&[0.0, -0.0]), &["frame 1", "as in frame 0"]);
-    let mut document = per_picture(&[0.0]);
+    assert_refused("cameras.json", &per_image(&[0.0, 0.5, 0.5]), &["frame 2", "view 4", "0.5", "frame 1"]);
+    assert_refused("cameras.json", &per_image(&[0.0, -0.0]), &["frame 1", "as in frame 0"]);
+    let mut document = per_image(&[0.0]);
     document["frames"][0]["split"] = json!("validation");
     assert_refused("cameras.json", &document, &["frame 0", "split", "validation"]);
 }
@@ -424,7 +424,7 @@ fn errors_name_the_image_by_its_number() {
 #[test]
 fn inputs_without_cameras_are_refused() {
     assert_refused("transforms.json", &json!({"frames": []}), &["non-empty list"]);
-    assert_refused("cameras.json", &json!([]), &["at least one picture"]);
+    assert_refused("cameras.json", &json!([]), &["at least one image"]);
     assert_refused("cameras.json", &json!([3]), &["frame 0", "an object"]);
     assert_refused("cameras.json", &json!("text"), &["text"]);
 

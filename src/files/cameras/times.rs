@@ -63,7 +63,7 @@ pub(super) fn resolve(
     times: &Times,
     counter: &mut MemoryCounter,
 ) -> Result<(Vec<Option<f64>>, String)> {
-    counter.take(file, "", "the times of its pictures", 40 * names.len() as u64)?;
+    counter.take(file, "", "the times of its images", 40 * names.len() as u64)?;
     let none = || Ok((Vec::new(), String::new()));
     match times {
         Times::None => none(),
@@ -72,7 +72,7 @@ pub(super) fn resolve(
             let time = |name: &str| {
                 let time = keys(name).find_map(|key| known.get(key)).copied();
                 time.map(Some).ok_or_else(|| {
-                    Error::input(table, "", format!("a line for the picture {}", quoted(name)), "none")
+                    Error::input(table, "", format!("a line for the image {}", quoted(name)), "none")
                         .hint(format!("the names are those of {}", file.shown()))
                 })
             };
@@ -87,7 +87,7 @@ pub(super) fn resolve(
                 }
                 return Err(Error::input(
                     file,
-                    format!("picture {}", quoted(&names[at])),
+                    format!("image {}", quoted(&names[at])),
                     "a number in its name",
                     "none",
                 )

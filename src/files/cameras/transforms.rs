@@ -15,7 +15,7 @@ use glam::{DMat3, DVec3};
 
 use super::assemble::{Assembly, ListedImage, from_camera_to_world, view_in_name};
 use super::fields::CameraFields;
-use super::pictures::{each_picture, outline};
+use super::image_list::{each_image, outline};
 use super::{CameraOptions, Clock};
 use crate::error::{Result, ShowPath};
 use crate::files::image::measure;
@@ -27,7 +27,7 @@ use crate::model::{Rig, Split};
 const OPENGL_TO_OPENCV: DMat3 = DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
 
 /// Keys of an image.
-const PICTURE: [&str; 11] =
+const IMAGE_KEYS: [&str; 11] =
     ["file_path", "w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y", "transform_matrix", "time"];
 
 /// Reads `file`, and the files of the other splits beside it if `with_others` is set, which is the case if the user
@@ -79,7 +79,7 @@ fn others(file: &Path) -> Vec<PathBuf> {
 /// Returns the largest time in a file. Other errors of the file are not reported here.
 fn latest_in(file: &Path) -> Result<f64> {
     let mut latest = 0.0;
-    each_picture(file, Some("frames"), &["time"], |_, frame| {
+    each_image(file, Some("frames"), &["time"], |_, frame| {
         let time = frame.get("time").and_then(Small::as_f64).filter(|time| time.is_finite());
         latest = time.map_or(latest, |time| time.max(latest));
         Ok(())
@@ -93,13 +93,13 @@ fn add(assembly: &mut Assembly, file: &Path, options: &CameraOptions) -> Result<
     let shared = CameraFields::new(file, None, &outline)?;
     assembly.begin(file, shared.list_len("frames")?)?;
     let split = split_of(file);
-    each_picture(file, Some("frames"), &PICTURE, |index, frame| {
-        assembly.add(picture(file, shared, CameraFields::new(file, Some(index), frame)?, split, options)?)
+    each_image(file, Some("frames"), &IMAGE_KEYS, |index, frame| {
+        assembly.add(listed_image(file, shared, CameraFields::new(file, Some(index), frame)?, split, options)?)
     })
 }
 
 /// Builds one image entry from its own keys and the keys `shared` by all images of the file.
-fn picture(
+fn listed_image(
     file: &Path,
     shared: CameraFields<'_>,
     own: CameraFields<'_>,
@@ -134,8 +134,8 @@ fn size(
     }
     // A missing or unreadable image is not an error, because the options may give the size.
     image.and_then(measure).or(options.size).ok_or_else(|| {
-        let tried = image.map_or_else(String::new, |image| format!(", or the picture {}", image.shown()));
-        own.wrong("w", format!("the picture size as w and h{tried}"))
+        let tried = image.map_or_else(String::new, |image| format!(", or the image {}", image.shown()));
+        own.wrong("w", format!("the image size as w and h{tried}"))
             .hint("give --size WIDTHxHEIGHT (800x800 for the original D-NeRF scenes)")
     })
 }

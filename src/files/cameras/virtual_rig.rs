@@ -135,7 +135,7 @@ mod tests {
             assert!((seen - DVec3::new(0.0, 0.0, 3.0)).length() < 1e-12, "{seen}");
             assert!((camera.rotation.determinant() - 1.0).abs() < 1e-12);
             let up = camera.rotation * (center + 0.1 * DVec3::Z) + camera.translation;
-            assert!(up.y < 0.0, "z is up in the picture, y is down: {up}");
+            assert!(up.y < 0.0, "z is up in the image, y is down: {up}");
             assert!((camera.fx - 256.0 / 30f64.to_radians().tan()).abs() < 1e-9);
         }
     }

@@ -207,7 +207,7 @@ impl<R: Read> CountingReader<R> {
             }
         };
         Error::input(&self.name, place(self.received, frames), expected, found)
-            .hint("the exporter stopped early; what it says on standard error tells why")
+            .hint("the exporter stopped early; its messages on standard error may tell why")
     }
 }
 

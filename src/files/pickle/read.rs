@@ -124,7 +124,7 @@ impl<'a> PickleMachine<'a> {
             0x85..=0x87 => {
                 let first = self.stack.len().checked_sub(usize::from(instruction - 0x84));
                 let first = first.filter(|&first| first >= self.floor());
-                self.collect(first.ok_or(Wrong::at(start, "a tuple of more than there is"))?, Node::Tuple)?;
+                self.collect(first.ok_or(Wrong::at(start, "a tuple of more values than there are"))?, Node::Tuple)?;
             }
             b'l' | 0x91 => {
                 let first = self.unmark()?;
@@ -301,7 +301,7 @@ impl<'a> PickleMachine<'a> {
 
     /// Ends the innermost open container and returns the place on the stack of its first element.
     fn unmark(&mut self) -> Result<usize, Wrong> {
-        let mark = self.marks.pop().ok_or(Wrong::at(self.at, "the end of what was never begun"))?;
+        let mark = self.marks.pop().ok_or(Wrong::at(self.at, "the end of a container that was never begun"))?;
         Ok(mark.min(self.stack.len()))
     }
 
@@ -338,7 +338,7 @@ impl<'a> PickleMachine<'a> {
             }
             // The elements of an object that behaves like a list are not needed.
             Node::Called { .. } => self.stack.truncate(first),
-            _ => return Err(Wrong::at(start, "an element of what is no list")),
+            _ => return Err(Wrong::at(start, "an element added to a value that is not a list")),
         }
         Ok(())
     }
@@ -355,7 +355,7 @@ impl<'a> PickleMachine<'a> {
                 self.allocations.reserve(items, pairs.len(), start)?;
                 items.extend(pairs.iter().map(|&[key, value]| (key, value)));
             }
-            _ => return Err(Wrong::at(start, "an item of what is no dict")),
+            _ => return Err(Wrong::at(start, "an item added to a value that is not a dict")),
         }
         self.stack.truncate(first);
         Ok(())
@@ -373,7 +373,7 @@ impl<'a> PickleMachine<'a> {
     /// Pushes the node stored in the memo under `key`.
     fn push_from_memo(&mut self, start: usize, key: u32) -> Result<(), Wrong> {
         let known = self.memo.get(&key).copied();
-        let known = known.ok_or_else(|| Wrong::at(start, format!("what was never remembered, {key}")))?;
+        let known = known.ok_or_else(|| Wrong::at(start, format!("memo entry {key}, which was never stored")))?;
         self.allocations.reserve(&mut self.stack, 1, start)?;
         self.stack.push(known);
         Ok(())
@@ -455,7 +455,7 @@ impl<'a> PickleMachine<'a> {
     fn stack_global(&mut self, start: usize) -> Result<(), Wrong> {
         let (name, module) = (self.pop()?, self.pop()?);
         let (Node::Text(module), Node::Text(name)) = (&self.nodes[module as usize], &self.nodes[name as usize]) else {
-            return Err(Wrong::at(start, "something of a module without its name"));
+            return Err(Wrong::at(start, "a global without the texts of its module and name"));
         };
         self.allocations.take(ALLOCATION_BYTES + module.len() + 1 + name.len(), start)?;
         let global = [module, ".", name].concat();

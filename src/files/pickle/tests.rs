@@ -146,7 +146,7 @@ fn malformed_pickles_are_refused_with_their_position() {
         (b"\x80\x02X\xff\xff\xff\xffab", 7, "end"),
         (b"\x80\x02(K\x010", 6, "end"),
         (b"\x80\x02\x85.", 2, "tuple"),
-        (b"\x80\x02h\x00.", 2, "remembered"),
+        (b"\x80\x02h\x00.", 2, "never stored"),
         (b"\x80\x02}K\x01K\x02.", 8, ""),
         (b"\x80\x02}(K\x01u.", 6, "key without"),
         (b"\x80\x02\xff.", 2, "0xff"),

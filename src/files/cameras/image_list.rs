@@ -48,7 +48,7 @@ pub(super) fn read_keys(file: &Path, wanted: &[&str]) -> Result<Small> {
 ///
 /// # Errors
 /// An error of `take`; a key that occurs twice; a file that is not valid JSON.
-pub(super) fn each_picture(
+pub(super) fn each_image(
     file: &Path,
     key: Option<&str>,
     wanted: &[&str],
