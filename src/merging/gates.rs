@@ -50,8 +50,8 @@ impl Gates {
 pub struct Appearance {
     position: DVec3,
     rotation: DQuat,
-    /// Log scales, descending; the smallest is raised to at least [`MIN_THICKNESS`] times the middle scale for the comparison of
-    /// sizes.
+    /// Log scales, descending; the smallest is raised to at least [`MIN_THICKNESS`] times the middle scale for the
+    /// comparison of sizes.
     log_scale: [f64; 3],
     scales: DVec3,
     dc: DVec3,

@@ -185,7 +185,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn parallel_rounds_equal_the_sequential_rule((rank, pairs) in any_graph(), limit in prop::option::of(0usize..150)) {
+        fn rounds_equal_the_sequential_rule((rank, pairs) in any_graph(), limit in prop::option::of(0usize..150)) {
             assert_equals_oracle(&rank, &pairs, limit);
         }
 

@@ -35,9 +35,9 @@ pub struct MergedSequence<'a> {
 }
 
 impl<'a> MergedSequence<'a> {
-    /// Creates the sequence of the Gaussians `survivors` of `source`, with the Gaussians at `clusters` (index into `survivors`,
-    /// members by id) replaced by proxies. Proxies are placed at the mean of their members: with a known trajectory
-    /// they need not follow their leader.
+    /// Creates the sequence of the Gaussians `survivors` of `source`, with the Gaussians at `clusters` (index into
+    /// `survivors`, members by id) replaced by proxies. Proxies are placed at the mean of their members: with a known
+    /// trajectory they need not follow their leader.
     pub fn new(
         source: &'a dyn FrameSource,
         survivors: &'a [u32],
@@ -71,7 +71,7 @@ impl MergedSequence<'_> {
     pub fn together(&self, places: Range<usize>, wanted: &ReadPlan) -> Result<Box<dyn BlockReader + '_>> {
         let inputs = MergedMembers::new(self, places);
         let frames = FrameReaders::open(self.source, Ids::List(&inputs.ids), Columns::all(), wanted)?;
-        Ok(Box::new(MergedReader::new(self, Box::new(frames), inputs)))
+        Ok(Box::new(MergedSequenceReader::new(self, Box::new(frames), inputs)))
     }
 
     /// Returns the number of source Gaussians from which the Gaussian at `place` is made; 1 if it is not a proxy.
@@ -88,7 +88,7 @@ impl FrameSource for MergedSequence<'_> {
     fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>> {
         let inputs = MergedMembers::new(self, ids.iter());
         let reader = self.source.open(Ids::List(&inputs.ids))?;
-        Ok(Box::new(MergedReader::new(self, reader, inputs)))
+        Ok(Box::new(MergedSequenceReader::new(self, reader, inputs)))
     }
 
     fn open_all(&self, wanted: &ReadPlan) -> Option<Result<Box<dyn BlockReader + '_>>> {
@@ -124,12 +124,12 @@ impl MergedMembers {
         ids.extend(places.iter().flat_map(|&place| sequence.members[place].iter().map(|&(id, _)| id)));
         ids.sort_unstable();
         ids.dedup();
-        let row = |id: u32| ids.binary_search(&id).unwrap_or_default() as u32;
-        let rows = places.iter().map(|&place| row(sequence.survivors[place])).collect();
+        let find_row = |id: u32| ids.binary_search(&id).unwrap_or_default() as u32;
+        let rows = places.iter().map(|&place| find_row(sequence.survivors[place])).collect();
         let (mut proxies, mut members) = (Vec::new(), Vec::new());
         for (row, &place) in places.iter().enumerate().filter(|&(_, &place)| !sequence.members[place].is_empty()) {
             let first = members.len();
-            members.extend(sequence.members[place].iter().map(|&(id, weight)| (row(id), weight)));
+            members.extend(sequence.members[place].iter().map(|&(id, weight)| (find_row(id), weight)));
             proxies.push(Proxy { row, members: first..members.len() });
         }
         MergedMembers { ids, rows, proxies, members }
@@ -165,7 +165,7 @@ impl MergedMembers {
     }
 }
 
-struct MergedReader<'a> {
+struct MergedSequenceReader<'a> {
     sequence: &'a MergedSequence<'a>,
     reader: Box<dyn BlockReader + 'a>,
     state: Gaussians,
@@ -174,14 +174,14 @@ struct MergedReader<'a> {
     inputs: MergedMembers,
 }
 
-impl<'a> MergedReader<'a> {
+impl<'a> MergedSequenceReader<'a> {
     fn new(sequence: &'a MergedSequence<'a>, reader: Box<dyn BlockReader + 'a>, inputs: MergedMembers) -> Self {
         let state = Gaussians::zeros(inputs.ids.len(), sequence.info.sh_degree);
-        MergedReader { sequence, reader, state, constant_read: Columns::empty(), inputs }
+        MergedSequenceReader { sequence, reader, state, constant_read: Columns::empty(), inputs }
     }
 }
 
-impl BlockReader for MergedReader<'_> {
+impl BlockReader for MergedSequenceReader<'_> {
     fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
         let needed = self.inputs.needed(want);
         self.reader.read(frame, needed.difference(self.constant_read), &mut self.state)?;

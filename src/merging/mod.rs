@@ -296,8 +296,9 @@ fn each_coincident<E>(
 
 /// Calls `take` with the pairs of nodes (leader, member) that pass tests 1 and 2 of `pass`: the member is among the
 /// leader's nearest neighbors and ranks after it. `unit` is the length of one unit of the recipe, in scene units. Pairs
-/// are ordered by leader in voxel order, then by distance, and passed `max_batch` (at least 1) at a time, with a flag that
-/// says whether there are several batches. Returns the number of nodes with more neighbors within ε than were examined.
+/// are ordered by leader in voxel order, then by distance, and passed `max_batch` (at least 1) at a time, with a flag
+/// that says whether there are several batches. Returns the number of nodes with more neighbors within ε than were
+/// examined.
 ///
 /// A node that is not mergeable or not finite never leads or joins, and does not count among the nearest neighbors of
 /// others.

@@ -222,17 +222,17 @@ mod tests {
         }
 
         #[test]
-        fn moving_the_mixture_moves_the_merged_gaussian(parts in mixture(), rotation_applied in unit_quaternion(), shift in prop::array::uniform3(-9.0..9.0f64)) {
+        fn moving_the_mixture_moves_the_merged_gaussian(parts in mixture(), turn in unit_quaternion(), shift in prop::array::uniform3(-9.0..9.0f64)) {
             let unmoved = moments(&parts, None);
             let shift = DVec3::from(shift);
             let moved: Vec<WeightedGaussian> = parts
                 .iter()
-                .map(|p| WeightedGaussian { position: rotation_applied * p.position + shift, rotation: (rotation_applied * p.rotation).normalize(), ..*p })
+                .map(|p| WeightedGaussian { position: turn * p.position + shift, rotation: (turn * p.rotation).normalize(), ..*p })
                 .collect();
             let got = moments(&moved, None);
-            prop_assert!((got.mean - (rotation_applied * unmoved.mean + shift)).length() < 1e-13);
+            prop_assert!((got.mean - (turn * unmoved.mean + shift)).length() < 1e-13);
             prop_assert!(((got.scales - unmoved.scales) / unmoved.scales).abs().max_element() < 1e-12);
-            assert_covariance(&Ellipsoid { scales: unmoved.scales, ..got }, covariance((rotation_applied * unmoved.rotation).normalize(), unmoved.scales));
+            assert_covariance(&Ellipsoid { scales: unmoved.scales, ..got }, covariance((turn * unmoved.rotation).normalize(), unmoved.scales));
         }
 
         #[test]

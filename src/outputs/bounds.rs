@@ -26,7 +26,8 @@ impl Bounds {
         Bounds(bounds)
     }
 
-    /// Creates the bounds `requested`; `extent` returns the scene extent and is called only if a bound is relative to it.
+    /// Creates the bounds `requested`; `extent` returns the scene extent and is called only if a bound is relative to
+    /// it.
     ///
     /// # Errors
     /// Fails if an attribute is named twice, or if `extent` fails.

@@ -82,7 +82,7 @@ impl Packing {
 }
 
 /// Writes `source` to the container `path`, which appears complete or not at all. `advance` is called with the number
-/// of Gaussian states written since the last call.
+/// of Gaussian states encoded since the last call.
 pub fn write_container(
     source: &dyn FrameSource,
     path: &Path,
@@ -276,9 +276,9 @@ pub enum BlockPresence {
     Varying,
     /// Varying attributes change; the others are written anew.
     New,
-    /// All frames are equal to the first one.
+    /// Every frame is equal to the first one.
     Still,
-    /// All frames are equal to the frame block before, in which all frames were equal.
+    /// Every frame is equal to the frame block before, in which every frame was equal.
     Repeating,
 }
 
@@ -295,9 +295,9 @@ pub fn of_block(count: usize, block: usize) -> Range<usize> {
     start..count.min(start + GAUSSIAN_BLOCK)
 }
 
-/// Encodes `source` at the `frames` of a block; `presence` gives the change of each block of Gaussians. Passes every tile
-/// to `each` in the order of the container, with its block of Gaussians and its column; `None` stands for the tile of
-/// the block before.
+/// Encodes `source` at the `frames` of a block; `presence` gives the change of each block of Gaussians. Passes every
+/// tile to `each` in the order of the container, with its block of Gaussians and its column; `None` stands for the tile
+/// of the block before.
 fn encode_frames(
     source: &dyn FrameSource,
     frames: Range<usize>,

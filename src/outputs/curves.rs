@@ -39,8 +39,8 @@ pub fn write_curves(source: &dyn FrameSource, path: &Path, events: &Events) -> R
     write(path, rows.len(), rows.iter().copied(), &seen_whole(&first.position))?;
     let sh_loss = if info.sh_degree > 0 { ", in colors that do not change with direction" } else { "" };
     Ok(format!(
-        "{} Gaussians became {} curves{sh_loss}; error of positions, as a fraction of the Gaussian's middle scale: {:.3} rms, \
-         {:.3} at most; error of opacities: {:.3} at most",
+        "{} Gaussians became {} curves{sh_loss}; error of positions, as a fraction of the Gaussian's middle scale: {:.3} \
+         rms, {:.3} at most; error of opacities: {:.3} at most",
         info.count,
         rows.len(),
         misfit.rms(),

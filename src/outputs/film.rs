@@ -15,7 +15,8 @@ use crate::render::Image;
 
 /// Program that encodes the video formats.
 const ENCODER: &str = "ffmpeg";
-/// Speed of the color selection of a GIF: 1 gives the best colors, 30 is fastest; 10 is the default of the library.
+/// Speed of the color selection of a GIF: 1 gives the best colors, 30 is fastest; 10 is the compromise that the library
+/// recommends.
 const GIF_SPEED: i32 = 10;
 /// Maximum number of bytes kept of the encoder's messages.
 const MAX_MESSAGE_BYTES: u64 = 1 << 16;
@@ -64,8 +65,8 @@ impl FilmFormat {
         let found = env::split_paths(&folders).map(|folder| folder.join(&name)).find(|file| file.is_file());
         found.map(|program| FilmFormat::Encoded(program, codec)).ok_or_else(|| {
             Error::usage(format!(
-                "{}: {ENCODER}, which makes .{extension}, is in no folder of PATH\n  install it (Debian: apt-get install \
-                 {ENCODER}), or give a name that ends in .png (every bit, large) or .gif (256 colors a frame)",
+                "{}: {ENCODER}, which makes .{extension}, is in no folder of PATH\n  install it (Debian: apt-get \
+                 install {ENCODER}), or give a name that ends in .png (every bit, large) or .gif (256 colors a frame)",
                 path.shown()
             ))
         })

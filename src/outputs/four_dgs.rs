@@ -56,8 +56,8 @@ pub fn write_four_dgs(source: &dyn FrameSource, path: &Path, events: &Events) ->
     let bytes = write_to_vec(&set, starts[info.times.len()], &options, &SceneExtras::default()).map_err(refused)?;
     std::fs::write(path, bytes).map_err(Error::io("write", path))?;
     Ok(format!(
-        "{} Gaussians became {pieces} pieces of straight motion at {FRAME_RATE} frames a second; error of positions, as a \
-         fraction of the Gaussian's middle scale: {:.3} rms, {:.3} at most; error of opacities: {:.3} at most",
+        "{} Gaussians became {pieces} pieces of straight motion at {FRAME_RATE} frames a second; error of positions, as \
+         a fraction of the Gaussian's middle scale: {:.3} rms, {:.3} at most; error of opacities: {:.3} at most",
         info.count,
         misfit.rms(),
         misfit.position,

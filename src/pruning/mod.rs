@@ -32,7 +32,7 @@ pub struct Overrides {
 pub struct Selection {
     /// Whether each Gaussian stays.
     pub keep: Vec<bool>,
-    /// All Gaussians except those dropped by the user, best first; the first `counts.kept` are those of `keep`.
+    /// Ranking of the Gaussians not dropped by the user, best first; the first `counts.kept` are those of `keep`.
     pub ranking: Ranking,
     /// Numbers of Gaussians kept and pruned by each stage.
     pub counts: Counts,

@@ -8,7 +8,7 @@ use crate::model::hash_id;
 use crate::recipe::{LowPriority, Select};
 use crate::statistics::score::Scores;
 
-/// All Gaussians, in the order in which they are kept.
+/// Gaussians in the order in which they are kept, best first.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Ranking {
     order: Vec<u32>,
@@ -106,7 +106,7 @@ fn rank_over(place: u32, kept: usize) -> f64 {
     (f64::from(place) + 1.0) / (kept as f64).max(0.5)
 }
 
-/// Returns x/τ, which is at least 1 exactly if x ≥ τ. With τ = 0 the ratio is undefined: all values that reach τ tie at
+/// Returns x/τ, which is at least 1 exactly if x ≥ τ. With τ ≤ 0 the ratio is undefined: all values that reach τ tie at
 /// infinity.
 fn ratio(x: f64, tau: f64) -> f64 {
     if tau > 0.0 {

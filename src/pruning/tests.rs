@@ -52,7 +52,7 @@ fn any_norm() -> impl Strategy<Value = f64> {
     prop_oneof![(-2i32..12).prop_map(|x| f64::from(x) / 8.0), Just(-0.0), Just(0.05), Just(0.05f64.next_down())]
 }
 
-/// Also holds for the order by rule, and for Gaussians that no stage keeps.
+// The claim also holds for the order by rule, and for Gaussians that no stage keeps.
 #[test]
 fn sign_of_zero_changes_no_ranking() {
     let parts = |zero: f64| -> Vec<(f64, f64)> {

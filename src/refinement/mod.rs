@@ -36,7 +36,8 @@ const NAME: &str = "refine";
 /// Time of an optimization step, as a multiple of the time to render its view.
 const STEP_RENDERS: f64 = 3.0;
 
-/// PSNR in dB above which refinement has nothing to gain: the error is less than a quarter of an 8-bit step.
+/// PSNR in dB above which refinement has nothing to gain: the rms error is about a quarter of an 8-bit
+/// step.
 pub(crate) const CLOSE_ENOUGH: f64 = 60.0;
 /// Fraction of the Gaussians that ranking alone leaves before the first optimization steps of a stronger compression.
 const MIN_START_FRACTION: f64 = 0.4;

@@ -53,8 +53,8 @@ pub struct Descent {
     change: ParamDelta,
     /// Running means of the derivatives, and of their squares.
     means: [Gaussians; 2],
-    /// `[N]`, factors on the learning rate: for positions 0.04 times the mean extent of the Gaussian, for other
-    /// attributes 1; 0 for fixed Gaussians.
+    /// `[N]`, factors on the learning rate: for positions 0.04 times the geometric mean of the scales, for
+    /// other attributes 1; 0 for fixed Gaussians.
     reach: [Vec<f32>; 2],
     columns: Columns,
     done: usize,

@@ -42,8 +42,8 @@ pub(super) const REEVALUATE_EVERY: usize = 200;
 /// The survivors, their states at the frames of the target views, and the delta so far.
 ///
 /// States that depend on the stored parameters by more than a sum, as with a deformation field, are reevaluated every
-/// [`REEVALUATE_EVERY`] steps and extrapolated along their Jacobians in between. Evaluating a field and its derivative at
-/// every step would take three times as long and gain nothing (method.md, section 6.2).
+/// [`REEVALUATE_EVERY`] steps and extrapolated along their Jacobians in between. Evaluating a field and its derivative
+/// at every step would take three times as long and gain nothing (method.md, section 6.2).
 ///
 /// Memory: six states, [`Descent`], and a view with its gradient; in a scratch file one state per frame, of the
 /// Gaussians present if they are few.
@@ -118,7 +118,7 @@ impl<'a> OptimizerState<'a> {
             course: Vec::new(),
             changing: vec![Columns::empty(); fixed.len()],
             gradients: Gradients::new(0, columns, sh_degree),
-            now: LinearizedState::zero(state_degree),
+            now: LinearizedState::none(state_degree),
             renderer: Renderer::on_all_threads(),
             steps: 0,
             reevaluated: false,
@@ -163,9 +163,9 @@ impl<'a> OptimizerState<'a> {
         self.gradients = Gradients::new(state.len(), columns, sh_degree);
     }
 
-    /// Starts optimizing a time-varying delta of 0 with `keyframe_count` keyframes. A Gaussian's delta varies only in attributes
-    /// that vary in the input (others are stored once), and only in SH coefficients of degree 0. Returns whether there
-    /// is anything to optimize.
+    /// Starts optimizing a time-varying delta of 0 with `keyframe_count` keyframes. A Gaussian's delta varies only in
+    /// attributes that vary in the input (others are stored once), and only in SH coefficients of degree 0. Returns
+    /// whether there is anything to optimize.
     pub(super) fn enable_keyframes(&mut self, keyframe_count: usize) -> bool {
         let columns = self.step_params.columns & self.changing.iter().copied().collect();
         let Some(LinearizedState { state, .. }) = self.linearized.first().filter(|_| !columns.is_empty()) else {

@@ -37,8 +37,8 @@ pub(crate) struct Parted {
     pub(crate) held: Vec<usize>,
 }
 
-/// Returns the number of target views from the scene's cameras and from cameras in between, at most `max_views` together, if
-/// a view has `pixels` pixels.
+/// Returns the number of target views from the scene's cameras and from cameras in between, at most `max_views`
+/// together, if a view has `pixels` pixels.
 pub(super) fn view_counts(max_views: usize, pixels: u64) -> [usize; 2] {
     let count = (MAX_BYTES / (6 * pixels.max(1))).max(MIN_VIEWS).min(max_views as u64) as usize;
     VIEW_SHARES.map(|part| part * count / 26)
