@@ -10,13 +10,13 @@ bitflags! {
     /// Anomalies of a Gaussian that the scan found.
     #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
     pub struct Flags: u8 {
-        /// Some value in some frame was NaN or infinite.
+        /// A value in some frame was NaN or infinite.
         const NON_FINITE = 1;
-        /// The quaternion was zero in some frame; the identity was used.
+        /// The quaternion was zero in some frame; the identity was used there.
         const ZERO_ROTATION = 2;
-        /// D fell below the noise floor of its f32 positions and was set to 0.
+        /// D was below the noise floor of the f32 positions and was set to 0.
         const SNAPPED_D = 4;
-        /// κ fell below the noise floor of its f32 positions and was set to 0.
+        /// κ was below the noise floor of the f32 positions and was set to 0.
         const SNAPPED_KAPPA = 8;
     }
 }
@@ -24,21 +24,21 @@ bitflags! {
 /// Statistic of a Gaussian. Its methods declare its names, its meaning, and the array that holds its values.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Statistic {
-    /// [`Rows::d`].
+    /// Trajectory magnitude, [`Rows::d`].
     D,
-    /// [`Rows::kappa`].
+    /// Curvature, [`Rows::kappa`].
     Kappa,
-    /// [`Rows::v`].
+    /// Variance of the opacity, [`Rows::v`].
     V,
-    /// [`Rows::life`].
+    /// Life span, [`Rows::life`].
     Life,
-    /// [`Rows::c`].
+    /// Mean contribution, [`Rows::c`].
     C,
-    /// [`Rows::e`].
+    /// Anisotropy, [`Rows::e`].
     E,
-    /// [`Rows::vis`].
+    /// Visibility, [`Rows::vis`].
     Vis,
-    /// [`Rows::w`].
+    /// Largest weight of a pixel, [`Rows::w`].
     W,
 }
 

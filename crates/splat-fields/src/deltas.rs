@@ -26,7 +26,7 @@ impl Deltas {
         Deltas { delta: Gaussians::zeros(0, sh_degree), mask: None, active: Columns::empty(), multiply_rotation: false }
     }
 
-    /// Resizes the `active` attributes to `rows` Gaussians.
+    /// Starts a block of `rows` Gaussians: resizes the `active` attributes and stores the arguments.
     pub(super) fn begin(&mut self, rows: usize, active: Columns, multiply_rotation: bool) {
         for column in active.iter() {
             self.delta.column_mut(column).resize(rows);

@@ -8,9 +8,9 @@ use super::tensors::Lookup;
 /// Grid of mask values `[1, 1, X, Y, Z]` between two corners.
 #[derive(Debug, Clone)]
 pub(super) struct VoxelMask {
-    /// Corner of the first grid point, scene units.
+    /// Position of the first grid point, scene units.
     low: [f32; 3],
-    /// Corner of the last grid point, scene units.
+    /// Position of the last grid point, scene units.
     high: [f32; 3],
     size: [usize; 3],
     values: Vec<f32>,

@@ -193,7 +193,7 @@ struct ProjectedSplats {
     falloff_x: [f64; BLOCK],
     shear: [f64; BLOCK],
     falloff_y: [f64; BLOCK],
-    /// Half the width of the ellipse on which alpha has halved once, pixels.
+    /// Half the width of the ellipse on which alpha is half its maximum, pixels.
     half_u: [f64; BLOCK],
     /// Half the height of that ellipse, pixels.
     half_v: [f64; BLOCK],
