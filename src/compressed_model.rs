@@ -202,7 +202,8 @@ impl CompressedModel {
         CompressedModel { kept, ..self.clone() }
     }
 
-    /// Sets the solved `proxies`. A refused cluster is dissolved: its leader stays unchanged.
+    /// Sets the solved `proxies`. A refused cluster is dissolved: its leader stays unchanged, its other members are
+    /// removed.
     pub fn make(&mut self, mut proxies: Proxies) {
         let refused = std::mem::take(&mut proxies.refused);
         if !refused.is_empty() {
@@ -264,7 +265,7 @@ mod tests {
     use crate::recipe::Recipe;
 
     #[test]
-    fn a_change_adds_to_its_own_columns_and_zeros_keep_even_the_sign_of_zero() {
+    fn delta_adds_to_its_attributes_and_zero_keeps_bits() {
         let mut state = Gaussians::zeros(2, 1);
         state.opacity_logit.set_row(0, [-0.0]);
         let mut by = Gaussians::zeros(2, 0);
@@ -285,7 +286,7 @@ mod tests {
     }
 
     #[test]
-    fn a_course_goes_through_its_knots_and_straight_in_between() {
+    fn trajectory_delta_is_linear_between_keyframes() {
         let knot = |x: f32, logit: f32| {
             let mut by = Gaussians::zeros(0, 0);
             by.position = Column::from_planes(3, vec![x, 0.0, 2.0 * x, 0.0, 0.0, -x]);
@@ -313,7 +314,7 @@ mod tests {
     }
 
     #[test]
-    fn clusters_that_are_refused_are_their_leaders_and_the_others_keep_their_proxies() {
+    fn refused_clusters_keep_only_their_leaders() {
         let rule = Recipe::preset("default").unwrap().merge;
         let mut reduction = CompressedModel::pruned(vec![1, 4, 6], &rule);
         let cluster = |output: u32, leader: u32, other: u32| Cluster {
@@ -331,7 +332,7 @@ mod tests {
     }
 
     #[test]
-    fn members_of_a_cluster_share_its_place() {
+    fn members_of_a_cluster_share_its_index() {
         let rule = Recipe::preset("default").unwrap().merge;
         let mut reduction = CompressedModel::pruned(vec![1, 4], &rule);
         assert_eq!(reduction.index_map(6), [None, Some(0), None, None, Some(1), None]);

@@ -11,8 +11,8 @@ use serde::de::DeserializeOwned;
 
 use super::key::CacheKey;
 use super::spill::{Spill, SpillWriter};
-use crate::cache::entry::{CacheEntry, ENDING, EntryName, names};
-use crate::cache::shard::MOST_PARTS;
+use crate::cache::entry::{CacheEntry, EXTENSION, EntryName, names};
+use crate::cache::shard::MAX_SHARDS;
 use crate::error::{Error, Result, ShowPath};
 use crate::files::atomic::remove_leftovers;
 
@@ -27,21 +27,21 @@ pub(super) struct CacheDir {
 
 impl CacheDir {
     /// Opens the work folder `folder`; creates it if it does not exist.
-    pub(super) fn at(folder: &Path, about: String) -> Result<CacheDir> {
+    pub(super) fn open_or_create(folder: &Path, about: String) -> Result<CacheDir> {
         match fs::create_dir(folder) {
             Err(error) if error.kind() != io::ErrorKind::AlreadyExists => {
                 Err(Error::io("create the work folder", folder)(error))
             }
             _ if !folder.is_dir() => Err(Error::usage(format!("{}: expected a folder, found a file", folder.shown()))),
             _ => {
-                remove_leftovers(folder, ENDING);
+                remove_leftovers(folder, EXTENSION);
                 Ok(CacheDir { folder: folder.to_owned(), context: CacheKey::new(&()), about })
             }
         }
     }
 
     /// Makes all further keys also depend on `context`.
-    pub(super) fn follow_from(&mut self, context: CacheKey) {
+    pub(super) fn depend_on(&mut self, context: CacheKey) {
         self.context = self.context.and(&context);
     }
 
@@ -51,12 +51,12 @@ impl CacheDir {
     }
 
     /// Returns the indices of the stored shards of `stage`, by the number of shards.
-    pub(super) fn parts(&self, stage: &str, key: CacheKey) -> Result<BTreeMap<usize, BTreeSet<usize>>> {
+    pub(super) fn stored_shards(&self, stage: &str, key: CacheKey) -> Result<BTreeMap<usize, BTreeSet<usize>>> {
         let key = self.key(key).text();
         let mut found: BTreeMap<usize, BTreeSet<usize>> = BTreeMap::new();
         for name in names(&self.folder)? {
             let (index, of) = name.part;
-            if name.stage == stage && name.key == key && (1..=of).contains(&index) && (2..=MOST_PARTS).contains(&of) {
+            if name.stage == stage && name.key == key && (1..=of).contains(&index) && (2..=MAX_SHARDS).contains(&of) {
                 found.entry(of).or_default().insert(index);
             }
         }
@@ -64,15 +64,15 @@ impl CacheDir {
     }
 
     /// Returns descriptions of the inputs to which stored shards of `stage` with other keys belong.
-    pub(super) fn others(&self, stage: &str, key: CacheKey) -> Result<BTreeSet<String>> {
+    pub(super) fn foreign_inputs(&self, stage: &str, key: CacheKey) -> Result<BTreeSet<String>> {
         let key = self.key(key).text();
-        let is_other = |name: &EntryName| name.stage == stage && name.key != key && name.part.1 > 1;
+        let is_foreign = |name: &EntryName| name.stage == stage && name.key != key && name.part.1 > 1;
         let mut found = BTreeMap::new();
-        for name in names(&self.folder)?.into_iter().filter(is_other) {
+        for name in names(&self.folder)?.into_iter().filter(is_foreign) {
             // One shard per key is enough. The input of a damaged shard is unknown.
             if let Entry::Vacant(new) = found.entry(name.key.clone()) {
-                let piece = CacheEntry::open(&self.folder.join(name.file()), &name.key)?;
-                new.insert(piece.map_or_else(|_| "an unknown input".to_owned(), |piece| piece.about().to_owned()));
+                let entry = CacheEntry::open(&self.folder.join(name.file()), &name.key)?;
+                new.insert(entry.map_or_else(|_| "an unknown input".to_owned(), |entry| entry.about().to_owned()));
             }
         }
         Ok(found.into_values().collect())
@@ -81,8 +81,8 @@ impl CacheDir {
     /// Reads the value of a cache entry, if it exists. Calls `damaged` with a message for a damaged entry, which counts
     /// as missing.
     pub(super) fn read<T: DeserializeOwned>(&self, name: &EntryName, damaged: impl Fn(String)) -> Result<Option<T>> {
-        let Some(piece) = self.open_piece(name, &damaged)? else { return Ok(None) };
-        let found = piece.value();
+        let Some(entry) = self.open_entry(name, &damaged)? else { return Ok(None) };
+        let found = entry.value();
         let wrong = |error| damaged(format!("{} has unexpected contents ({error}): computed again", name.file()));
         Ok(found.map_err(wrong).ok())
     }
@@ -91,20 +91,20 @@ impl CacheDir {
     /// one.
     pub(super) fn open(&self, name: &EntryName, damaged: impl Fn(String)) -> Result<Option<Spill>> {
         let at = self.folder.join(name.file());
-        let spill = |piece: CacheEntry| {
-            let (file, start) = piece.into_file();
+        let spill = |entry: CacheEntry| {
+            let (file, start) = entry.into_file();
             Spill::from_file(file, start, at)
         };
-        Ok(self.open_piece(name, &damaged)?.map(spill))
+        Ok(self.open_entry(name, &damaged)?.map(spill))
     }
 
-    fn open_piece(&self, name: &EntryName, damaged: &impl Fn(String)) -> Result<Option<CacheEntry>> {
+    fn open_entry(&self, name: &EntryName, damaged: &impl Fn(String)) -> Result<Option<CacheEntry>> {
         let path = self.folder.join(name.file());
         if !path.exists() {
-            return self.is_there().map(|()| None);
+            return self.check_exists().map(|()| None);
         }
         match CacheEntry::open(&path, &name.key) {
-            Ok(Ok(piece)) => Ok(Some(piece)),
+            Ok(Ok(entry)) => Ok(Some(entry)),
             Ok(Err(why)) => {
                 damaged(format!("{} is damaged ({why}): computed again", name.file()));
                 Ok(None)
@@ -116,21 +116,21 @@ impl CacheDir {
     }
 
     /// Checks that the folder still exists: a vanished folder is an error, not an empty cache.
-    fn is_there(&self) -> Result<()> {
+    fn check_exists(&self) -> Result<()> {
         fs::metadata(&self.folder).map(|_| ()).map_err(Error::io("find the work folder", &self.folder))
     }
 
     /// Writes a cache entry with the value `found`.
     pub(super) fn write<T: Serialize>(&self, name: &EntryName, found: &T) -> Result<()> {
-        let mut spilling = self.begin(name)?;
-        spilling.write_value(found)?;
-        spilling.finish()?;
+        let mut writer = self.begin_entry(name)?;
+        writer.write_value(found)?;
+        writer.finish()?;
         Ok(())
     }
 
     /// Begins to write a cache entry.
-    pub(super) fn begin(&self, name: &EntryName) -> Result<SpillWriter> {
-        self.is_there()?;
+    pub(super) fn begin_entry(&self, name: &EntryName) -> Result<SpillWriter> {
+        self.check_exists()?;
         let key = u128::from_str_radix(&name.key, 16).unwrap_or_default();
         SpillWriter::named(&self.folder.join(name.file()), key, &self.about)
     }

@@ -32,9 +32,9 @@ const VERSION: u32 = 1;
 /// Bytes of the header before the text.
 const HEADER: usize = 48;
 /// Extension of the file names of cache entries.
-pub(super) const ENDING: &str = ".piece";
+pub(super) const EXTENSION: &str = ".piece";
 /// Maximum bytes of all strings in the value of an entry.
-const MOST_TEXT: u64 = 8 << 20;
+const MAX_STRING_BYTES: u64 = 8 << 20;
 
 /// File name of a cache entry.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
@@ -54,14 +54,14 @@ impl EntryName {
     pub(super) fn file(&self) -> String {
         let EntryName { stage, key, part } = self;
         match part {
-            (_, 1) => format!("{stage}.{key}{ENDING}"),
-            (index, of) => format!("{stage}.{key}.{index}-of-{of}{ENDING}"),
+            (_, 1) => format!("{stage}.{key}{EXTENSION}"),
+            (index, of) => format!("{stage}.{key}.{index}-of-{of}{EXTENSION}"),
         }
     }
 
     /// Parses the file name of a cache entry; returns `None` for other files.
     pub(super) fn parse(file: &str) -> Option<EntryName> {
-        let mut fields = file.strip_suffix(ENDING)?.split('.');
+        let mut fields = file.strip_suffix(EXTENSION)?.split('.');
         let (stage, key, part) = (fields.next()?, fields.next()?, fields.next());
         let part = match part {
             None => (1, 1),
@@ -138,19 +138,19 @@ impl EntryWriter {
 
 impl Write for EntryWriter {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
-        let written = self.file.write(bytes).inspect_err(|error| self.failed = Some(again(error)))?;
+        let written = self.file.write(bytes).inspect_err(|error| self.failed = Some(copied_error(error)))?;
         self.hash.update(&bytes[..written]);
         self.length += written as u64;
         Ok(written)
     }
 
     fn flush(&mut self) -> io::Result<()> {
-        self.file.flush().inspect_err(|error| self.failed = Some(again(error)))
+        self.file.flush().inspect_err(|error| self.failed = Some(copied_error(error)))
     }
 }
 
 /// Returns a copy of the error.
-fn again(error: &io::Error) -> io::Error {
+fn copied_error(error: &io::Error) -> io::Error {
     error.raw_os_error().map_or_else(|| io::Error::new(error.kind(), error.to_string()), io::Error::from_raw_os_error)
 }
 
@@ -230,8 +230,8 @@ impl CacheEntry {
     /// Reads the value of the entry.
     pub(super) fn value<T: DeserializeOwned>(self) -> postcard::Result<T> {
         // Buffer into which the deserializer reads strings one after the other.
-        let mut texts = vec![0; self.length.min(MOST_TEXT) as usize];
-        postcard::from_io((BufReader::new(self.file), &mut texts)).map(|(value, _)| value)
+        let mut string_buffer = vec![0; self.length.min(MAX_STRING_BYTES) as usize];
+        postcard::from_io((BufReader::new(self.file), &mut string_buffer)).map(|(value, _)| value)
     }
 
     /// Returns the description of the input that the entry belongs to.

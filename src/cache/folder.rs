@@ -8,7 +8,7 @@ use std::path::Path;
 use bytesize::ByteSize;
 use serde::Serialize;
 
-use crate::cache::entry::{CacheEntry, ENDING, EntryName, names};
+use crate::cache::entry::{CacheEntry, EXTENSION, EntryName, names};
 use crate::error::{Error, Result};
 use crate::files::atomic::remove_leftovers;
 use crate::model::ranges;
@@ -40,12 +40,12 @@ pub fn list(folder: &Path) -> Result<Vec<Listed>> {
     let mut found: BTreeMap<(String, String, usize), Listed> = BTreeMap::new();
     for name in names(folder)? {
         let path = folder.join(name.file());
-        let EntryName { stage, key, part: (index, of) } = name;
-        let listed = found.entry((stage.clone(), key.clone(), of)).or_insert_with(|| Listed {
+        let EntryName { stage, key, part: (index, count) } = name;
+        let listed = found.entry((stage.clone(), key.clone(), count)).or_insert_with(|| Listed {
             stage,
             key: key.clone(),
-            parts: of,
-            missing: (1..=of).collect(),
+            parts: count,
+            missing: (1..=count).collect(),
             damaged: Vec::new(),
             bytes: 0,
             belongs_to: String::new(),
@@ -53,7 +53,7 @@ pub fn list(folder: &Path) -> Result<Vec<Listed>> {
         listed.missing.retain(|&missing| missing != index);
         listed.bytes += fs::metadata(&path).map_err(Error::io("read the size of", &path))?.len();
         match CacheEntry::open(&path, &key)? {
-            Ok(piece) => piece.about().clone_into(&mut listed.belongs_to),
+            Ok(entry) => entry.about().clone_into(&mut listed.belongs_to),
             Err(_) => listed.damaged.push(index),
         }
     }
@@ -65,11 +65,11 @@ pub fn list(folder: &Path) -> Result<Vec<Listed>> {
 /// Formats a listing for display.
 pub fn text(listed: &[Listed]) -> String {
     let mut out = String::new();
-    for of_run in listed.chunk_by(|a, b| a.belongs_to == b.belongs_to) {
-        let bytes = ByteSize(of_run.iter().map(|of| of.bytes).sum());
-        let belongs_to = if of_run[0].belongs_to.is_empty() { "damaged" } else { &of_run[0].belongs_to };
+    for run_entries in listed.chunk_by(|a, b| a.belongs_to == b.belongs_to) {
+        let bytes = ByteSize(run_entries.iter().map(|entry| entry.bytes).sum());
+        let belongs_to = if run_entries[0].belongs_to.is_empty() { "damaged" } else { &run_entries[0].belongs_to };
         _ = writeln!(out, "{belongs_to}: {}", bytes.display().si());
-        for Listed { stage, key, parts, missing, damaged, bytes, .. } in of_run {
+        for Listed { stage, key, parts, missing, damaged, bytes, .. } in run_entries {
             let mut state = if *parts == 1 { "whole".to_owned() } else { format!("{parts} parts") };
             for (what, which) in [("missing", missing), ("damaged", damaged)] {
                 if !which.is_empty() {
@@ -99,7 +99,7 @@ pub fn clean(folder: &Path) -> Result<(usize, u64)> {
         fs::remove_file(&path).map_err(Error::io("remove", &path))?;
         files += 1;
     }
-    remove_leftovers(folder, ENDING);
+    remove_leftovers(folder, EXTENSION);
     // A folder with files of other programs is not empty, so it stays.
     let _ = fs::remove_dir(folder);
     Ok((files, bytes))

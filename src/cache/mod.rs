@@ -27,7 +27,7 @@ use serde::de::DeserializeOwned;
 
 use crate::cache::dir::CacheDir;
 use crate::cache::entry::EntryName;
-use crate::cache::shard::MOST_PARTS;
+use crate::cache::shard::MAX_SHARDS;
 pub use crate::cache::shard::{Completion, Shard};
 use crate::error::{Error, Result};
 use crate::model::ranges;
@@ -48,11 +48,11 @@ pub struct CacheRequest {
 /// Cache of stage results, if there is a work folder, and the shard that this run computes.
 #[derive(Debug, Default)]
 pub struct Cache {
-    place: Option<CacheDir>,
+    dir: Option<CacheDir>,
     part: Option<Shard>,
     /// Cache key of the ids of Gaussians that are excluded from the input; `None`: none are excluded.
     absent: Mutex<Option<CacheKey>>,
-    said: Mutex<Vec<String>>,
+    notes: Mutex<Vec<String>>,
 }
 
 impl Cache {
@@ -67,19 +67,19 @@ impl Cache {
     /// # Errors
     /// Fails if the folder cannot be created or the path is not a folder.
     pub fn open(asked: &CacheRequest, about: String) -> Result<Cache> {
-        Ok(Cache { place: Some(CacheDir::at(&asked.folder, about)?), part: asked.part, ..Cache::default() })
+        Ok(Cache { dir: Some(CacheDir::open_or_create(&asked.folder, about)?), part: asked.part, ..Cache::default() })
     }
 
     /// Makes all further keys also depend on `context`.
     pub fn follow_from(&mut self, context: CacheKey) {
-        if let Some(place) = &mut self.place {
-            place.follow_from(context);
+        if let Some(dir) = &mut self.dir {
+            dir.depend_on(context);
         }
     }
 
     /// Returns whether results are stored.
     pub fn keeps(&self) -> bool {
-        self.place.is_some()
+        self.dir.is_some()
     }
 
     /// Makes all further keys also depend on the ids of Gaussians that are excluded from the input, if there are any.
@@ -100,11 +100,11 @@ impl Cache {
 
     /// Returns the notes for the user since the last call.
     pub fn take_notes(&self) -> Vec<String> {
-        std::mem::take(&mut self.said.lock().unwrap_or_else(PoisonError::into_inner))
+        std::mem::take(&mut self.notes.lock().unwrap_or_else(PoisonError::into_inner))
     }
 
-    fn say(&self, note: String) {
-        self.said.lock().unwrap_or_else(PoisonError::into_inner).push(note);
+    fn add_note(&self, note: String) {
+        self.notes.lock().unwrap_or_else(PoisonError::into_inner).push(note);
     }
 
     /// Returns the stored result of `stage` for `key`, if there is one.
@@ -112,7 +112,7 @@ impl Cache {
     /// # Errors
     /// Fails if the folder cannot be read. A damaged entry counts as missing and causes a note.
     pub fn find<T: DeserializeOwned>(&self, stage: &str, key: CacheKey) -> Result<Option<T>> {
-        self.find_part(stage, key, Shard::WHOLE)
+        self.read_shard(stage, key, Shard::WHOLE)
     }
 
     /// Stores the result `found` of `stage` for `key`.
@@ -120,7 +120,7 @@ impl Cache {
     /// # Errors
     /// Fails if the folder cannot be written.
     pub fn keep<T: Serialize>(&self, stage: &str, key: CacheKey, found: &T) -> Result<()> {
-        self.keep_part(stage, key, Shard::WHOLE, found)
+        self.write_shard(stage, key, Shard::WHOLE, found)
     }
 
     /// Returns the stored result of `stage` for `key`, or computes and stores it. A run of a single shard computes it,
@@ -172,16 +172,16 @@ impl Cache {
         if let Some(whole) = self.find(stage, key)? {
             return Ok(whole);
         }
-        let find = |part| self.find_part(stage, key, part);
+        let find = |part| self.read_shard(stage, key, part);
         let make = |part: Shard| -> Result<T> {
-            let found = compute(part.of_units(units))?;
-            self.keep_part(stage, key, part, &found)?;
+            let found = compute(part.unit_range(units))?;
+            self.write_shard(stage, key, part, &found)?;
             Ok(found)
         };
-        let of = self.divide(stage, key, &find, &make)?;
-        let whole = match of {
+        let count = self.divide(stage, key, &find, &make)?;
+        let whole = match count {
             1 => join(&mut std::iter::once_with(|| compute(0..units)))?,
-            _ => join(&mut Shard::all(of).map(|part| find(part)?.map_or_else(|| make(part), Ok)))?,
+            _ => join(&mut Shard::all(count).map(|part| find(part)?.map_or_else(|| make(part), Ok)))?,
         };
         self.keep(stage, key, &whole)?;
         self.complete(stage, whole)
@@ -200,24 +200,24 @@ impl Cache {
         scratch: &Path,
         write: impl Fn(Range<usize>, &mut SpillWriter) -> Result<()>,
     ) -> Result<Vec<(Range<usize>, Spill)>> {
-        let find = |part| match &self.place {
+        let find = |part| match &self.dir {
             None => Ok(None),
-            Some(place) => place.open(&EntryName::new(stage, place.key(key), part), |note| self.say(note)),
+            Some(dir) => dir.open(&EntryName::new(stage, dir.key(key), part), |note| self.add_note(note)),
         };
         let make = |part: Shard| -> Result<Spill> {
-            let mut spilling = match &self.place {
+            let mut spilling = match &self.dir {
                 None => SpillWriter::new(scratch)?,
-                Some(place) => place.begin(&EntryName::new(stage, place.key(key), part))?,
+                Some(dir) => dir.begin_entry(&EntryName::new(stage, dir.key(key), part))?,
             };
-            write(part.of_units(units), &mut spilling)?;
+            write(part.unit_range(units), &mut spilling)?;
             spilling.finish()
         };
         if let Some(whole) = find(Shard::WHOLE)? {
             return Ok(vec![(0..units, whole)]);
         }
-        let of = self.divide(stage, key, &find, &make)?;
-        let spill = |part: Shard| Ok((part.of_units(units), find(part)?.map_or_else(|| make(part), Ok)?));
-        let spills = Shard::all(of).map(spill).collect::<Result<_>>()?;
+        let count = self.divide(stage, key, &find, &make)?;
+        let spill = |part: Shard| Ok((part.unit_range(units), find(part)?.map_or_else(|| make(part), Ok)?));
+        let spills = Shard::all(count).map(spill).collect::<Result<_>>()?;
         self.complete(stage, spills)
     }
 
@@ -241,22 +241,26 @@ impl Cache {
         find: &dyn Fn(Shard) -> Result<Option<T>>,
         make: &dyn Fn(Shard) -> Result<T>,
     ) -> Result<usize> {
-        let Some(place) = &self.place else { return Ok(1) };
+        let Some(dir) = &self.dir else { return Ok(1) };
         // Stored shards by the number of shards.
-        let there = place.parts(stage, key)?;
-        if let Some((&of, _)) = there.iter().find(|(of, parts)| parts.len() == **of) {
-            return Ok(of);
+        let stored = dir.stored_shards(stage, key)?;
+        if let Some((&count, _)) = stored.iter().find(|(count, parts)| parts.len() == **count) {
+            return Ok(count);
         }
         let Some(part) = self.part else {
-            let Some((&of, parts)) = there.iter().max_by_key(|(of, parts)| parts.len() * MOST_PARTS / **of) else {
-                self.say_of_others(place, stage, key)?;
+            let Some((&count, parts)) = stored.iter().max_by_key(|(count, parts)| parts.len() * MAX_SHARDS / **count)
+            else {
+                self.note_unusable_shards(dir, stage, key)?;
                 return Ok(1);
             };
-            self.say(format!("{stage}: of {of} parts these are missing and computed here: {}", missing(parts, of)));
-            return Ok(of);
+            self.add_note(format!(
+                "{stage}: of {count} parts these are missing and computed here: {}",
+                missing(parts, count)
+            ));
+            return Ok(count);
         };
-        let (_, of) = part.numbers();
-        if of == 1 {
+        let (_, count) = part.numbers();
+        if count == 1 {
             return Ok(1);
         }
         // A file with the name of this shard may be damaged, so it is read.
@@ -267,22 +271,22 @@ impl Cache {
                 "is done"
             }
         };
-        if there.is_empty() {
-            self.say_of_others(place, stage, key)?;
+        if stored.is_empty() {
+            self.note_unusable_shards(dir, stage, key)?;
         }
-        let there = place.parts(stage, key)?.remove(&of).unwrap_or_default();
-        let mut said = match there.len() == of {
+        let stored = dir.stored_shards(stage, key)?.remove(&count).unwrap_or_default();
+        let mut report = match stored.len() == count {
             true => format!("{stage}: part {part} {done}; all parts are there"),
-            false => format!("{stage}: part {part} {done}; missing: {}", missing(&there, of)),
+            false => format!("{stage}: part {part} {done}; missing: {}", missing(&stored, count)),
         };
-        self.take_notes().iter().for_each(|note| said += &format!("\n  note: {note}"));
-        Err(Error::ShardDone(said))
+        self.take_notes().iter().for_each(|note| report += &format!("\n  note: {note}"));
+        Err(Error::ShardDone(report))
     }
 
     /// Adds a note if shards of `stage` are stored that this run cannot use.
-    fn say_of_others(&self, place: &CacheDir, stage: &str, key: CacheKey) -> Result<()> {
-        for other in place.others(stage, key)? {
-            self.say(format!(
+    fn note_unusable_shards(&self, dir: &CacheDir, stage: &str, key: CacheKey) -> Result<()> {
+        for other in dir.foreign_inputs(stage, key)? {
+            self.add_note(format!(
                 "{stage}: parts in the work folder are not used because they come from another input, recipe, program version or \
                  kind of processor; they belong to {other}"
             ));
@@ -290,20 +294,20 @@ impl Cache {
         Ok(())
     }
 
-    fn find_part<T: DeserializeOwned>(&self, stage: &str, key: CacheKey, part: Shard) -> Result<Option<T>> {
-        let Some(place) = &self.place else { return Ok(None) };
-        place.read(&EntryName::new(stage, place.key(key), part), |note| self.say(note))
+    fn read_shard<T: DeserializeOwned>(&self, stage: &str, key: CacheKey, part: Shard) -> Result<Option<T>> {
+        let Some(dir) = &self.dir else { return Ok(None) };
+        dir.read(&EntryName::new(stage, dir.key(key), part), |note| self.add_note(note))
     }
 
-    fn keep_part<T: Serialize>(&self, stage: &str, key: CacheKey, part: Shard, found: &T) -> Result<()> {
-        let Some(place) = &self.place else { return Ok(()) };
-        place.write(&EntryName::new(stage, place.key(key), part), found)
+    fn write_shard<T: Serialize>(&self, stage: &str, key: CacheKey, part: Shard, found: &T) -> Result<()> {
+        let Some(dir) = &self.dir else { return Ok(()) };
+        dir.write(&EntryName::new(stage, dir.key(key), part), found)
     }
 }
 
-/// Returns the indices of the `of` shards that are not in `there`, as text.
-fn missing(there: &BTreeSet<usize>, of: usize) -> String {
-    ranges(&(1..=of).filter(|index| !there.contains(index)).collect::<Vec<_>>()).join(", ")
+/// Returns the indices of the `count` shards that are not in `stored`, as text.
+fn missing(stored: &BTreeSet<usize>, count: usize) -> String {
+    ranges(&(1..=count).filter(|index| !stored.contains(index)).collect::<Vec<_>>()).join(", ")
 }
 
 #[cfg(test)]

@@ -7,7 +7,7 @@ use std::str::FromStr;
 use crate::error::{Error, Result};
 
 /// Maximum number of shards of a stage. Each shard is a file, and all files of a stage may be open at once.
-pub(super) const MOST_PARTS: usize = 900;
+pub(super) const MAX_SHARDS: usize = 900;
 
 /// Result of a run that may have computed only one shard of the work.
 #[derive(Debug)]
@@ -33,37 +33,37 @@ impl<T> Completion<T> {
     }
 }
 
-/// Shard `index`, counted from 1, of `of` shards.
+/// Shard `index`, counted from 1, of `count` shards.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Shard {
     index: usize,
-    of: usize,
+    count: usize,
 }
 
 impl Shard {
     /// Shard 1 of 1: all the work.
-    pub(super) const WHOLE: Shard = Shard { index: 1, of: 1 };
+    pub(super) const WHOLE: Shard = Shard { index: 1, count: 1 };
 
-    /// Returns all shards of a division into `of`.
-    pub(super) fn all(of: usize) -> impl Iterator<Item = Shard> {
-        (1..=of).map(move |index| Shard { index, of })
+    /// Returns all shards of a division into `count`.
+    pub(super) fn all(count: usize) -> impl Iterator<Item = Shard> {
+        (1..=count).map(move |index| Shard { index, count })
     }
 
     /// Returns the index of the shard and the number of shards.
     pub(super) fn numbers(self) -> (usize, usize) {
-        (self.index, self.of)
+        (self.index, self.count)
     }
 
     /// Returns the range of `units` that belongs to this shard.
-    pub(super) fn of_units(self, units: usize) -> Range<usize> {
-        let end = |parts: usize| (units as u128 * parts as u128 / self.of as u128) as usize;
+    pub(super) fn unit_range(self, units: usize) -> Range<usize> {
+        let end = |shards: usize| (units as u128 * shards as u128 / self.count as u128) as usize;
         end(self.index - 1)..end(self.index)
     }
 }
 
 impl fmt::Display for Shard {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{}/{}", self.index, self.of)
+        write!(f, "{}/{}", self.index, self.count)
     }
 }
 
@@ -71,10 +71,10 @@ impl FromStr for Shard {
     type Err = String;
 
     fn from_str(text: &str) -> std::result::Result<Shard, String> {
-        let numbers = text.split_once('/').and_then(|(index, of)| Some((index.parse().ok()?, of.parse().ok()?)));
+        let numbers = text.split_once('/').and_then(|(index, count)| Some((index.parse().ok()?, count.parse().ok()?)));
         match numbers {
-            Some((index, of)) if (1..=of).contains(&index) && of <= MOST_PARTS => Ok(Shard { index, of }),
-            _ => Err(format!("expected i/n with 1 <= i <= n <= {MOST_PARTS}, such as 3/8")),
+            Some((index, count)) if (1..=count).contains(&index) && count <= MAX_SHARDS => Ok(Shard { index, count }),
+            _ => Err(format!("expected i/n with 1 <= i <= n <= {MAX_SHARDS}, such as 3/8")),
         }
     }
 }

@@ -20,22 +20,22 @@ static READ_BACK: AtomicU64 = AtomicU64::new(0);
 pub struct Spill {
     file: File,
     start: u64,
-    at: PathBuf,
+    path: PathBuf,
 }
 
 /// Writer of a [`Spill`].
 pub struct SpillWriter {
     writer: EntryWriter,
     /// Path for error messages: the file itself, or the folder of an unnamed file.
-    at: PathBuf,
+    path: PathBuf,
     /// Temporary file that is renamed when the spill is complete; `None` for an unnamed file.
     staged: Option<StagedFile>,
 }
 
 impl Spill {
     /// Returns the content of `file` from byte `start` on.
-    pub(super) fn from_file(file: File, start: u64, at: PathBuf) -> Spill {
-        Spill { file, start, at }
+    pub(super) fn from_file(file: File, start: u64, path: PathBuf) -> Spill {
+        Spill { file, start, path }
     }
 
     /// Reads `bytes.len()` bytes, beginning at byte `start` of the content.
@@ -44,7 +44,7 @@ impl Spill {
     /// Fails if a read fails or the content ends.
     pub fn read(&self, start: u64, bytes: &mut [u8]) -> Result<()> {
         READ_BACK.fetch_add(bytes.len() as u64, Ordering::Relaxed);
-        read_exact_at(&self.file, bytes, self.start + start).map_err(Error::io("read back values from", &self.at))
+        read_exact_at(&self.file, bytes, self.start + start).map_err(Error::io("read back values from", &self.path))
     }
 
     /// Reads the record that [`SpillWriter::write_record`] wrote at `start` into `bytes`. Returns the start of the next
@@ -75,7 +75,7 @@ impl SpillWriter {
     pub fn new(folder: &Path) -> Result<SpillWriter> {
         let file = tempfile::tempfile_in(folder).map_err(Error::io("create a scratch file in", folder))?;
         let writer = EntryWriter::new(file, 0, "").map_err(Error::io("write a scratch file in", folder))?;
-        Ok(SpillWriter { writer, at: folder.to_owned(), staged: None })
+        Ok(SpillWriter { writer, path: folder.to_owned(), staged: None })
     }
 
     /// Creates a file that gets the name `target` when it is complete.
@@ -84,11 +84,11 @@ impl SpillWriter {
         let file = File::options().read(true).write(true).create_new(true).open(staged.path());
         let file = file.map_err(Error::io("create", target))?;
         let writer = EntryWriter::new(file, key, about).map_err(Error::io("write", target))?;
-        Ok(SpillWriter { writer, at: target.to_owned(), staged: Some(staged) })
+        Ok(SpillWriter { writer, path: target.to_owned(), staged: Some(staged) })
     }
 
     /// Returns the action for error messages; a scratch file has no name that could be shown.
-    fn action(&self) -> &'static str {
+    fn write_action(&self) -> &'static str {
         if self.staged.is_some() { "write values to" } else { "write a scratch file in" }
     }
 
@@ -97,7 +97,7 @@ impl SpillWriter {
     /// # Errors
     /// Fails if the write fails.
     pub fn write(&mut self, bytes: &[u8]) -> Result<()> {
-        let failed = Error::io(self.action(), &self.at);
+        let failed = Error::io(self.write_action(), &self.path);
         self.writer.write_all(bytes).map_err(failed)
     }
 
@@ -114,7 +114,7 @@ impl SpillWriter {
     pub(super) fn write_value(&mut self, value: &impl Serialize) -> Result<()> {
         let Err(error) = postcard::to_io(value, &mut self.writer) else { return Ok(()) };
         let failed = self.writer.failed.take().unwrap_or_else(|| io::Error::other(error));
-        Err(Error::io(self.action(), &self.at)(failed))
+        Err(Error::io(self.write_action(), &self.path)(failed))
     }
 
     /// Completes the file and gives it its name, if it has one. The content can be read only then.
@@ -122,11 +122,11 @@ impl SpillWriter {
     /// # Errors
     /// Fails if a write fails.
     pub fn finish(self) -> Result<Spill> {
-        let action = self.action();
-        let SpillWriter { writer, at, staged } = self;
+        let write_action = self.write_action();
+        let SpillWriter { writer, path, staged } = self;
         let start = writer.start();
-        let file = writer.finish().map_err(Error::io(action, &at))?;
+        let file = writer.finish().map_err(Error::io(write_action, &path))?;
         staged.map_or(Ok(()), StagedFile::commit)?;
-        Ok(Spill { file, start, at })
+        Ok(Spill { file, start, path })
     }
 }

@@ -32,29 +32,29 @@ pub struct CubicTrack {
 
 impl CubicTrack {
     /// Returns the position at `time`.
-    pub fn place(&self, time: f64) -> [f64; 3] {
+    pub fn position_at(&self, time: f64) -> [f64; 3] {
         let dt = time - self.center;
         std::array::from_fn(|c| self.position.iter().rev().fold(0.0, |sum, row| sum * dt + row[c]))
     }
 
     /// Returns the opacity at `time`.
-    pub fn visible(&self, time: f64) -> f64 {
+    pub fn opacity_at(&self, time: f64) -> f64 {
         self.opacity * window(time, self.center, self.width)
     }
 }
 
 /// Maximum number of intervals between the centers of overlapping curves.
-const MOST: usize = 32;
+const MAX_INTERVALS: usize = 32;
 /// Maximum number of updates of the distributed optical depths.
-const UPDATES: usize = 60;
+const MAX_UPDATES: usize = 60;
 /// Change of the depths below which the updates stop.
-const SETTLED: f64 = 1e-3;
+const CONVERGED: f64 = 1e-3;
 /// Maximum opacity, so that the optical depth stays finite.
-const OPAQUE: f64 = 0.999;
+const MAX_OPACITY: f64 = 0.999;
 /// Ridge weight for coefficients that the frames do not determine.
 const RIDGE: f64 = 1e-6;
 /// Fraction of the weight below which a frame does not affect a curve.
-const LIGHT: f64 = 1e-3;
+const MIN_WEIGHT: f64 = 1e-3;
 
 /// Returns the curves of `track`: as few as meet `tolerance` at every visible frame, or the closest ones tried if none
 /// do. The error of the curves is added to `misfit`.
@@ -63,16 +63,16 @@ pub fn curved(track: &FittedTrack, tolerance: &Tolerance, misfit: &mut Misfit) -
     let last = (first..track.len()).rev().find(|&frame| track.is_seen(frame)).unwrap_or(first);
     let mut best: Option<(f64, Vec<CubicTrack>, Misfit)> = None;
     let mut attempt = |curves: Vec<CubicTrack>| {
-        let (excess, found) = misfit_of(track, &curves, tolerance);
+        let (excess, found) = measure_misfit(track, &curves, tolerance);
         if best.as_ref().is_none_or(|(least, _, _)| excess < *least) {
             best = Some((excess, curves, found));
         }
         excess <= 1.0
     };
-    let mut done = attempt(vec![endless(track)]) || attempt(vec![once(track)]);
+    let mut done = attempt(vec![constant_curve(track)]) || attempt(vec![single_window_curve(track)]);
     let mut count = 2;
-    while !done && count <= MOST.min((last - first + 1).max(2)) {
-        done = attempt(handing_over(track, [track.times[first], track.times[last]], count));
+    while !done && count <= MAX_INTERVALS.min((last - first + 1).max(2)) {
+        done = attempt(overlapping_curves(track, [track.times[first], track.times[last]], count));
         count *= 2;
     }
     let (_, curves, found) = best.unwrap_or_default();
@@ -85,20 +85,20 @@ fn window(time: f64, center: f64, width: f64) -> f64 {
 }
 
 fn depth(opacity: f64) -> f64 {
-    -(-opacity.clamp(0.0, OPAQUE)).ln_1p()
+    -(-opacity.clamp(0.0, MAX_OPACITY)).ln_1p()
 }
 
 /// Returns one curve of infinite width.
-fn endless(track: &FittedTrack) -> CubicTrack {
+fn constant_curve(track: &FittedTrack) -> CubicTrack {
     let center = track.times[0].midpoint(track.times[track.len() - 1]);
     let seen = (0..track.len()).filter(|&frame| track.is_seen(frame));
     let (sum, count) = seen.fold((0.0, 0.0), |(sum, count), frame| (sum + track.opacity[frame], count + 1.0));
-    let curve = moving(track, center, f64::INFINITY, |_| 1.0);
+    let curve = fit_motion(track, center, f64::INFINITY, |_| 1.0);
     CubicTrack { opacity: sum / f64::max(count, 1.0), ..curve }
 }
 
 /// Returns one curve whose window has the mean and the variance of the opacities.
-fn once(track: &FittedTrack) -> CubicTrack {
+fn single_window_curve(track: &FittedTrack) -> CubicTrack {
     let moment = |of: &dyn Fn(f64) -> f64| -> f64 {
         (0..track.len()).map(|frame| track.opacity[frame] * of(track.times[frame])).sum()
     };
@@ -114,28 +114,28 @@ fn once(track: &FittedTrack) -> CubicTrack {
         right += windows(frame) * track.opacity[frame];
         normal += windows(frame).powi(2);
     }
-    let curve = moving(track, center, width, |frame| window(track.times[frame], center, width));
-    CubicTrack { opacity: (right / normal.max(1e-300)).min(OPAQUE), ..curve }
+    let curve = fit_motion(track, center, width, |frame| window(track.times[frame], center, width));
+    CubicTrack { opacity: (right / normal.max(1e-300)).min(MAX_OPACITY), ..curve }
 }
 
 /// Returns `count` + 1 overlapping curves over the visible time between two instants.
-fn handing_over(track: &FittedTrack, [start, end]: [f64; 2], count: usize) -> Vec<CubicTrack> {
+fn overlapping_curves(track: &FittedTrack, [start, end]: [f64; 2], count: usize) -> Vec<CubicTrack> {
     let apart = ((end - start) / count as f64).max(1e-9);
     let width = 0.75 * apart;
     let centers: Vec<f64> = (0..=count).map(|k| start + k as f64 * apart).collect();
-    let wanted: Vec<f64> = track.opacity.iter().map(|&opacity| depth(opacity)).collect();
+    let target_depths: Vec<f64> = track.opacity.iter().map(|&opacity| depth(opacity)).collect();
     // For each curve the frames that affect it, with the value of its window.
     let shares: Vec<Vec<(usize, f64)>> = centers
         .iter()
         .map(|&center| {
             let share = |frame: usize| (frame, window(track.times[frame], center, width));
-            (0..track.len()).map(share).filter(|(_, share)| *share > LIGHT).collect()
+            (0..track.len()).map(share).filter(|(_, share)| *share > MIN_WEIGHT).collect()
         })
         .collect();
-    let most = wanted.iter().copied().fold(0.0, f64::max);
+    let most = target_depths.iter().copied().fold(0.0, f64::max);
     let mut depths = vec![most / 2.0; centers.len()];
     let mut shown = vec![0.0; track.len()];
-    for _ in 0..UPDATES {
+    for _ in 0..MAX_UPDATES {
         // Opacities, not depths, are multiplied by windows, so a curve adds the depth of its windowed opacity.
         shown.fill(0.0);
         for (shares, d) in shares.iter().zip(&depths) {
@@ -144,18 +144,19 @@ fn handing_over(track: &FittedTrack, [start, end]: [f64; 2], count: usize) -> Ve
         }
         let mut moved = 0.0f64;
         for (shares, depth) in shares.iter().zip(&mut depths) {
-            let ratio: f64 = shares.iter().map(|&(frame, share)| share * wanted[frame] / shown[frame].max(1e-9)).sum();
+            let ratio: f64 =
+                shares.iter().map(|&(frame, share)| share * target_depths[frame] / shown[frame].max(1e-9)).sum();
             let weight: f64 = shares.iter().map(|(_, share)| share).sum();
             let by = if weight > 0.0 { (ratio / weight).min(4.0) } else { 0.0 };
             moved = moved.max((by - 1.0).abs().min(*depth));
-            *depth = (*depth * by).min(self::depth(OPAQUE));
+            *depth = (*depth * by).min(self::depth(MAX_OPACITY));
         }
-        if moved < SETTLED {
+        if moved < CONVERGED {
             break;
         }
     }
     let curve = |(k, depth): (usize, f64)| {
-        let curve = moving(track, centers[k], width, |frame| window(track.times[frame], centers[k], width));
+        let curve = fit_motion(track, centers[k], width, |frame| window(track.times[frame], centers[k], width));
         CubicTrack { opacity: 1.0 - (-depth).exp(), ..curve }
     };
     depths.into_iter().enumerate().map(curve).collect()
@@ -163,19 +164,21 @@ fn handing_over(track: &FittedTrack, [start, end]: [f64; 2], count: usize) -> Ve
 
 /// Returns a curve that follows the position and rotation of `track`, by least squares with the given weights. The
 /// opacity is left at 0.
-fn moving(track: &FittedTrack, center: f64, width: f64, weight: impl Fn(usize) -> f64) -> CubicTrack {
+fn fit_motion(track: &FittedTrack, center: f64, width: f64, weight: impl Fn(usize) -> f64) -> CubicTrack {
     let weight = |frame: usize| if track.is_seen(frame) { weight(frame) * track.opacity[frame] } else { 0.0 };
-    let heavy: Vec<(usize, f64)> =
-        (0..track.len()).map(|frame| (frame, weight(frame))).filter(|(_, weight)| *weight > LIGHT * SEEN).collect();
-    let reach = heavy.iter().map(|&(frame, _)| (track.times[frame] - center).abs()).fold(1e-9, f64::max);
+    let samples: Vec<(usize, f64)> = (0..track.len())
+        .map(|frame| (frame, weight(frame)))
+        .filter(|(_, weight)| *weight > MIN_WEIGHT * SEEN)
+        .collect();
+    let reach = samples.iter().map(|&(frame, _)| (track.times[frame] - center).abs()).fold(1e-9, f64::max);
     let scaled = |frame: usize| (track.times[frame] - center) / reach;
     let position: [[f64; 3]; 4] =
-        polynomial(heavy.iter().map(|&(frame, weight)| (scaled(frame), track.position[frame], weight)), RIDGE);
+        polynomial(samples.iter().map(|&(frame, weight)| (scaled(frame), track.position[frame], weight)), RIDGE);
     let rotation: [[f64; 4]; 2] =
-        polynomial(heavy.iter().map(|&(frame, weight)| (scaled(frame), track.rotation[frame], weight)), RIDGE);
-    let whole: f64 = heavy.iter().map(|&(_, weight)| weight).sum();
+        polynomial(samples.iter().map(|&(frame, weight)| (scaled(frame), track.rotation[frame], weight)), RIDGE);
+    let whole: f64 = samples.iter().map(|&(_, weight)| weight).sum();
     let mean = |of: &dyn Fn(usize) -> f64| {
-        heavy.iter().map(|&(frame, weight)| weight * of(frame)).sum::<f64>() / whole.max(1e-300)
+        samples.iter().map(|&(frame, weight)| weight * of(frame)).sum::<f64>() / whole.max(1e-300)
     };
     let width_of_sh = track.sh(0).len();
     let unscaled = |k: usize| reach.powi(k as i32);
@@ -192,26 +195,26 @@ fn moving(track: &FittedTrack, center: f64, width: f64, weight: impl Fn(usize) -
 
 /// Returns the error of `curves`: the largest one in units of `tolerance`, and all errors together. Where several
 /// curves are visible, each must be close to the Gaussian, in proportion to its visibility.
-fn misfit_of(track: &FittedTrack, curves: &[CubicTrack], tolerance: &Tolerance) -> (f64, Misfit) {
+fn measure_misfit(track: &FittedTrack, curves: &[CubicTrack], tolerance: &Tolerance) -> (f64, Misfit) {
     let (mut worst, mut misfit) = (0.0f64, Misfit::default());
     for frame in 0..track.len() {
         let time = track.times[frame];
         let (mut shown, mut away) = (0.0, 0.0);
         for curve in curves {
-            let share = depth(curve.visible(time));
+            let share = depth(curve.opacity_at(time));
             shown += share;
-            if curve.visible(time) < SEEN {
+            if curve.opacity_at(time) < SEEN {
                 continue;
             }
             let dt = time - curve.center;
             let rotation = std::array::from_fn(|c| curve.rotation[0][c] + dt * curve.rotation[1][c]);
             let scale = (0..3).map(|c| (curve.log_scale[c] - track.log_scale[frame][c]).abs()).fold(0.0, f64::max);
             let sh = curve.sh.iter().zip(track.sh(frame)).map(|(a, b)| f64::from((a - b).abs())).fold(0.0, f64::max);
-            let distance = track.distance(frame, curve.place(time));
+            let distance = track.distance(frame, curve.position_at(time));
             away += share * distance;
             worst = [
                 distance / tolerance.position,
-                track.turned(frame, rotation) / tolerance.rotation,
+                track.rotation_error(frame, rotation) / tolerance.rotation,
                 scale / tolerance.log_scale,
                 sh / tolerance.sh,
             ]
@@ -264,7 +267,7 @@ mod tests {
         let wave = |t: f64| [(18.0 * t).sin(), 0.0, 0.0];
         let mut misfit = Misfit::default();
         let many = curved(&track(120, wave, |_| 0.6), &Tolerance::default(), &mut misfit);
-        assert!((4..=MOST + 1).contains(&many.len()), "{} curves", many.len());
+        assert!((4..=MAX_INTERVALS + 1).contains(&many.len()), "{} curves", many.len());
         assert!(misfit.opacity < 0.05 && misfit.rms() < 0.1, "{misfit:?}");
         let mut misfit = Misfit::default();
         let step =
@@ -277,7 +280,7 @@ mod tests {
         let mut misfit = Misfit::default();
         assert!(curved(&track(20, |_| [0.0; 3], |_| 1e-3), &Tolerance::default(), &mut misfit).is_empty());
         let still = curved(&track(1, |_| [1.0; 3], |_| 0.5), &Tolerance::default(), &mut misfit);
-        assert!(still.len() == 1 && still[0].place(0.0).iter().all(|x| (x - 1.0).abs() < 1e-9), "{still:?}");
+        assert!(still.len() == 1 && still[0].position_at(0.0).iter().all(|x| (x - 1.0).abs() < 1e-9), "{still:?}");
         let flash = track(30, |_| [0.0; 3], |t| if (t - 0.5).abs() < 1e-9 { 0.5 } else { 0.0 });
         assert!(!curved(&flash, &Tolerance::default(), &mut misfit).is_empty());
     }

@@ -32,40 +32,43 @@ pub struct LinearPiece {
 /// are frames. The error of the pieces is added to `misfit`.
 pub fn straight(track: &FittedTrack, tolerance: &Tolerance, misfit: &mut Misfit) -> Vec<LinearPiece> {
     let mut pieces = Vec::new();
-    cut(track, 0..track.len().next_power_of_two(), tolerance, &mut pieces);
+    add_pieces(track, 0..track.len().next_power_of_two(), tolerance, &mut pieces);
     for piece in &pieces {
         for frame in piece.frames.clone() {
-            misfit.add(track.distance(frame, place(piece, track.times[frame])), track.opacity[frame] - piece.opacity);
+            misfit.add(
+                track.distance(frame, position_at(piece, track.times[frame])),
+                track.opacity[frame] - piece.opacity,
+            );
         }
     }
     pieces
 }
 
 /// Adds the pieces of a span of 2ᵏ frames; the last frames of the span may not exist.
-fn cut(track: &FittedTrack, span: Range<usize>, tolerance: &Tolerance, pieces: &mut Vec<LinearPiece>) {
+fn add_pieces(track: &FittedTrack, span: Range<usize>, tolerance: &Tolerance, pieces: &mut Vec<LinearPiece>) {
     let frames = span.start..span.end.min(track.len());
     let seen = frames.clone().filter(|&frame| track.is_seen(frame)).count();
     if seen == 0 {
         return;
     }
     if seen == frames.len() {
-        let whole = piece(track, frames.clone());
-        if frames.len() == 1 || holds(track, &whole, tolerance) {
+        let whole = fit_piece(track, frames.clone());
+        if frames.len() == 1 || is_within(track, &whole, tolerance) {
             return pieces.push(whole);
         }
     }
     let middle = span.start.midpoint(span.end);
-    cut(track, span.start..middle, tolerance, pieces);
-    cut(track, middle..span.end, tolerance, pieces);
+    add_pieces(track, span.start..middle, tolerance, pieces);
+    add_pieces(track, middle..span.end, tolerance, pieces);
 }
 
 /// Returns the position of `piece` at `time`.
-fn place(piece: &LinearPiece, time: f64) -> [f64; 3] {
+fn position_at(piece: &LinearPiece, time: f64) -> [f64; 3] {
     std::array::from_fn(|c| piece.position[c] + piece.velocity[c] * (time - piece.at))
 }
 
 /// Returns the best piece for the given frames: least squares for positions, means for all other attributes.
-fn piece(track: &FittedTrack, frames: Range<usize>) -> LinearPiece {
+fn fit_piece(track: &FittedTrack, frames: Range<usize>) -> LinearPiece {
     let count = frames.len() as f64;
     let (first, last) = (track.times[frames.start], track.times[frames.end - 1]);
     let (at, half) = (first.midpoint(last), ((last - first) / 2.0).max(f64::MIN_POSITIVE));
@@ -89,11 +92,11 @@ fn piece(track: &FittedTrack, frames: Range<usize>) -> LinearPiece {
 }
 
 /// Returns whether `piece` is within `tolerance` at every one of its frames.
-fn holds(track: &FittedTrack, piece: &LinearPiece, tolerance: &Tolerance) -> bool {
+fn is_within(track: &FittedTrack, piece: &LinearPiece, tolerance: &Tolerance) -> bool {
     let near = |a: f64, b: f64, within: f64| (a - b).abs() <= within;
     piece.frames.clone().all(|frame| {
-        track.distance(frame, place(piece, track.times[frame])) <= tolerance.position
-            && track.turned(frame, piece.rotation) <= tolerance.rotation
+        track.distance(frame, position_at(piece, track.times[frame])) <= tolerance.position
+            && track.rotation_error(frame, piece.rotation) <= tolerance.rotation
             && near(track.opacity[frame], piece.opacity, tolerance.opacity)
             && (0..3).all(|c| near(track.log_scale[frame][c], piece.log_scale[c], tolerance.log_scale))
             && track.sh(frame).iter().zip(&piece.sh).all(|(a, b)| near(f64::from(*a), f64::from(*b), tolerance.sh))
@@ -157,7 +160,7 @@ mod tests {
             (*rotation, *scale) = ([angle.cos(), angle.sin(), 0.0, 0.0], [-3.0, -2.0, -4.0 + angle]);
         }
         let pieces = straight(&wild, &Tolerance::default(), &mut misfit);
-        assert!(pieces.iter().all(|piece| holds(&wild, piece, &Tolerance::default()) || piece.frames.len() == 1));
+        assert!(pieces.iter().all(|piece| is_within(&wild, piece, &Tolerance::default()) || piece.frames.len() == 1));
         assert!(pieces.windows(2).all(|pair| pair[0].frames.end == pair[1].frames.start));
         assert!(misfit.position <= 0.1 && misfit.opacity <= 0.02 && misfit.states == 200, "{misfit:?}");
     }

@@ -74,7 +74,7 @@ impl FittedTrack {
     }
 
     /// Returns the middle one of the three scales at `frame`, scene units; at least 1e-12.
-    pub fn size(&self, frame: usize) -> f64 {
+    pub fn middle_scale(&self, frame: usize) -> f64 {
         let mut scales = self.log_scale[frame];
         scales.sort_by(f64::total_cmp);
         scales[1].exp().max(1e-12)
@@ -83,12 +83,12 @@ impl FittedTrack {
     /// Returns the distance between `position` and the position at `frame`, in units of the middle scale.
     pub fn distance(&self, frame: usize, position: [f64; 3]) -> f64 {
         let apart = position.iter().zip(self.position[frame]).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt();
-        apart / self.size(frame)
+        apart / self.middle_scale(frame)
     }
 
     /// Returns the angle between the rotation at `frame` and `rotation`, radians. Returns 0 if no two log scales differ
     /// by 0.1 or more.
-    pub fn turned(&self, frame: usize, rotation: [f64; 4]) -> f64 {
+    pub fn rotation_error(&self, frame: usize, rotation: [f64; 4]) -> f64 {
         let scales = self.log_scale[frame];
         let [least, most] =
             [scales.iter().copied().fold(f64::MAX, f64::min), scales.iter().copied().fold(f64::MIN, f64::max)];

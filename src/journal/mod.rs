@@ -148,12 +148,12 @@ impl Journal {
         self.add(name, [0, gaussians], start, reads, 0);
     }
 
-    /// Records that `what` was omitted, with the reason `why`.
+    /// Adds an entry for the omitted work `what` with the reason `why`.
     pub fn leave_out(&mut self, what: impl Into<String>, why: impl Into<String>) {
         self.left_out.push(LeftOut { what: what.into(), why: why.into(), saved: None });
     }
 
-    /// Records that `what` was omitted, with the reason `why` and the saved cost.
+    /// Adds an entry for the omitted work `what` with the reason `why` and the saved cost.
     pub fn spare(&mut self, what: impl Into<String>, why: impl Into<String>, saved: Saved) {
         self.left_out.push(LeftOut { what: what.into(), why: why.into(), saved: Some(saved) });
     }

@@ -185,31 +185,38 @@ fn receive_measured(
         );
         scene.notes.push(note);
     }
-    let mut arrived = None;
-    if let Some(measuring) = measuring {
-        let complete = ScanPlan::new(&scan.recipe, &scene.source().info().times, &scene.schedule)?;
-        let found = match measuring.failed_assumption(&complete, &scene) {
-            None => {
-                let found = measuring.finish(&complete);
-                // The frames were measured with these Gaussians before they proved not to be finite.
-                match stages.measure.score.absent(&found.scanned.rows).is_empty() {
-                    true => Ok(found),
-                    false => Err("Gaussians with NaN or infinity are dropped from all frames"),
-                }
-            }
-            Some(why) => Err(why),
-        };
-        match found {
-            Ok(found) => arrived = Some(found),
-            Err(why) => {
-                let note = format!("statistics were taken from the packed frames, not as they arrived: {why}");
-                scene.notes.push(note);
-            }
-        }
-    }
+    let arrived = match measuring {
+        Some(measuring) => finish_measuring(measuring, &stages.measure, &mut scene)?,
+        None => None,
+    };
     let measured = arrived.as_ref().map(Measured::kinds).unwrap_or_default();
     send_forecast(&mut scene, &later, &stages, measured, options, journal)?;
     Ok((scene, stages, arrived))
+}
+
+/// Returns the statistics that were taken while the frames arrived. Returns `None` and adds a note to the scene if an
+/// assumption about the stream proved wrong.
+fn finish_measuring(measuring: Measuring<'_>, measure: &Measure, scene: &mut Scene) -> Result<Option<Measured>> {
+    let complete = ScanPlan::new(&measure.scan.recipe, &scene.source().info().times, &scene.schedule)?;
+    let found = match measuring.failed_assumption(&complete, scene) {
+        None => {
+            let found = measuring.finish(&complete);
+            // The frames were measured with these Gaussians before they proved not to be finite.
+            match measure.score.absent(&found.scanned.rows).is_empty() {
+                true => Ok(found),
+                false => Err("Gaussians with NaN or infinity are dropped from all frames"),
+            }
+        }
+        Some(why) => Err(why),
+    };
+    match found {
+        Ok(found) => Ok(Some(found)),
+        Err(why) => {
+            let note = format!("statistics were taken from the packed frames, not as they arrived: {why}");
+            scene.notes.push(note);
+            Ok(None)
+        }
+    }
 }
 
 /// Returns a virtual rig around the first of the held frames.

@@ -196,7 +196,7 @@ impl RunPlan {
         [phase_estimates(Phase::Rank), reduce, phase_estimates(Phase::Write)].concat()
     }
 
-    /// Returns whether the amount of work depends on results of stages, which makes time estimates imprecise.
+    /// Returns whether the amount of work depends on results of stages, which widens the range of time estimates.
     pub fn is_open_ended(&self) -> bool {
         self.search.is_some() || self.stages.is_open_ended()
     }
@@ -287,7 +287,7 @@ mod tests {
     use crate::recipe::Recipe;
     use crate::scene::InputOptions;
 
-    const OUTLOOK: InputMeta = InputMeta { gaussians: 1000, has_cameras: true, own_output: OutputKind::Gseq };
+    const INPUT: InputMeta = InputMeta { gaussians: 1000, has_cameras: true, own_output: OutputKind::Gseq };
 
     fn request(recipe: Recipe) -> Request {
         Request::new(InputOptions::default(), "out.gseq".into(), recipe)
@@ -298,23 +298,23 @@ mod tests {
     }
 
     /// Returns a function that estimates all stages of a compression with the recipe `preset`.
-    fn everything(preset: &str) -> impl Fn(&Workload, &Limits) -> Vec<ResourceEstimate> {
+    fn all_estimates(preset: &str) -> impl Fn(&Workload, &Limits) -> Vec<ResourceEstimate> {
         let recipe = Recipe::preset(preset).unwrap();
-        let plan = RunPlan::new(&request(recipe), OUTLOOK).unwrap();
+        let plan = RunPlan::new(&request(recipe), INPUT).unwrap();
         move |work, limits| plan.estimates(work, limits)
     }
 
     #[test]
-    fn every_plan_keeps_to_its_budget_down_to_the_least_and_no_further() {
+    fn plan_fits_every_budget_down_to_the_smallest() {
         for preset in ["default", "strong"] {
-            let least = Plan::closest(work(200_000), 1, everything(preset)).peak();
+            let least = Plan::closest(work(200_000), 1, all_estimates(preset)).peak();
             let mut before = 0;
             for bytes in [least, least + (8 << 20), 2 * least, 4 * least, 64 * least] {
-                let plan = Plan::fit(work(200_000), budget(bytes), &Events::IGNORED, everything(preset)).unwrap();
+                let plan = Plan::fit(work(200_000), budget(bytes), &Events::IGNORED, all_estimates(preset)).unwrap();
                 assert!((before..=bytes).contains(&plan.peak()), "{bytes}: {}", plan.text());
                 before = plan.peak();
             }
-            let message = Plan::fit(work(200_000), budget(least - 1), &Events::IGNORED, everything(preset))
+            let message = Plan::fit(work(200_000), budget(least - 1), &Events::IGNORED, all_estimates(preset))
                 .unwrap_err()
                 .to_string();
             assert!(message.contains(&format!("at least {}MiB", least.div_ceil(1 << 20))), "{message}");
@@ -322,12 +322,12 @@ mod tests {
     }
 
     #[test]
-    fn a_small_budget_leaves_out_time_then_bands_then_refining_and_names_what_there_would_have_to_be() {
+    fn small_budget_omits_time_then_sh_then_refinement() {
         let mut request = request(Recipe::preset("default").unwrap());
         let work = work(200_000);
         let mut within = |bytes: u64| {
             request.input.memory = budget(bytes);
-            let plan = RunPlan::within_memory(&request, OUTLOOK, &work).unwrap();
+            let plan = RunPlan::within_memory(&request, INPUT, &work).unwrap();
             let mut journal = Journal::default();
             plan.stages.record_left_out(&work, &Limits::NONE, &mut journal);
             let left_out =
@@ -347,17 +347,17 @@ mod tests {
             | MemoryFallback::WithoutRefinement { required_bytes } => required_bytes,
             MemoryFallback::Nothing => 0,
         };
-        let full_plan = Plan::closest(work, 1, everything("default")).peak();
-        assert_eq!(within(full_plan).0, MemoryFallback::Nothing);
-        let (spared, degree, named, none) = within(full_plan - 1);
+        let full_bytes = Plan::closest(work, 1, all_estimates("default")).peak();
+        assert_eq!(within(full_bytes).0, MemoryFallback::Nothing);
+        let (spared, degree, named, none) = within(full_bytes - 1);
         assert_eq!(
             (spared, degree, none),
-            (MemoryFallback::ConstantInTime { required_bytes: full_plan }, Some(ALL_HARMONICS), None)
+            (MemoryFallback::ConstantInTime { required_bytes: full_bytes }, Some(ALL_HARMONICS), None)
         );
-        assert!(named.unwrap().contains(&format!("{}MiB", full_plan.div_ceil(1 << 20))));
-        let (spared, ..) = (1..).map(|k| within(full_plan - k * (1 << 20))).find(|found| found.1 == Some(0)).unwrap();
+        assert!(named.unwrap().contains(&format!("{}MiB", full_bytes.div_ceil(1 << 20))));
+        let (spared, ..) = (1..).map(|k| within(full_bytes - k * (1 << 20))).find(|found| found.1 == Some(0)).unwrap();
         let all = least(spared);
-        assert!(matches!(spared, MemoryFallback::WithoutHarmonics { .. }) && all < full_plan, "{spared:?}");
+        assert!(matches!(spared, MemoryFallback::WithoutHarmonics { .. }) && all < full_bytes, "{spared:?}");
         assert!(matches!(within(all).0, MemoryFallback::ConstantInTime { .. }));
         let (spared, degree, named, none) = within(all - 1);
         assert_eq!((spared, degree, none), (MemoryFallback::WithoutHarmonics { required_bytes: all }, Some(0), None));
@@ -374,8 +374,8 @@ mod tests {
     }
 
     #[test]
-    fn ten_times_the_gaussians_take_ten_times_the_stated_bytes_and_ten_times_the_frames_next_to_nothing() {
-        let least = |work: Workload| Plan::closest(work, 1, everything("default"));
+    fn memory_is_linear_in_gaussians_and_constant_in_frames() {
+        let least = |work: Workload| Plan::closest(work, 1, all_estimates("default"));
         let peaks = [100_000, 1_000_000, 1_900_000].map(|count| least(work(count)).peak());
         let (first, second) = (peaks[1] - peaks[0], peaks[2] - peaks[1]);
         assert!(first.abs_diff(second) <= first / 1000, "not linear: {peaks:?}");
@@ -384,11 +384,11 @@ mod tests {
     }
 
     #[test]
-    fn what_a_recipe_does_not_do_takes_nothing_and_is_named() {
+    fn unused_stages_cost_nothing_and_are_named() {
         let mut recipe = Recipe::preset("paper").unwrap();
         recipe.merge.passes.clear();
         let request = request(recipe);
-        let plan = RunPlan::new(&request, OUTLOOK).unwrap();
+        let plan = RunPlan::new(&request, INPUT).unwrap();
         let needs = plan.estimates(&work(1000), &Limits::NONE);
         assert_eq!(needs.iter().map(|need| need.stage).collect::<Vec<_>>(), ["scan", "score", "emit"]);
         let mut journal = Journal::default();
@@ -398,11 +398,11 @@ mod tests {
     }
 
     #[test]
-    fn the_plan_says_how_many_gaussians_ranking_and_refinement_leave() {
+    fn plan_text_names_counts_of_ranking_and_refinement() {
         let counts = |recipe: Recipe, ratio: Option<f64>, goal: Option<Goal>| {
             let target = ratio.map(Target::Ratio);
             let request = Request { target, goal, ..request(recipe) };
-            let plan = RunPlan::new(&request, OUTLOOK).unwrap();
+            let plan = RunPlan::new(&request, INPUT).unwrap();
             let after = [plan.stages.counts.after_ranking(100, 1000), plan.stages.counts.before_refinement(100, 1000)];
             (after, plan.text())
         };

@@ -75,7 +75,7 @@ pub struct Request {
     pub output: PathBuf,
     /// Kind of output; `None`: determined by the output's name.
     pub kind: Option<OutputKind>,
-    /// All parameters of the method.
+    /// Recipe with the parameters of the method.
     pub recipe: Recipe,
     /// Digest of the input for which the recipe was written, if known. A different input causes a note.
     pub made_for: Option<String>,

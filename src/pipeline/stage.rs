@@ -112,7 +112,7 @@ pub struct Measured {
 }
 
 impl Measured {
-    /// Returns which kinds of statistics these are.
+    /// Returns the kinds of statistics that were taken.
     pub fn kinds(&self) -> MeasuredOnArrival {
         MeasuredOnArrival { scanned: true, seen: self.seen.is_some() }
     }
@@ -182,7 +182,7 @@ pub struct StageList {
     left_out: Vec<LeftOutStage>,
     /// Numbers of Gaussians that ranking and refinement leave.
     pub counts: CountPlan,
-    /// Whether the amount of work depends on results of stages, which makes time estimates imprecise.
+    /// Whether the amount of work depends on results of stages, which widens the range of time estimates.
     is_open_ended: bool,
 }
 
@@ -192,12 +192,12 @@ impl StageList {
         self.stages.push((phase, Box::new(stage)));
     }
 
-    /// Records that the run omits `what`, with the reason `why`.
+    /// Adds the omitted work `what` with the reason `why`.
     pub fn leave_out(&mut self, what: &'static str, why: impl Into<String>) {
         self.left_out.push(LeftOutStage { what, why: why.into(), estimate: None });
     }
 
-    /// Records that the run omits `what`, whose cost would be the result of `estimate`.
+    /// Adds the omitted stage `what` with the reason `why`; `estimate` returns its cost.
     pub fn leave_out_stage(
         &mut self,
         what: &'static str,
@@ -207,7 +207,7 @@ impl StageList {
         self.left_out.push(LeftOutStage { what, why: why.into(), estimate: Some(Box::new(estimate)) });
     }
 
-    /// Records that the amount of work depends on results of stages.
+    /// Marks the amount of work as dependent on results of stages.
     pub fn set_open_ended(&mut self) {
         self.is_open_ended = true;
     }

@@ -14,7 +14,7 @@ pub enum Effort {
 }
 
 /// Settings of an effort.
-struct Knobs {
+struct EffortSettings {
     look_pictures: usize,
     round_pictures: usize,
     round_turns: usize,
@@ -24,7 +24,7 @@ struct Knobs {
 }
 
 impl Effort {
-    /// All efforts, the fastest first.
+    /// Efforts in order, the fastest first.
     pub const ALL: [Effort; 3] = [Effort::Fast, Effort::Default, Effort::Best];
 
     /// Returns the name on the command line.
@@ -36,9 +36,9 @@ impl Effort {
         }
     }
 
-    fn knobs(self) -> Option<Knobs> {
+    fn settings(self) -> Option<EffortSettings> {
         match self {
-            Effort::Fast => Some(Knobs {
+            Effort::Fast => Some(EffortSettings {
                 look_pictures: 50,
                 round_pictures: 24,
                 round_turns: 3,
@@ -46,9 +46,13 @@ impl Effort {
                 steps: 1.0 / 3.0,
             }),
             Effort::Default => None,
-            Effort::Best => {
-                Some(Knobs { look_pictures: 400, round_pictures: 96, round_turns: 3, round_fraction: 0.95, steps: 3.0 })
-            }
+            Effort::Best => Some(EffortSettings {
+                look_pictures: 400,
+                round_pictures: 96,
+                round_turns: 3,
+                round_fraction: 0.95,
+                steps: 3.0,
+            }),
         }
     }
 }
@@ -57,21 +61,22 @@ impl Recipe {
     /// Returns this recipe at `effort`: with more or fewer scored views, rounds and optimization steps. Parts that the
     /// recipe does not use stay unused. A recipe that scores all views keeps scoring all.
     pub fn at_effort(&self, effort: Effort) -> Recipe {
-        let Some(knobs) = effort.knobs() else { return self.clone() };
-        let steps = knobs.steps * f64::from(self.refine.refine_steps);
+        let Some(settings) = effort.settings() else { return self.clone() };
+        let steps = settings.steps * f64::from(self.refine.refine_steps);
         let mut recipe = self.refining_by((steps.ceil() as u32).min(MOST_STEPS));
         // Never cross the recipe's own value in the wrong direction.
-        let less = knobs.steps < 1.0;
-        let moved = |own: usize, to: usize| if less { own.min(to) } else { own.max(to) };
+        let less = settings.steps < 1.0;
+        let limited = |own: usize, to: usize| if less { own.min(to) } else { own.max(to) };
         if recipe.scan.look_pictures > 0 {
-            recipe.scan.look_pictures = moved(recipe.scan.look_pictures, knobs.look_pictures);
+            recipe.scan.look_pictures = limited(recipe.scan.look_pictures, settings.look_pictures);
         }
         if recipe.select.round_fraction < 1.0 {
             let select = &mut recipe.select;
-            select.round_pictures = moved(select.round_pictures, knobs.round_pictures);
-            select.round_turns = select.round_turns.min(knobs.round_turns);
+            select.round_pictures = limited(select.round_pictures, settings.round_pictures);
+            select.round_turns = select.round_turns.min(settings.round_turns);
             let own = select.round_fraction;
-            select.round_fraction = if less { own.min(knobs.round_fraction) } else { own.max(knobs.round_fraction) };
+            select.round_fraction =
+                if less { own.min(settings.round_fraction) } else { own.max(settings.round_fraction) };
         }
         recipe
     }

@@ -39,7 +39,7 @@ const MOST_STEPS: u32 = 1_000_000;
 /// Maximum number of merge passes. Every pass reads all frames.
 const MOST_PASSES: usize = 16;
 
-/// All parameters of the method; `paper.toml` documents each of them.
+/// Parameters of the method; `paper.toml` documents each of them.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Recipe {

@@ -178,7 +178,7 @@ pub struct ShDegreeParams {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub enum WhichBands {
-    /// All SH degrees of the input.
+    /// SH degree of the input, unchanged.
     All,
     /// Lowest degree at which renders hardly change.
     Needed,

@@ -456,7 +456,7 @@ mod tests {
     }
 
     #[test]
-    fn places_follow_the_ids() {
+    fn indices_follow_the_ids() {
         assert_eq!(indices_in(&[2, 5, 9], &[1, 2, 3, 5, 9]), [1, 3, 4]);
         assert!(indices_in(&[], &[4]).is_empty());
     }

@@ -166,8 +166,8 @@ pub(crate) fn check_measurable(psnr: f64) -> Result<f64> {
 /// passes.
 ///
 /// # Errors
-/// Fails if the PSNR is more than [`MAX_SHORTFALL`] below the smaller of `asked` and [`ENOUGH_PSNR`]: then some values are so large
-/// that their grid cannot represent the others.
+/// Fails if the PSNR is more than [`MAX_SHORTFALL`] below the smaller of `asked` and [`ENOUGH_PSNR`]: then some values
+/// are so large that their grid cannot represent the others.
 pub(crate) fn check_met(quality_target: QualityTarget, asked: f64, found: f64) -> Result<()> {
     let is_met = matches!(quality_target, QualityTarget::Bytes(_)) || found >= asked.min(ENOUGH_PSNR) - MAX_SHORTFALL;
     match is_met {

@@ -102,8 +102,8 @@ impl ByteLimit {
         Some(ByteLimit { writer: Emit::from_planning(planning), most, field })
     }
 
-    /// Returns the numbers of Gaussians `ids` that fit for the SH degree of `template` and, if degrees may be dropped, for
-    /// every lower one, until all Gaussians fit. See [`ByteLimit::count`].
+    /// Returns the numbers of Gaussians `ids` that fit for the SH degree of `template` and, if degrees may be dropped,
+    /// for every lower one, until all Gaussians fit. See [`ByteLimit::count`].
     ///
     /// # Errors
     /// Fails where [`ByteLimit::count`] fails.
@@ -190,8 +190,8 @@ impl ByteLimit {
         })
     }
 
-    /// Removes the Gaussians of `compressed` with the lowest removal error until the result fits. This is needed because
-    /// refined values may compress worse than those by which the count was found. Protected Gaussians stay.
+    /// Removes the Gaussians of `compressed` with the lowest removal error until the result fits. This is needed
+    /// because refined values may compress worse than those by which the count was found. Protected Gaussians stay.
     ///
     /// # Errors
     /// Fails if the protected Gaussians alone do not fit, if frames cannot be read, or if a write fails. What is
