@@ -96,7 +96,7 @@ impl RunningContribution {
         )
     }
 
-    /// Returns C and W over all views added.
+    /// Returns the contributions C and peaks W over all views added.
     pub fn finish(self) -> VisibleContribution {
         let (pictures, pixel_stride) = (self.pictures, self.pixel_stride);
         VisibleContribution::new(&self.sum(), pictures, pixel_stride)

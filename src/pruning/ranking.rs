@@ -1,5 +1,5 @@
-//! A ranking of all Gaussians of which the selection is a prefix. A target count is met exactly by the same two stages
-//! with both thresholds moved together.
+//! A ranking of all Gaussians whose first entries are the selection. It meets any target count exactly: it corresponds to
+//! the same two stages with both thresholds moved together.
 
 use rayon::slice::ParallelSliceMut;
 use serde::{Deserialize, Serialize};

@@ -16,7 +16,7 @@ use crate::scene::Scene;
 /// Name of the stage.
 pub(crate) const NAME: &str = "visible";
 
-/// The stage that measures C from rendered views.
+/// The stage that measures the contribution C and its peak W from rendered views.
 #[derive(Debug, Clone)]
 pub struct Visible {
     /// Parameters of the scan, which include the strides and the maximum number of views.

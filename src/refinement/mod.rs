@@ -70,7 +70,7 @@ pub struct RefineStage {
     /// Maximum number of keyframes of the time-varying delta, for inputs with explicit frames; 0: no time-varying
     /// delta.
     pub knots: usize,
-    /// Target fraction of the Gaussians.
+    /// Target fraction of the Gaussians; `None`: no target was given.
     pub target: Option<f64>,
 }
 
