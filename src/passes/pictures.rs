@@ -244,7 +244,7 @@ impl<W: Send> Workers<W> {
         visit: impl Fn(&mut W, &Gaussians, &Camera) + Sync,
     ) -> Result<()> {
         let workers = rayon::current_num_threads().min(self.limits.pictures_together);
-        show([subject], cameras, pictures, Batch::to_look(&self.limits), |views| {
+        show([subject], cameras, pictures, Batch::many_views(&self.limits), |views| {
             let next = AtomicUsize::new(0);
             (0..workers.min(views.len())).into_par_iter().with_max_len(1).for_each(|_| {
                 let free = self.free.lock().unwrap_or_else(PoisonError::into_inner).pop();

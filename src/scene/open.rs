@@ -7,7 +7,7 @@ use glam::DVec3;
 use super::Scene;
 use super::input::{InputOptions, Opened, load_cameras};
 use super::pictures::no_picture;
-use super::stream::open_arriving;
+use super::stream::open_packed_stream;
 use crate::error::{Error, Result, ShowPath};
 use crate::files::cameras;
 use crate::files::cameras::{Clock, Times};
