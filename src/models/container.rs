@@ -69,7 +69,10 @@ impl InputModel for Container {
     }
 
     fn with_times(self: Box<Self>, _: Vec<f64>) -> Result<Box<dyn InputModel>> {
-        Err(Error::usage(format!("{}: a container says itself when its frames are", self.path().shown())))
+        Err(Error::usage(format!(
+            "{}: a container stores the times of its frames; no other times can be given",
+            self.path().shown()
+        )))
     }
 
     fn columns(&self) -> Result<Vec<ColumnInfo>> {

@@ -33,17 +33,20 @@ pub trait InputModel: Send + Sync {
 
     /// Returns a hash of the bytes read.
     ///
-    /// # Errors Fails if a file cannot be read.
+    /// # Errors
+    /// Fails if a file cannot be read.
     fn digest(&self) -> Result<String>;
 
     /// Returns the bytes of all files that a renderer opens; for a stream, the bytes received.
     ///
-    /// # Errors Fails if a file no longer exists.
+    /// # Errors
+    /// Fails if a file no longer exists.
     fn bytes(&self) -> Result<u64>;
 
     /// Returns [`InputModel::bytes`] divided by part.
     ///
-    /// # Errors Fails if a file no longer exists.
+    /// # Errors
+    /// Fails if a file no longer exists.
     fn size(&self) -> Result<Size> {
         Ok(Size::of_frames(self.bytes()?))
     }
@@ -51,7 +54,8 @@ pub trait InputModel: Send + Sync {
     /// Returns the bytes, by part, that [`InputModel::write`] wrote to `path` as `kind`. No other files may have been
     /// added yet.
     ///
-    /// # Errors Fails if a file no longer exists.
+    /// # Errors
+    /// Fails if a file no longer exists.
     fn size_written(&self, kind: OutputKind, path: &Path) -> Result<Size> {
         let _ = kind;
         Ok(Size::of_frames(bytes_below(path)?))
@@ -59,7 +63,8 @@ pub trait InputModel: Send + Sync {
 
     /// Returns the bytes of the files that frames are read from.
     ///
-    /// # Errors Fails if a file no longer exists.
+    /// # Errors
+    /// Fails if a file no longer exists.
     fn stored_bytes(&self) -> Result<u64> {
         self.bytes()
     }
@@ -85,8 +90,8 @@ pub trait InputModel: Send + Sync {
 
     /// Returns the input with frames at `times`. Inputs with [`Timing::Stamped`] refuse.
     ///
-    /// # Errors Fails if times are not finite or do not increase, or if their number differs from a fixed number of
-    /// frames.
+    /// # Errors
+    /// Fails if times are not finite or do not increase, or if their number differs from a fixed number of frames.
     fn with_times(self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn InputModel>>;
 
     /// Returns notes for the user, such as repairs or guesses made while opening.
@@ -123,7 +128,8 @@ pub trait InputModel: Send + Sync {
 
     /// Returns a description of each column of a container; empty for other inputs.
     ///
-    /// # Errors Fails if the index cannot be read.
+    /// # Errors
+    /// Fails if the index cannot be read.
     fn columns(&self) -> Result<Vec<ColumnInfo>> {
         Ok(Vec::new())
     }
@@ -135,7 +141,8 @@ pub trait InputModel: Send + Sync {
 
     /// Checks that this input can be written as `kind` to `path`.
     ///
-    /// # Errors Fails if it cannot; the message lists kinds that work.
+    /// # Errors
+    /// Fails if it cannot; the message lists kinds that work.
     fn check_output(&self, kind: OutputKind, path: &Path) -> Result<()> {
         match kind {
             OutputKind::Archive if self.archives_frames() => Ok(()),
@@ -146,7 +153,8 @@ pub trait InputModel: Send + Sync {
     /// Computes the raw parameters of the proxies of `clusters`, compared at `reference`. The default returns no
     /// proxies: without raw parameters, a proxy follows from its members in each frame.
     ///
-    /// # Errors Fails if frames cannot be read.
+    /// # Errors
+    /// Fails if frames cannot be read.
     fn solve(&self, clusters: &[Cluster], reference: Reference, rule: &MergeParams) -> Result<Proxies> {
         let _ = (clusters, reference, rule);
         Ok(Proxies::default())
@@ -154,7 +162,8 @@ pub trait InputModel: Send + Sync {
 
     /// Returns whether the model has a deformation field that can be written in half precision.
     ///
-    /// # Errors Fails if the field can no longer be read.
+    /// # Errors
+    /// Fails if the field can no longer be read.
     fn can_round_field(&self) -> Result<bool> {
         Ok(false)
     }
@@ -166,7 +175,8 @@ pub trait InputModel: Send + Sync {
 
     /// Returns the content of an archive of the compressed model `reduction`.
     ///
-    /// # Errors Fails if the input cannot be archived or its files cannot be read.
+    /// # Errors
+    /// Fails if the input cannot be archived or its files cannot be read.
     fn content(&self, reduction: &CompressedModel) -> Result<Content> {
         let _ = reduction;
         Err(Error::usage(NO_ARCHIVE))
@@ -175,7 +185,8 @@ pub trait InputModel: Send + Sync {
     /// Returns the frames that `content` decodes to, at the times of this input. `content` is an archive of this input
     /// or of a compressed model of it.
     ///
-    /// # Errors Fails if `content` belongs to another kind of input.
+    /// # Errors
+    /// Fails if `content` belongs to another kind of input.
     fn decode_frames<'a>(&'a self, content: &Content) -> Result<Box<dyn FrameSource + 'a>> {
         let _ = content;
         Err(Error::usage(NO_ARCHIVE))
@@ -199,7 +210,8 @@ pub trait InputModel: Send + Sync {
 
     /// Returns the frames of the compressed model `reduction`, as they will be after writing.
     ///
-    /// # Errors Fails if the deformation field cannot be evaluated.
+    /// # Errors
+    /// Fails if the deformation field cannot be evaluated.
     fn reduced<'a>(&'a self, reduction: &'a CompressedModel) -> Result<Box<dyn FrameSource + 'a>> {
         Ok(reduced_trajectories(self.source(), reduction))
     }
@@ -207,7 +219,8 @@ pub trait InputModel: Send + Sync {
     /// Writes the compressed model `reduction` to `path`, a new file or an empty folder, and returns notes for the
     /// user. Write buffers stay within `limits`. Progress is reported to `events`.
     ///
-    /// # Errors Fails if frames cannot be read or a write fails.
+    /// # Errors
+    /// Fails if frames cannot be read or a write fails.
     fn write(
         &self,
         reduction: &CompressedModel,
@@ -331,8 +344,8 @@ pub(super) struct FoundInput<'a> {
 impl FoundInput<'_> {
     /// Returns whether a file looks like one of `torch.save`: a ZIP archive that is not an `.npz` of NumPy.
     pub(super) fn is_checkpoint(&self) -> bool {
-        let of_numpy = self.path.extension().is_some_and(|found| found.eq_ignore_ascii_case("npz"));
-        !self.is_folder && self.head.starts_with(b"PK") && !of_numpy
+        let is_npz = self.path.extension().is_some_and(|found| found.eq_ignore_ascii_case("npz"));
+        !self.is_folder && self.head.starts_with(b"PK") && !is_npz
     }
 
     /// Returns whether a file begins with `magic` or has `extension`. The extension also catches files with damaged
@@ -417,7 +430,7 @@ impl OpenOptions {
     /// Refuses `--iteration` for an input that is not a model folder.
     pub(super) fn refuse_for(&self, path: &Path) -> Result<()> {
         match self.iteration {
-            Some(_) => Err(Error::usage(format!("{}: --iteration is for model folders", path.shown()))),
+            Some(_) => Err(Error::usage(format!("{}: --iteration applies to model folders only", path.shown()))),
             None => Ok(()),
         }
     }

@@ -7,8 +7,9 @@ use crate::error::{Error, Result};
 
 /// Returns the number K of each folder `iteration_K` in `within`, in increasing order.
 ///
-/// # Errors Fails if the folder cannot be listed.
-pub(super) fn numbers(within: &Path) -> Result<Vec<u32>> {
+/// # Errors
+/// Fails if the folder cannot be listed.
+pub(super) fn iteration_numbers(within: &Path) -> Result<Vec<u32>> {
     let entries = fs::read_dir(within).map_err(Error::io("open", within))?;
     let mut found = Vec::new();
     for entry in entries {
@@ -22,10 +23,10 @@ pub(super) fn numbers(within: &Path) -> Result<Vec<u32>> {
 
 /// Returns K and the path of the folder `iteration_K` in `within`: the requested K, or the largest.
 ///
-/// # Errors Fails if the folder cannot be listed or the requested iteration does not exist; the message lists those
-/// that do.
-pub(super) fn iteration(within: &Path, asked: Option<u32>) -> Result<(u32, PathBuf)> {
-    let found = numbers(within)?;
+/// # Errors
+/// Fails if the folder cannot be listed or the requested iteration does not exist; the message lists those that do.
+pub(super) fn find_iteration(within: &Path, asked: Option<u32>) -> Result<(u32, PathBuf)> {
+    let found = iteration_numbers(within)?;
     let chosen = asked.map_or(found.last().copied(), |k| found.contains(&k).then_some(k));
     let Some(k) = chosen else {
         let names: Vec<String> = found.iter().map(|k| format!("iteration_{k}")).collect();

@@ -72,7 +72,8 @@ pub fn trained_background(cameras: &Path) -> Option<[f32; 3]> {
 /// Opens the model, frames or container at `path`, recognized by its content. Formats that are continuous in time have
 /// no frames until [`InputModel::with_times`] is called.
 ///
-/// # Errors Fails if the path does not exist, has no known format, or holds a damaged file.
+/// # Errors
+/// Fails if the path does not exist, has no known format, or holds a damaged file.
 pub fn open(path: &Path, options: &OpenOptions) -> Result<Box<dyn InputModel>> {
     let is_folder = fs::metadata(path).map_err(Error::io("open", path))?.is_dir();
     let mut head = Vec::new();
@@ -99,18 +100,19 @@ fn refuse_inside_a_model(path: &Path) -> Result<()> {
     // A path such as `.` has no file name, so resolve it first.
     let Ok(real) = fs::canonicalize(path) else { return Ok(()) };
     let iteration = |folder: &Path| folder.file_name()?.to_str()?.strip_prefix("iteration_")?.parse::<u32>().ok();
-    let is_clouds = |folder: &Path| folder.file_name().is_some_and(|name| name == "point_cloud");
+    let is_point_cloud_folder = |folder: &Path| folder.file_name().is_some_and(|name| name == "point_cloud");
     // A PLY without deformation in such a folder is a model by itself.
-    let is_part = |folder: &Path| {
-        folder.join("deformation.pth").exists() || spacetime_gaussians::is_marked(&folder.join("point_cloud.ply"))
+    let is_deformed_model = |folder: &Path| {
+        folder.join("deformation.pth").exists()
+            || spacetime_gaussians::has_marker_property(&folder.join("point_cloud.ply"))
     };
-    let (below, number) = match (iteration(&real), real.parent()) {
-        (Some(number), Some(clouds)) if is_clouds(clouds) && is_part(&real) => (2, Some(number)),
-        _ if is_clouds(&real) => (1, None),
+    let (levels, number) = match (iteration(&real), real.parent()) {
+        (Some(number), Some(clouds)) if is_point_cloud_folder(clouds) && is_deformed_model(&real) => (2, Some(number)),
+        _ if is_point_cloud_folder(&real) => (1, None),
         _ => return Ok(()),
     };
-    let Some(root) = real.ancestors().nth(below).filter(|root| root.join("cfg_args").exists()) else { return Ok(()) };
+    let Some(root) = real.ancestors().nth(levels).filter(|root| root.join("cfg_args").exists()) else { return Ok(()) };
     let option = number.map_or_else(String::new, |number| format!(" --iteration {number}"));
-    Err(Error::input(path, "", "a model folder", "a folder inside of one")
+    Err(Error::input(path, "", "a model folder", "a folder inside a model folder")
         .hint(format!("give the folder above: {}{option}", root.shown())))
 }

@@ -49,14 +49,14 @@ pub(super) const FILE: ModelFormat = ModelFormat {
 fn open_frames(frames: PlyFrames, path: &Path, options: &OpenOptions) -> Result<Box<dyn InputModel>> {
     options.refuse_for(path)?;
     let order = match options.link {
-        _ if frames.paths().len() == 1 => FrameOrder::Believed,
-        link if link.is_asked() => FrameOrder::Lost("as asked".to_owned()),
-        Link::Auto => order(&frames)?,
-        _ => FrameOrder::Believed,
+        _ if frames.paths().len() == 1 => FrameOrder::Assumed,
+        link if link.is_asked() => FrameOrder::Lost("as requested".to_owned()),
+        Link::Auto => measure_order(&frames)?,
+        _ => FrameOrder::Assumed,
     };
     match order {
-        FrameOrder::Believed => Ok(Box::new(PlySequence::new(frames)?)),
-        FrameOrder::Kept(note) => Ok(Box::new(PlySequence::new(frames)?.with_note(note))),
+        FrameOrder::Assumed => Ok(Box::new(PlySequence::new(frames)?)),
+        FrameOrder::Confirmed(note) => Ok(Box::new(PlySequence::new(frames)?.with_note(note))),
         FrameOrder::Lost(why) => {
             Ok(Box::new(LinkedFrames::open(frames, path, &why, options.link.joins(), &options.ply())?))
         }
@@ -64,14 +64,14 @@ fn open_frames(frames: PlyFrames, path: &Path, options: &OpenOptions) -> Result<
 }
 
 /// Maximum number of pairs of frames whose order is measured.
-const MEASURED: usize = 5;
+const MAX_MEASURED_PAIRS: usize = 5;
 
 /// Whether the order of Gaussians in frames identifies them.
 enum FrameOrder {
     /// Order trusted without measurement.
-    Believed,
+    Assumed,
     /// Order that identifies Gaussians; the note gives the measured differences.
-    Kept(String),
+    Confirmed(String),
     /// Order that does not identify Gaussians, with the reason.
     Lost(String),
 }
@@ -80,15 +80,15 @@ enum FrameOrder {
 /// pairs of neighboring frames.
 ///
 /// Frames with different numbers of Gaussians have no common order.
-fn order(frames: &PlyFrames) -> Result<FrameOrder> {
+fn measure_order(frames: &PlyFrames) -> Result<FrameOrder> {
     if let Some(other) = frames.other_count() {
         let (counts, name) = (frames.counts(), shown_name(&frames.paths()[other]));
-        return Ok(FrameOrder::Lost(format!("{name} has {} Gaussians, the first {}", counts[other], counts[0])));
+        return Ok(FrameOrder::Lost(format!("{name} has {} Gaussians, the first frame {}", counts[other], counts[0])));
     }
     let pairs = frames.paths().len() - 1;
     let mut found = Vec::new();
-    for k in 0..pairs.min(MEASURED) {
-        let first = k * pairs / pairs.min(MEASURED);
+    for k in 0..pairs.min(MAX_MEASURED_PAIRS) {
+        let first = k * pairs / pairs.min(MAX_MEASURED_PAIRS);
         let state = |frame: usize| -> Result<Gaussians> {
             let mut state = Gaussians::zeros(0, frames.sh_degree());
             frames.frame(frame)?.gaussians(0..frames.counts()[frame] as usize, Columns::all(), &mut state)?;
@@ -101,16 +101,17 @@ fn order(frames: &PlyFrames) -> Result<FrameOrder> {
     let Some(OrderDifference { moved, apart, unlike, strangers, .. }) =
         found.iter().find(|found| found.holds != is_lost)
     else {
-        return Ok(FrameOrder::Believed);
+        return Ok(FrameOrder::Assumed);
     };
-    let apart = format!("({moved:.1} sizes, {apart:.1})");
+    let apart = format!("({moved:.1} vs. {apart:.1} sizes)");
     Ok(match is_lost {
         true => FrameOrder::Lost(format!(
-            "those of the same place are as far apart as strangers {apart} or look as different ({unlike:.2}, {strangers:.2})"
+            "Gaussians of the same index are as far apart as unrelated ones {apart} or as different in appearance \
+             ({unlike:.2} vs. {strangers:.2})"
         )),
-        false => FrameOrder::Kept(format!(
-            "frames are in one order: those of the same place are nearer than strangers {apart} and look more alike \
-             ({unlike:.2}, {strangers:.2})"
+        false => FrameOrder::Confirmed(format!(
+            "frames have a common order: Gaussians of the same index are nearer than unrelated ones {apart} and more \
+             alike in appearance ({unlike:.2} vs. {strangers:.2})"
         )),
     })
 }

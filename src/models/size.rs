@@ -66,10 +66,13 @@ impl Size {
     pub fn why_larger_than(&self, before: &Size) -> Option<String> {
         let (after, whole) = (self.whole(), before.whole());
         let why = match (self.frames > 0, before.frames > 0) {
-            (true, false) => "it holds the states of every frame, the input what all frames follow from",
-            _ => "the input holds its values in fewer bytes than this kind of result does",
+            (true, false) => {
+                "it holds the states of every frame, while the input holds parameters from which all \
+                              frames are computed"
+            }
+            _ => "the input stores its values in fewer bytes than this output format",
         };
-        (after > whole).then(|| format!("the result is larger than its input, {after} bytes of {whole}: {why}"))
+        (after > whole).then(|| format!("the result is larger than its input, {after} bytes instead of {whole}: {why}"))
     }
 }
 
@@ -98,7 +101,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_bytes_of_a_folder_are_those_of_all_its_files() {
+    fn folder_size_is_the_sum_of_its_files() {
         let folder = tempfile::tempdir().unwrap();
         fs::create_dir(folder.path().join("a")).unwrap();
         fs::write(folder.path().join("a/b"), [0; 7]).unwrap();
@@ -108,7 +111,7 @@ mod tests {
     }
 
     #[test]
-    fn parts_are_compared_with_parts_of_their_own_kind() {
+    fn each_part_is_compared_with_its_counterpart() {
         let model = Size { cloud: 1000, field: 4000, rest: 10, ..Size::default() };
         let small = Size { cloud: 100, field: 2000, rest: 10, ..Size::default() };
         assert_eq!(small.whole(), 2110);
@@ -124,11 +127,11 @@ mod tests {
     }
 
     #[test]
-    fn only_what_is_larger_has_a_reason_and_it_is_that_of_its_parts() {
+    fn only_larger_results_are_explained() {
         let model = Size { cloud: 1000, field: 4000, ..Size::default() };
         assert_eq!(Size::of_frames(5000).why_larger_than(&model), None);
         let why = Size::of_frames(5001).why_larger_than(&model).unwrap();
-        assert!(why.contains("5001 bytes of 5000") && why.contains("every frame"), "{why}");
+        assert!(why.contains("5001 bytes instead of 5000") && why.contains("every frame"), "{why}");
         let why = Size::of_frames(3).why_larger_than(&Size::of_frames(2)).unwrap();
         assert!(why.contains("fewer bytes"), "{why}");
     }

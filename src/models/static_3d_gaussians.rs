@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 
 use super::files::copy;
 use super::four_d_gaussians::cfg_args;
-use super::iterations::iteration;
+use super::iterations::find_iteration;
 use super::size::{Size, bytes_below, bytes_of};
 use crate::archive::Content;
 use crate::compressed_model::CompressedModel;
@@ -21,60 +21,62 @@ use crate::progress::Events;
 use crate::source::FrameSource;
 
 /// Name of the folder of iterations.
-const CLOUDS: &str = "point_cloud";
+const POINT_CLOUD_FOLDER: &str = "point_cloud";
 /// Name of the point cloud file in an iteration folder.
-const CLOUD: &str = "point_cloud.ply";
+const POINT_CLOUD_FILE: &str = "point_cloud.ply";
 
 /// Model folder with a point cloud file and no deformation field.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
     expected: "a 3D Gaussian Splatting model folder",
     recognizes: |found| {
-        let is_whole = |folder: &Path| folder.join(CLOUD).is_file() && !folder.join("deformation.pth").exists();
-        let whole = iteration(&found.path.join(CLOUDS), None).is_ok_and(|(_, folder)| is_whole(&folder));
-        found.is_folder && whole && !deforms(found.path)
+        let is_static =
+            |folder: &Path| folder.join(POINT_CLOUD_FILE).is_file() && !folder.join("deformation.pth").exists();
+        let is_static_model =
+            find_iteration(&found.path.join(POINT_CLOUD_FOLDER), None).is_ok_and(|(_, folder)| is_static(&folder));
+        found.is_folder && is_static_model && !has_deformation(found.path)
     },
-    open: |path, options| Ok(Box::new(Static::open(path, options)?)),
+    open: |path, options| Ok(Box::new(StaticModel::open(path, options)?)),
 };
 
 /// Returns whether a model folder says that its Gaussians are deformed, even if the deformation file is missing.
-fn deforms(root: &Path) -> bool {
+fn has_deformation(root: &Path) -> bool {
     let arguments = cfg_args::read(&root.join("cfg_args")).unwrap_or_default();
     root.join("deform").exists() || ["kplanes_config", "defor_depth"].iter().any(|name| arguments.contains(name))
 }
 
 /// Files of the model folder that are copied to the output.
-const BESIDE: [&str; 2] = ["cfg_args", "cameras.json"];
+const COPIED_FILES: [&str; 2] = ["cfg_args", "cameras.json"];
 
 /// Open model folder of 3DGS.
-struct Static {
+struct StaticModel {
     root: PathBuf,
     iteration: u32,
     cloud: PlySequence,
 }
 
-impl Static {
+impl StaticModel {
     /// Opens the requested iteration of the model folder `root`, or the largest.
-    fn open(root: &Path, options: &OpenOptions) -> Result<Static> {
-        let (iteration, folder) = iteration(&root.join(CLOUDS), options.iteration)?;
-        Ok(Static {
+    fn open(root: &Path, options: &OpenOptions) -> Result<StaticModel> {
+        let (iteration, folder) = find_iteration(&root.join(POINT_CLOUD_FOLDER), options.iteration)?;
+        Ok(StaticModel {
             root: root.to_owned(),
             iteration,
-            cloud: PlySequence::single(&folder.join(CLOUD), &options.ply())?,
+            cloud: PlySequence::single(&folder.join(POINT_CLOUD_FILE), &options.ply())?,
         })
     }
 
     /// Returns the paths of existing files that are copied to the output.
-    fn beside(&self) -> impl Iterator<Item = PathBuf> {
-        BESIDE.iter().map(|name| self.root.join(name)).filter(|path| path.is_file())
+    fn copied_files(&self) -> impl Iterator<Item = PathBuf> {
+        COPIED_FILES.iter().map(|name| self.root.join(name)).filter(|path| path.is_file())
     }
 
     /// Returns the path of the point cloud file in a model folder `root`.
-    fn cloud_in(&self, root: &Path) -> PathBuf {
-        root.join(CLOUDS).join(format!("iteration_{}", self.iteration)).join(CLOUD)
+    fn cloud_path(&self, root: &Path) -> PathBuf {
+        root.join(POINT_CLOUD_FOLDER).join(format!("iteration_{}", self.iteration)).join(POINT_CLOUD_FILE)
     }
 }
 
-impl InputModel for Static {
+impl InputModel for StaticModel {
     fn kind(&self) -> &'static str {
         "3D Gaussian Splatting model"
     }
@@ -92,7 +94,7 @@ impl InputModel for Static {
     }
 
     fn size(&self) -> Result<Size> {
-        let rest = self.beside().collect::<Vec<_>>();
+        let rest = self.copied_files().collect::<Vec<_>>();
         let (cloud, rest) = (InputModel::bytes(&self.cloud)?, bytes_of(rest.iter().map(PathBuf::as_path))?);
         Ok(Size { cloud, rest, ..Size::default() })
     }
@@ -100,7 +102,7 @@ impl InputModel for Static {
     fn size_written(&self, kind: OutputKind, path: &Path) -> Result<Size> {
         match kind {
             OutputKind::Model => {
-                let cloud = bytes_of([&*self.cloud_in(path)])?;
+                let cloud = bytes_of([&*self.cloud_path(path)])?;
                 Ok(Size { cloud, rest: bytes_below(path)?.saturating_sub(cloud), ..Size::default() })
             }
             _ => self.cloud.size_written(kind, path),
@@ -116,7 +118,7 @@ impl InputModel for Static {
     }
 
     fn with_times(self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn InputModel>> {
-        Ok(Box::new(Static { cloud: self.cloud.with_times(times)?, ..*self }))
+        Ok(Box::new(StaticModel { cloud: self.cloud.with_times(times)?, ..*self }))
     }
 
     fn own_output(&self) -> OutputKind {
@@ -131,7 +133,7 @@ impl InputModel for Static {
     }
 
     fn needs_all_bands(&self) -> Option<&'static str> {
-        self.root.join("cfg_args").exists().then_some("cfg_args says how many there are")
+        self.root.join("cfg_args").exists().then_some("cfg_args fixes the SH degree")
     }
 
     fn content(&self, reduction: &CompressedModel) -> Result<Content> {
@@ -157,10 +159,10 @@ impl InputModel for Static {
         if kind != OutputKind::Model {
             return self.cloud.write(reduction, kind, path, limits, events);
         }
-        let to = self.cloud_in(path);
+        let to = self.cloud_path(path);
         let folder = to.parent().unwrap_or(path);
         fs::create_dir_all(folder).map_err(Error::io("create", folder))?;
-        for file in self.beside() {
+        for file in self.copied_files() {
             copy(&file, &path.join(file.file_name().unwrap_or_default()))?;
         }
         self.cloud.write(reduction, OutputKind::Ply, &to, limits, events)
@@ -177,7 +179,7 @@ mod tests {
     use crate::recipe::Recipe;
 
     #[test]
-    fn a_folder_without_a_field_is_a_static_model_and_is_written_as_one() {
+    fn folder_without_a_field_is_read_and_written_as_static() {
         let folder = tempfile::tempdir().unwrap();
         let root = folder.path().join("model");
         for k in [7000, 30_000] {

@@ -44,7 +44,8 @@ pub struct Streamed {
 impl Streamed {
     /// Packs a stream into a scratch file in `folder`. Calls `take` with the frames of each frame block, in order.
     ///
-    /// # Errors Fails if the stream is damaged or a write fails.
+    /// # Errors
+    /// Fails if the stream is damaged or a write fails.
     pub fn receive(
         stream: FrameStream<impl Read + Send + 'static>,
         folder: &Path,
@@ -100,7 +101,7 @@ impl InputModel for Streamed {
     }
 
     fn with_times(self: Box<Self>, _: Vec<f64>) -> Result<Box<dyn InputModel>> {
-        Err(Error::usage("a frame stream says itself when its frames are"))
+        Err(Error::usage("a frame stream contains the times of its frames; no other times can be given"))
     }
 }
 
@@ -118,7 +119,7 @@ pub fn pack_stream(
     let mut writer = ContainerWriter::create(path, count, sh_degree, block, packing, BTreeMap::new())?;
     let mut held = HeldFrames::new(count, sh_degree, varying, stream.take_constant());
     let progress = events.counting_task("receive", "frames");
-    let mut put = |held: &mut HeldFrames| -> Result<Vec<Gaussians>> {
+    let mut flush = |held: &mut HeldFrames| -> Result<Vec<Gaussians>> {
         writer.append(held, 0..held.len(), |_| ())?;
         take(held)?;
         Ok(held.drain().collect())
@@ -147,13 +148,13 @@ pub fn pack_stream(
         held.push(time, state);
         progress.advance(1);
         if held.len() == block {
-            for state in put(&mut held)? {
+            for state in flush(&mut held)? {
                 let _ = to_fill.send(state);
             }
         }
     }
     if !held.is_empty() {
-        put(&mut held)?;
+        flush(&mut held)?;
     }
     writer.finish()?;
     reader.join().map_err(|_| Error::internal("the thread that reads standard input failed"))

@@ -23,18 +23,18 @@ use crate::progress::Events;
 use crate::source::{FrameSource, ReadPlan};
 
 /// zstd level of output containers. Higher levels gain about 1% on trained models.
-const LEVEL: i32 = 1;
+const ZSTD_LEVEL: i32 = 1;
 
 /// Default kind of output of explicit trajectories.
 pub const OWN_OUTPUT: OutputKind = OutputKind::PlySequence;
 
 /// Message for inputs that cannot be written as an archive.
-pub(super) const NO_ARCHIVE: &str = "only a 4DGaussians or 3DGS model, a PLY, or frames can be written as an archive\n  \
-                                     pack it into a .gseq first, or write one";
+pub(super) const NO_ARCHIVE: &str = "only a 4DGaussians or 3DGS model, a PLY, or frames can be written as an \
+                                     archive\n  write a .gseq instead, or pack the input into a .gseq first";
 
-/// Returns the bytes of the columns `of` of one Gaussian at one frame.
-pub fn state_bytes(sh_degree: usize, of: Columns) -> u64 {
-    of.iter().map(|column| 4 * column.width(sh_degree) as u64).sum()
+/// Returns the bytes of the `columns` of one Gaussian at one frame.
+pub fn state_bytes(sh_degree: usize, columns: Columns) -> u64 {
+    columns.iter().map(|column| 4 * column.width(sh_degree) as u64).sum()
 }
 
 /// Returns the frames of `source` with Gaussians removed and merged as `reduction` says.
@@ -84,20 +84,20 @@ pub(super) fn write_trajectories(
 }
 
 /// Writes a container with proxies, whose members can be anywhere in the source. Works by frame block and by groups of
-/// Gaussians made of about `most` source Gaussians.
+/// Gaussians made of about `max_gaussians` source Gaussians.
 fn write_merged(
     source: &dyn FrameSource,
     reduction: &CompressedModel,
     path: &Path,
-    most: usize,
+    max_gaussians: usize,
     events: &Events,
 ) -> Result<()> {
     let merged = merged(source, reduction);
     let SequenceInfo { count, times, sh_degree, varying } = merged.info();
-    let (compression, left) = (Compression::Zstd(LEVEL), reduction.sh_degree.min(*sh_degree));
+    let (compression, left) = (Compression::Zstd(ZSTD_LEVEL), reduction.sh_degree.min(*sh_degree));
     let mut writer = ContainerWriter::create(path, *count, left, FRAME_BLOCK, compression, BTreeMap::new())?;
     let progress = events.task("emit", "states", (count * times.len()) as u64);
-    let parts = parts(&merged, most);
+    let parts = block_ranges(&merged, max_gaussians);
     for start in (0..times.len()).step_by(FRAME_BLOCK) {
         let of_block = start..times.len().min(start + FRAME_BLOCK);
         writer.begin(&times[of_block.clone()])?;
@@ -125,19 +125,19 @@ fn write_merged(
     writer.finish()
 }
 
-/// Divides the Gaussians of `merged` into ranges of whole blocks. Each range is made of at most `most` Gaussians of the
+/// Divides the Gaussians of `merged` into ranges of whole blocks. Each range is made of at most `max_gaussians` Gaussians of the
 /// source, or is a single block.
-fn parts(merged: &MergedSequence<'_>, most: usize) -> Vec<Range<usize>> {
+fn block_ranges(merged: &MergedSequence<'_>, max_gaussians: usize) -> Vec<Range<usize>> {
     let count = merged.info().count;
-    let (mut parts, mut start, mut made_of) = (Vec::new(), 0, 0);
+    let (mut parts, mut start, mut source_gaussians) = (Vec::new(), 0, 0);
     for block in (0..count).step_by(GAUSSIAN_BLOCK) {
-        let of_block = block..count.min(block + GAUSSIAN_BLOCK);
-        let members: usize = of_block.map(|place| merged.members(place)).sum();
-        if made_of > 0 && made_of + members > most {
+        let places = block..count.min(block + GAUSSIAN_BLOCK);
+        let members: usize = places.map(|place| merged.members(place)).sum();
+        if source_gaussians > 0 && source_gaussians + members > max_gaussians {
             parts.push(start..block);
-            (start, made_of) = (block, 0);
+            (start, source_gaussians) = (block, 0);
         }
-        made_of += members;
+        source_gaussians += members;
     }
     parts.push(start..count);
     parts
@@ -146,7 +146,8 @@ fn parts(merged: &MergedSequence<'_>, most: usize) -> Vec<Range<usize>> {
 /// Writes every frame of `source` as a kind of output that consists of frames, and returns notes for the user. Readers
 /// of whole frames keep at most `held` of the frames that are decoded together.
 ///
-/// # Errors Fails if frames cannot be read or a write fails.
+/// # Errors
+/// Fails if frames cannot be read or a write fails.
 pub fn write_sequence(
     source: &dyn FrameSource,
     kind: OutputKind,
@@ -160,11 +161,11 @@ pub fn write_sequence(
         OutputKind::FourDgs => return Ok(vec![write_four_dgs(source, path, events)?]),
         OutputKind::Spz => {
             let off = write_spz(&gather_all(source, 0, Columns::all())?, path)?;
-            return Ok(vec![format!("positions are {off:.2e} scene units off at most")]);
+            return Ok(vec![format!("maximum position error: {off:.2e} scene units")]);
         }
         OutputKind::Gseq => {
             let progress = events.task("emit", "states", info.count as u64 * info.times.len() as u64);
-            let compression = Compression::Zstd(LEVEL);
+            let compression = Compression::Zstd(ZSTD_LEVEL);
             write_container(source, path, compression, BTreeMap::new(), |done| progress.advance(done))?;
             return Ok(Vec::new());
         }

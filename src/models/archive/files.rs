@@ -22,11 +22,12 @@ pub(crate) const ITERATION: &str = "iteration";
 /// Adds to `content` everything of the PLY `template` that is not an attribute: the extra properties of `rows`, and the
 /// bytes before and after the rows.
 ///
-/// # Errors Fails if the template was cut short since it was opened, or needs more memory than allowed.
+/// # Errors
+/// Fails if the template was cut short since it was opened, or needs more memory than allowed.
 pub(crate) fn add_cloud(content: &mut Content, template: &Ply, rows: impl Iterator<Item = u32>) -> Result<()> {
     template.check_unshrunk()?;
     let [lead, tail] = template.bytes_around();
-    let what = "what the archive keeps beside the attributes of Gaussians";
+    let what = "the data that the archive keeps beside the attributes of Gaussians";
     let bytes = lead + tail + bytes_beside(template) * content.cloud.len();
     // Counted twice: the content and the archive encoded from it.
     template.memory().check(template.path(), "element vertex", what, 2 * bytes as u64)?;

@@ -38,7 +38,8 @@ pub(super) const ENTRY: ModelFormat = ModelFormat {
 
 /// Reads an archive and returns its content and its bytes by part.
 ///
-/// # Errors Fails if the archive is damaged or needs more than `memory`.
+/// # Errors
+/// Fails if the archive is damaged or needs more than `memory`.
 pub fn read_archive(path: &Path, memory: ReadLimit) -> Result<(Content, ArchiveSize)> {
     archive::decode(&load(path, memory)?, path, memory)
 }
@@ -47,20 +48,21 @@ pub fn read_archive(path: &Path, memory: ReadLimit) -> Result<(Content, ArchiveS
 fn load(path: &Path, memory: ReadLimit) -> Result<Vec<u8>> {
     let failed = |error| Error::io("read", path)(error);
     let mut file = open_file(path)?;
-    let whole = file.metadata().map_err(failed)?.len();
+    let length = file.metadata().map_err(failed)?.len();
     let mut bytes = Vec::new();
     file.by_ref().take(archive::HEAD as u64).read_to_end(&mut bytes).map_err(failed)?;
-    archive::check_head(&bytes, whole, path, memory)?;
+    archive::check_head(&bytes, length, path, memory)?;
     // `check_head` compared the length of the file with the head, so the length is safe to allocate.
-    bytes.reserve_exact((whole - bytes.len() as u64) as usize);
-    file.take(whole - bytes.len() as u64).read_to_end(&mut bytes).map_err(failed)?;
+    bytes.reserve_exact((length - bytes.len() as u64) as usize);
+    file.take(length - bytes.len() as u64).read_to_end(&mut bytes).map_err(failed)?;
     Ok(bytes)
 }
 
 /// Writes the content of an archive read from `path` as the original files: a model folder into `to`, or a single PLY
 /// to the new file `to`.
 ///
-/// # Errors Fails if the content is not a complete model or a write fails.
+/// # Errors
+/// Fails if the content is not a complete model or a write fails.
 pub fn unpack(content: &Content, path: &Path, to: &Path) -> Result<()> {
     let Some(cfg_args) = content.files.get(CFG_ARGS) else { return write_cloud(content, path, to) };
     let number = content.files.get(ITERATION).and_then(|text| std::str::from_utf8(text).ok()?.parse::<u32>().ok());

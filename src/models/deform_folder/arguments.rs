@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use crate::error::Result;
 use crate::files::python_literal::{Argument, Literal, parse_call};
-use crate::models::four_d_gaussians::cfg_args::{ConfigKey, NAME, read};
+use crate::models::four_d_gaussians::cfg_args::{CALL_NAME, ConfigKey, read};
 
 /// Keys of a `cfg_args` file and their values.
 #[derive(Debug)]
@@ -16,10 +16,11 @@ pub(in crate::models) struct Arguments {
 impl Arguments {
     /// Reads the file at `path`.
     ///
-    /// # Errors Fails if the file cannot be read or its text is not a `Namespace(…)`.
+    /// # Errors
+    /// Fails if the file cannot be read or its text is not a `Namespace(…)`.
     pub(in crate::models) fn read(path: &Path) -> Result<Arguments> {
         let text = read(path)?;
-        let keys = parse_call(&text, NAME).map_err(|error| error.in_file(path, &text))?;
+        let keys = parse_call(&text, CALL_NAME).map_err(|error| error.in_file(path, &text))?;
         Ok(Arguments { keys, path: path.to_owned() })
     }
 

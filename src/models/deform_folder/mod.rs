@@ -1,7 +1,7 @@
 //! Model folders with a subfolder `deform`: canonical Gaussians and a network that deforms them.
 //!
 //! Files: `cfg_args`, `cameras.json`, `point_cloud/iteration_K/point_cloud.ply`, `deform/iteration_K/deform.pth`. A
-//! model format provides the computation of states from the network's outputs ([`Deforming`]); reading files, proxies
+//! model format provides the computation of states from the network's outputs ([`NetworkMotionModel`]); reading files, proxies
 //! and writing are shared. The output is a folder of the same layout with a smaller point cloud file. The network is
 //! copied byte for byte, and so is the configuration, except for the SH degree if that is lowered.
 
@@ -16,7 +16,7 @@ use std::path::Path;
 
 pub(super) use arguments::Arguments;
 use paths::Paths;
-pub(super) use paths::{has_network, names_of_network};
+pub(super) use paths::{has_network, network_tensor_names};
 
 use super::files::copy;
 use super::four_d_gaussians::cfg_args::read_for_degree;
@@ -39,14 +39,14 @@ use crate::recipe::MergeParams;
 use crate::source::FrameSource;
 
 /// Minimum scale, so that its logarithm is finite.
-pub(super) const LEAST_SCALE: f64 = 1e-7;
+pub(super) const MIN_SCALE: f64 = 1e-7;
 
 /// Motion model that computes states from the outputs of a network.
-pub(super) trait Deforming: MotionModel {
+pub(super) trait NetworkMotionModel: MotionModel {
     /// Name of the model format, shown to users.
     const KIND: &'static str;
     /// Whether a quaternion is normalized before the network's output is added to it.
-    const NORMALISES: bool;
+    const NORMALIZES_ROTATION: bool;
 
     /// Returns the bytes per Gaussian of the values prepared by [`MotionModel::prepare`].
     fn bytes_per_gaussian(&self) -> usize;
@@ -61,7 +61,7 @@ pub(super) trait Deforming: MotionModel {
 }
 
 /// Parts from which a model format creates its motion model.
-pub(super) struct Parts<'a> {
+pub(super) struct ModelParts<'a> {
     /// Training arguments of `cfg_args`.
     pub(super) arguments: &'a Arguments,
     /// Tensors of the network.
@@ -75,7 +75,7 @@ pub(super) struct Parts<'a> {
 }
 
 /// Open model folder.
-pub(super) struct Folder<L> {
+pub(super) struct DeformFolder<L> {
     paths: Paths,
     model: MotionModelFrames<L>,
     source_path: Option<String>,
@@ -84,14 +84,15 @@ pub(super) struct Folder<L> {
     notes: Vec<String>,
 }
 
-impl<L: Deforming + 'static> Folder<L> {
+impl<L: NetworkMotionModel + 'static> DeformFolder<L> {
     /// Opens the model at `root`. `make` returns its motion model and notes for the user.
     ///
-    /// # Errors Fails if files are missing or damaged, or if `make` refuses the model.
+    /// # Errors
+    /// Fails if files are missing or damaged, or if `make` refuses the model.
     pub(super) fn open(
         root: &Path,
         options: &OpenOptions,
-        make: impl FnOnce(&Parts<'_>) -> Result<(L, Vec<String>)>,
+        make: impl FnOnce(&ModelParts<'_>) -> Result<(L, Vec<String>)>,
     ) -> Result<Box<dyn InputModel>> {
         let paths = Paths::locate(root, options.iteration)?;
         let arguments = Arguments::read(&paths.cfg_args)?;
@@ -99,13 +100,20 @@ impl<L: Deforming + 'static> Folder<L> {
         let ply = Ply::open_with(&paths.point_cloud, &options.ply())?;
         let raw = raw(&ply)?;
         let (features, file, cloud) = (raw.own.width(), &*paths.network, &*paths.point_cloud);
-        let parts = Parts { arguments: &arguments, tensors: &tensors, file, features, cloud };
-        let (law, notes) = make(&parts)?;
+        let parts = ModelParts { arguments: &arguments, tensors: &tensors, file, features, cloud };
+        let (motion_model, notes) = make(&parts)?;
         let values = tensors.values().map(|tensor| tensor.data.len()).sum::<usize>();
         let source_path = arguments.get("source_path").string()?;
         let white_background = arguments.get("white_background").bool(false)?;
-        let model = MotionModelFrames::new(law, raw, ply.sh_degree());
-        Ok(Box::new(Folder { paths, model, source_path, white_background, tensor_bytes: 4 * values as u64, notes }))
+        let model = MotionModelFrames::new(motion_model, raw, ply.sh_degree());
+        Ok(Box::new(DeformFolder {
+            paths,
+            model,
+            source_path,
+            white_background,
+            tensor_bytes: 4 * values as u64,
+            notes,
+        }))
     }
 
     /// Returns the text of `cfg_args` with the SH degree limited to `sh_degree`.
@@ -170,7 +178,7 @@ fn raw(ply: &Ply) -> Result<Raw> {
                 "a finite number",
                 value.to_string(),
             )
-            .hint("drop this Gaussian, or save the model anew"));
+            .hint("remove this Gaussian from the model, or train and save it again"));
         }
     }
     Ok(Raw { gaussians, own })
@@ -182,7 +190,7 @@ fn size_of(paths: &Paths) -> Result<Size> {
     Ok(Size { cloud, field, rest: bytes_of([&*paths.cfg_args])?, ..Size::default() })
 }
 
-impl<L: Deforming + 'static> InputModel for Folder<L> {
+impl<L: NetworkMotionModel + 'static> InputModel for DeformFolder<L> {
     fn kind(&self) -> &'static str {
         L::KIND
     }
@@ -211,7 +219,7 @@ impl<L: Deforming + 'static> InputModel for Folder<L> {
     }
 
     fn residence(&self) -> MemoryProfile {
-        let law = self.model.law();
+        let motion_model = self.model.motion_model();
         let features = 4 * self.model.raw().own.width() as u64;
         let whole = state_bytes(self.model.info().sh_degree, Columns::all()) + features;
         MemoryProfile {
@@ -219,16 +227,16 @@ impl<L: Deforming + 'static> InputModel for Folder<L> {
             // Normals and other extra properties are stored beside the attributes.
             opening: whole + 24,
             // A copy of the parameters, values prepared from them, and the deltas of a block.
-            reader: 2 * whole + law.bytes_per_gaussian() as u64 + 128,
+            reader: 2 * whole + motion_model.bytes_per_gaussian() as u64 + 128,
             reduced: 2 * whole,
             jacobian: Jacobian::BYTES_PER_GAUSSIAN as u64 + 36,
             file: whole + 24,
             // Tensors as read and as used.
-            fixed: 2 * self.tensor_bytes + law.bytes() as u64,
+            fixed: 2 * self.tensor_bytes + motion_model.bytes() as u64,
             frame_block: 0,
             gaussian_block: GAUSSIAN_BLOCK as u64,
             columns: 0,
-            seconds_per_state: law.seconds_per_state(),
+            seconds_per_state: motion_model.seconds_per_state(),
             decoded: 0,
         }
     }
@@ -294,10 +302,11 @@ impl<L: Deforming + 'static> InputModel for Folder<L> {
             OutputKind::Model => self.write_folder(reduction, path).map(|()| Vec::new())?,
             _ => write_sequence(&*self.reduced(reduction)?, kind, path, limits.frames_held, events)?,
         };
-        let left = Columns::all().difference(self.model.law().movable());
+        let left = Columns::all().difference(self.model.motion_model().movable());
         if !reduction.change.is_empty() && !left.is_empty() {
             notes.push(
-                "sizes and rotations were not refined: this model's covariances are not those of its quaternions"
+                "scales and rotations were not refined: the covariances of this model do not follow from its \
+                 quaternions alone"
                     .to_owned(),
             );
         }

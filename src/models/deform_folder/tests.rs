@@ -26,7 +26,7 @@ const COUNT: usize = 40;
 const TIMES: [f64; 5] = [0.0, 0.25, 0.5, 0.75, 1.0];
 
 /// Content of a model folder to be written.
-struct Made {
+struct TestModel {
     folder: TempDir,
     cfg_args: String,
     tensors: Tensors,
@@ -34,11 +34,11 @@ struct Made {
     cloud: Vec<(String, Vec<f32>)>,
 }
 
-impl Made {
+impl TestModel {
     /// Creates a model of Deformable-3D-Gaussians.
-    fn plain(kind: DeepVariant) -> Made {
+    fn deformable(kind: DeepVariant) -> TestModel {
         let stripped = |(name, tensor): (String, Tensor)| (name.replace("network.", ""), small(tensor));
-        Made {
+        TestModel {
             folder: tempfile::tempdir().unwrap(),
             cfg_args: format!(
                 "Namespace(is_6dof={}, is_blender={}, sh_degree=1, source_path='', white_background=True)",
@@ -51,7 +51,7 @@ impl Made {
     }
 
     /// Creates a model of SC-GS with 12 nodes, 2 hyper dimensions and a mask.
-    fn sparse(kind: DeepVariant) -> Made {
+    fn sc_gs(kind: DeepVariant) -> TestModel {
         let mut noise = Noise(23);
         let mut add = |shape: &[usize]| Tensor {
             shape: shape.to_vec(),
@@ -61,11 +61,11 @@ impl Made {
         made.insert("nodes".into(), add(&[12, 5]));
         made.insert("_node_radius".into(), add(&[12]));
         made.insert("_node_weight".into(), add(&[12, 1]));
-        Made {
+        TestModel {
             cfg_args: "Namespace(K=3, deform_type='node', gs_with_motion_mask=True, hyper_dim=2, sh_degree=1)".into(),
             tensors: made,
             cloud: cloud(3),
-            ..Made::plain(kind)
+            ..TestModel::deformable(kind)
         }
     }
 
@@ -165,12 +165,12 @@ fn unit(q: [f64; 4]) -> [f64; 4] {
     q.map(|x| x / length)
 }
 
-fn of_state(state: &Gaussians, i: usize) -> DMat3 {
+fn state_covariance(state: &Gaussians, i: usize) -> DMat3 {
     let scales = state.log_scale.row::<3>(i).map(|x| f64::from(x).exp());
     covariance(scales, unit(state.rotation.row::<4>(i).map(f64::from)))
 }
 
-fn off(a: DMat3, b: DMat3) -> f64 {
+fn relative_difference(a: DMat3, b: DMat3) -> f64 {
     let most = |m: DMat3| m.to_cols_array().iter().fold(0.0f64, |most, x| most.max(x.abs()));
     most(a - b) / most(b)
 }
@@ -191,7 +191,7 @@ fn row<const W: usize>(column: &Column, i: usize) -> [f64; W] {
 #[test]
 fn states_of_deformable_3d_gaussians_follow_the_formulas() {
     for kind in &KINDS[..2] {
-        let made = Made::plain(*kind);
+        let made = TestModel::deformable(*kind);
         let model = made.open();
         assert_eq!(model.kind(), "Deformable-3D-Gaussians model");
         assert_eq!((model.background(), model.notes()), (Some([1.0; 3]), vec![]));
@@ -204,7 +204,7 @@ fn states_of_deformable_3d_gaussians_follow_the_formulas() {
                 let scale = made.row::<3>("scale", i).map(f64::exp);
                 let scale = [0, 1, 2].map(|c| scale[c] + row::<3>(&by.scaling, i)[c]);
                 let expected = covariance(scale, [0, 1, 2, 3].map(|c| rotation[c] + d[c]));
-                let found = off(of_state(state, i), expected);
+                let found = relative_difference(state_covariance(state, i), expected);
                 assert!(found < 1e-5, "Gaussian {i}: covariance off by {found:e}");
                 if !kind.screws {
                     let to = [0, 1, 2].map(|c| (place[c] + row::<3>(&by.warp, i)[c]) as f32);
@@ -219,7 +219,7 @@ fn states_of_deformable_3d_gaussians_follow_the_formulas() {
 #[test]
 fn states_of_sc_gs_follow_the_formulas() {
     for kind in [KINDS[0], KINDS[2]] {
-        let made = Made::sparse(kind);
+        let made = TestModel::sc_gs(kind);
         let model = made.open();
         assert_eq!((model.kind(), model.notes()), ("SC-GS model", vec![]));
         let [nodes, radius, weight] = ["nodes", "_node_radius", "_node_weight"].map(|name| &made.tensors[name].data);
@@ -243,8 +243,8 @@ fn states_of_sc_gs_follow_the_formulas() {
                 let u: Vec<(f64, usize)> = u.collect();
                 let sum: f64 = u.iter().map(|u| u.0).sum();
                 let sum = |column: &Column, c: usize| {
-                    let of: f64 = u.iter().map(|&(u, node)| u / sum * f64::from(column.plane(c)[node])).sum();
-                    of / (1.0 + (-mask).exp())
+                    let weighted: f64 = u.iter().map(|&(u, node)| u / sum * f64::from(column.plane(c)[node])).sum();
+                    weighted / (1.0 + (-mask).exp())
                 };
                 for (c, x) in x.iter().enumerate() {
                     let to = x + sum(&by.warp, c);
@@ -269,10 +269,10 @@ fn states_of_sc_gs_follow_the_formulas() {
 }
 
 #[test]
-fn the_network_may_move_gaussians_of_sc_gs_without_nodes() {
-    let made = Made {
+fn sc_gs_without_nodes_uses_the_network_directly() {
+    let made = TestModel {
         cfg_args: "Namespace(deform_type='mlp', sh_degree=1)".into(),
-        ..Made::plain(DeepVariant { screws: false, ..KINDS[0] })
+        ..TestModel::deformable(DeepVariant { screws: false, ..KINDS[0] })
     };
     let model = made.open();
     assert_eq!(model.kind(), "SC-GS model");
@@ -287,12 +287,17 @@ fn the_network_may_move_gaussians_of_sc_gs_without_nodes() {
 }
 
 #[test]
-fn derivatives_are_those_of_finite_differences() {
-    let models =
-        [Made::plain(KINDS[0]), Made::plain(KINDS[1]), Made::sparse(KINDS[0]), Made::sparse(KINDS[2])].map(|made| {
-            let model = made.open();
-            (made, model)
-        });
+fn jacobian_agrees_with_finite_differences() {
+    let models = [
+        TestModel::deformable(KINDS[0]),
+        TestModel::deformable(KINDS[1]),
+        TestModel::sc_gs(KINDS[0]),
+        TestModel::sc_gs(KINDS[2]),
+    ]
+    .map(|made| {
+        let model = made.open();
+        (made, model)
+    });
     for (_, model) in &models {
         let deformation = model.source().deformation().unwrap();
         let (stored, want) = (deformation.stored(), deformation.movable());
@@ -356,8 +361,8 @@ fn reduction(model: &dyn InputModel) -> CompressedModel {
 }
 
 #[test]
-fn what_stays_keeps_its_bytes_and_the_network_all_of_them() {
-    for made in [Made::plain(KINDS[1]), Made::sparse(KINDS[0])] {
+fn kept_rows_and_network_keep_their_bytes() {
+    for made in [TestModel::deformable(KINDS[1]), TestModel::sc_gs(KINDS[0])] {
         let model = made.open();
         let rule = Recipe::preset("default").unwrap().merge;
         let path = made.folder.path().join("result");
@@ -392,8 +397,8 @@ fn what_stays_keeps_its_bytes_and_the_network_all_of_them() {
 }
 
 #[test]
-fn merged_and_changed_ones_read_back_as_they_were_shown() {
-    for made in [Made::plain(KINDS[0]), Made::plain(KINDS[1]), Made::sparse(KINDS[2])] {
+fn written_proxies_and_deltas_read_back() {
+    for made in [TestModel::deformable(KINDS[0]), TestModel::deformable(KINDS[1]), TestModel::sc_gs(KINDS[2])] {
         let model = made.open();
         let mut reduction = reduction(&*model);
         for sh_degree in [1, 0] {
@@ -410,8 +415,8 @@ fn merged_and_changed_ones_read_back_as_they_were_shown() {
 }
 
 #[test]
-fn a_proxy_of_twins_is_one_of_them() {
-    for mut made in [Made::plain(KINDS[0]), Made::plain(KINDS[1]), Made::sparse(KINDS[2])] {
+fn proxy_of_equal_members_equals_them() {
+    for mut made in [TestModel::deformable(KINDS[0]), TestModel::deformable(KINDS[1]), TestModel::sc_gs(KINDS[2])] {
         // Gaussian 1 equals Gaussian 0 except for its normals.
         made.cloud.iter_mut().filter(|(name, _)| !name.starts_with('n')).for_each(|(_, of)| of[1] = of[0]);
         let model = made.open();
@@ -425,15 +430,15 @@ fn a_proxy_of_twins_is_one_of_them() {
         for (frame, state) in states(&*shown).iter().enumerate() {
             assert!((0..3).all(|c| (state.position.plane(c)[0] - all[frame].position.plane(c)[0]).abs() < 1e-6));
             // Scales and rotations are right on average only; random quaternions have any length.
-            let found = off(of_state(state, 0), of_state(&all[frame], 0));
+            let found = relative_difference(state_covariance(state, 0), state_covariance(&all[frame], 0));
             assert!(found < 0.5, "{} at {frame}: covariance off by {found}", model.kind());
         }
     }
 }
 
 #[test]
-fn iterations_are_those_that_both_folders_have() {
-    let made = Made::plain(KINDS[0]);
+fn iterations_need_both_folders() {
+    let made = TestModel::deformable(KINDS[0]);
     made.write(7);
     made.write(100);
     fs::remove_file(made.file("deform", 100)).unwrap();
@@ -442,15 +447,18 @@ fn iterations_are_those_that_both_folders_have() {
     assert_eq!(opened(None).unwrap().digest().unwrap(), opened(Some(30)).unwrap().digest().unwrap());
     assert!(opened(Some(7)).is_ok());
     let message = opened(Some(100)).err().unwrap().to_string();
-    assert!(message.contains("clouds of 7, 30, 100, networks of 7, 30"), "{message}");
+    assert!(message.contains("point clouds of iterations 7, 30, 100, networks of iterations 7, 30"), "{message}");
 }
 
 #[test]
-fn what_training_was_told_is_believed_less_than_the_weights() {
-    let mut made = Made::plain(KINDS[1]);
+fn weights_take_precedence_over_cfg_args() {
+    let mut made = TestModel::deformable(KINDS[1]);
     made.cfg_args = "Namespace(is_6dof=False, is_blender=False)".into();
     let notes = made.open().notes();
-    assert!(notes.len() == 1 && notes[0].contains("is_6dof = False") && notes[0].contains("believed"), "{notes:?}");
+    assert!(
+        notes.len() == 1 && notes[0].contains("is_6dof = False") && notes[0].contains("the weights are used"),
+        "{notes:?}"
+    );
 }
 
 #[test]
@@ -458,16 +466,16 @@ fn models_that_are_not_read_are_refused_by_name() {
     for key in
         ["skinning=True", "use_hash=True", "local_frame=True", "progressive_brand_time=True", "d_rot_as_res=False"]
     {
-        let mut made = Made::sparse(KINDS[0]);
+        let mut made = TestModel::sc_gs(KINDS[0]);
         made.cfg_args = made.cfg_args.replace("K=3", &format!("K=3, {key}"));
         let message = made.message();
         assert!(message.contains(key.split('=').next().unwrap()) && message.contains("cfg_args"), "{message}");
     }
-    let mut made = Made::sparse(KINDS[0]);
+    let mut made = TestModel::sc_gs(KINDS[0]);
     made.cfg_args = made.cfg_args.replace("K=3", "max_d_scale=1.5");
     assert!(made.message().contains("max_d_scale"));
     // A file with two state dicts.
-    let made = Made::plain(KINDS[0]);
+    let made = TestModel::deformable(KINDS[0]);
     made.write(7);
     let mut archive = zip::ZipWriter::new(fs::File::create(made.file("deform", 7)).unwrap());
     let stored = zip::write::FileOptions::default().compression_method(zip::CompressionMethod::Stored);
@@ -479,34 +487,38 @@ fn models_that_are_not_read_are_refused_by_name() {
 }
 
 #[test]
-fn damaged_models_say_what_is_wrong_with_which_file() {
-    type Damage = fn(&mut Made);
-    let cases: [(Made, Damage, &[&str]); 9] = [
+fn errors_name_the_damaged_file_and_the_problem() {
+    type Damage = fn(&mut TestModel);
+    let cases: [(TestModel, Damage, &[&str]); 9] = [
         (
-            Made::plain(KINDS[0]),
+            TestModel::deformable(KINDS[0]),
             |made| drop(made.tensors.remove("linear.0.weight")),
             &["deform.pth", "linear.0.weight"],
         ),
-        (Made::plain(KINDS[0]), |made| made.cloud[0].1[5] = f32::NAN, &["point_cloud.ply", "Gaussian 5, x y z", "NaN"]),
-        (Made::plain(KINDS[0]), |made| drop(made.cloud.remove(0)), &["point_cloud.ply", "property x"]),
-        (Made::plain(KINDS[0]), |made| made.cfg_args.truncate(30), &["cfg_args"]),
-        (Made::sparse(KINDS[0]), |made| drop(made.tensors.remove("_node_radius")), &["deform.pth", "_node_radius"]),
         (
-            Made::sparse(KINDS[0]),
+            TestModel::deformable(KINDS[0]),
+            |made| made.cloud[0].1[5] = f32::NAN,
+            &["point_cloud.ply", "Gaussian 5, x y z", "NaN"],
+        ),
+        (TestModel::deformable(KINDS[0]), |made| drop(made.cloud.remove(0)), &["point_cloud.ply", "property x"]),
+        (TestModel::deformable(KINDS[0]), |made| made.cfg_args.truncate(30), &["cfg_args"]),
+        (TestModel::sc_gs(KINDS[0]), |made| drop(made.tensors.remove("_node_radius")), &["deform.pth", "_node_radius"]),
+        (
+            TestModel::sc_gs(KINDS[0]),
             |made| made.tensors.get_mut("_node_weight").unwrap().shape = vec![6, 2],
             &["_node_weight", "12 nodes", "[6, 2]"],
         ),
         (
-            Made::sparse(KINDS[0]),
+            TestModel::sc_gs(KINDS[0]),
             |made| made.tensors.get_mut("nodes").unwrap().data[7] = f32::INFINITY,
             &["nodes", "finite", "element 7"],
         ),
         (
-            Made::sparse(KINDS[0]),
+            TestModel::sc_gs(KINDS[0]),
             |made| made.cloud.retain(|(name, _)| !name.starts_with("fea_1") && !name.starts_with("fea_2")),
             &["point_cloud.ply", "2 properties fea_*", "1"],
         ),
-        (Made::sparse(KINDS[0]), |made| drop(made.tensors.remove("nodes")), &["deform.pth", "nodes", "'node'"]),
+        (TestModel::sc_gs(KINDS[0]), |made| drop(made.tensors.remove("nodes")), &["deform.pth", "nodes", "'node'"]),
     ];
     for (mut made, damage, parts) in cases {
         damage(&mut made);
@@ -518,8 +530,8 @@ fn damaged_models_say_what_is_wrong_with_which_file() {
 }
 
 #[test]
-fn a_network_cut_anywhere_is_refused() {
-    let made = Made::plain(KINDS[0]);
+fn truncated_network_is_refused() {
+    let made = TestModel::deformable(KINDS[0]);
     made.write(7);
     let path = made.file("deform", 7);
     let whole = fs::read(&path).unwrap();

@@ -11,7 +11,7 @@ mod screw;
 
 use glam::{DMat3, DVec3};
 
-use super::deform_folder::{Deforming, Folder, Parts, has_network};
+use super::deform_folder::{DeformFolder, ModelParts, NetworkMotionModel, has_network};
 use crate::deform::{Encoded, Network, PredictedMotion};
 use crate::error::{Error, Result};
 use crate::model::{Column, Columns, Gaussians, Jacobian, Raw, scale_rotation};
@@ -22,7 +22,7 @@ use crate::models::motion_model::{MotionModel, copy_stored};
 pub(super) const ENTRY: ModelFormat = ModelFormat {
     expected: "a Deformable-3D-Gaussians model folder",
     recognizes: |found| found.is_folder && has_network(found.path),
-    open: |path, options| Folder::open(path, options, DeformationKind::new),
+    open: |path, options| DeformFolder::open(path, options, DeformableMotion::new),
 };
 
 /// Columns that follow from the covariance.
@@ -30,37 +30,37 @@ const SHAPE: Columns = Columns::ROTATION.union(Columns::LOG_SCALE);
 
 /// Motion model of Deformable-3D-Gaussians.
 #[derive(Debug)]
-struct DeformationKind {
+struct DeformableMotion {
     network: Network,
 }
 
-impl DeformationKind {
+impl DeformableMotion {
     /// Reads the network, and adds a note where `cfg_args` contradicts its weights.
-    fn new(parts: &Parts<'_>) -> Result<(DeformationKind, Vec<String>)> {
+    fn new(parts: &ModelParts<'_>) -> Result<(DeformableMotion, Vec<String>)> {
         if !parts.tensors.contains_key("linear.0.weight") {
             let names: Vec<&str> = parts.tensors.keys().map(String::as_str).take(6).collect();
             let found = if names.is_empty() { "none".to_owned() } else { format!("{}, …", names.join(", ")) };
             return Err(Error::input(parts.file, "", "tensors linear.0.weight and so on", found)
-                .hint("networks of Deformable-3D-Gaussians and of SC-GS are read"));
+                .hint("only networks of Deformable-3D-Gaussians and SC-GS are supported"));
         }
         let network = Network::new(parts.tensors, "", parts.file)?;
         let mut notes = Vec::new();
         let time = parts.tensors.contains_key("timenet.0.weight");
-        for (key, there) in [("is_blender", time), ("is_6dof", network.has_screws())] {
-            let said = parts.arguments.get(key).bool(there)?;
-            if said != there {
-                let [said, there] = [said, there].map(|yes| if yes { "True" } else { "False" });
+        for (key, actual) in [("is_blender", time), ("is_6dof", network.has_screws())] {
+            let configured = parts.arguments.get(key).bool(actual)?;
+            if configured != actual {
+                let [configured, actual] = [configured, actual].map(|yes| if yes { "True" } else { "False" });
                 notes.push(format!(
-                    "cfg_args says {key} = {said}, the weights in deform.pth are those of {key} = {there}: the weights are \
-                     believed"
+                    "cfg_args says {key} = {configured}, but the weights in deform.pth belong to {key} = {actual}: \
+                     the weights are used"
                 ));
             }
         }
-        Ok((DeformationKind { network }, notes))
+        Ok((DeformableMotion { network }, notes))
     }
 }
 
-impl DeformationKind {
+impl DeformableMotion {
     /// Returns the network's output for the columns `want` of a block.
     fn motion(&self, time: f64, encoded: &Encoded, want: Columns) -> Result<PredictedMotion> {
         let mut motion = PredictedMotion::default();
@@ -73,7 +73,7 @@ impl DeformationKind {
     }
 }
 
-impl MotionModel for DeformationKind {
+impl MotionModel for DeformableMotion {
     type Prepared = Encoded;
 
     fn prepare(&self, raw: &Raw) -> Encoded {
@@ -98,7 +98,7 @@ impl MotionModel for DeformationKind {
                 let to = match self.network.has_screws() {
                     true => {
                         let [x, w, v] = screw(at, motion.warp.row::<6>(row));
-                        screw::moved(x, w, v).as_vec3().to_array()
+                        screw::apply_screw(x, w, v).as_vec3().to_array()
                     }
                     false => {
                         let by = motion.warp.row::<3>(row);
@@ -160,15 +160,15 @@ impl MotionModel for DeformationKind {
     }
 }
 
-impl Deforming for DeformationKind {
+impl NetworkMotionModel for DeformableMotion {
     const KIND: &'static str = "Deformable-3D-Gaussians model";
-    const NORMALISES: bool = true;
+    const NORMALIZES_ROTATION: bool = true;
 
     fn bytes_per_gaussian(&self) -> usize {
         Network::BYTES_PER_GAUSSIAN
     }
 
-    /// Returns the cost measured by `benches/families.rs`, as a function of the size of the network.
+    /// Returns the seconds measured by `benches/families.rs`, as a function of the size of the network.
     fn seconds_per_state(&self) -> f64 {
         1e-6 + 2e-11 * self.network.multiplications() as f64
     }

@@ -9,14 +9,14 @@ use glam::DVec3;
 /// Value added to every component of the normalized vectors.
 const EPSILON: f64 = 1e-5;
 /// Minimum angle; below it the limit x + v is used, where the original divides by zero.
-const LEAST_ANGLE: f64 = 1e-30;
+const MIN_ANGLE: f64 = 1e-30;
 /// Half step of numerical derivatives for values of size 1: the cube root of the f64 precision.
-const SMALL: f64 = 6e-6;
+const HALF_STEP: f64 = 6e-6;
 
 /// Returns the position of `x` after the screw motion.
-pub(super) fn moved(x: DVec3, w: DVec3, v: DVec3) -> DVec3 {
+pub(super) fn apply_screw(x: DVec3, w: DVec3, v: DVec3) -> DVec3 {
     let angle = w.length();
-    if angle < LEAST_ANGLE {
+    if angle < MIN_ANGLE {
         return x + v;
     }
     let (w, v) = (w / angle + EPSILON, v / angle + EPSILON);
@@ -29,8 +29,8 @@ pub(super) fn moved(x: DVec3, w: DVec3, v: DVec3) -> DVec3 {
 /// `of_v`. Uses central differences of all three together.
 pub(super) fn slope(x: DVec3, w: DVec3, v: DVec3, axis: DVec3, [of_w, of_v]: [DVec3; 2]) -> DVec3 {
     // Screws may change fast with x, so the step is shortened accordingly.
-    let step = SMALL / (1.0 + of_w.abs().max_element() + of_v.abs().max_element());
-    let at = |by: f64| moved(x + by * axis, w + by * of_w, v + by * of_v);
+    let step = HALF_STEP / (1.0 + of_w.abs().max_element() + of_v.abs().max_element());
+    let at = |by: f64| apply_screw(x + by * axis, w + by * of_w, v + by * of_v);
     (at(step) - at(-step)) / (2.0 * step)
 }
 
@@ -51,25 +51,25 @@ mod tests {
     }
 
     #[test]
-    fn screws_are_those_of_the_matrices_and_none_at_no_angle() {
+    fn screw_agrees_with_the_matrix_formula() {
         let [x, w, v] = [DVec3::new(0.3, -1.2, 2.0), DVec3::new(0.02, -0.5, 0.1), DVec3::new(-0.4, 0.1, 0.7)];
         for size in [1e-9, 1e-3, 1.0, 20.0] {
-            let off = (moved(x, size * w, v) - by_matrices(x, size * w, v)).length();
+            let off = (apply_screw(x, size * w, v) - by_matrices(x, size * w, v)).length();
             assert!(off < 1e-13, "size {size}: off by {off:e}");
         }
-        assert_eq!(moved(x, DVec3::ZERO, v), x + v);
-        assert!((moved(x, 1e-20 * w, v) - x - v).length() < 1e-15);
+        assert_eq!(apply_screw(x, DVec3::ZERO, v), x + v);
+        assert!((apply_screw(x, 1e-20 * w, v) - x - v).length() < 1e-15);
     }
 
     #[test]
-    fn slopes_follow_x_and_what_the_network_changes_with_it() {
+    fn slope_follows_position_and_network() {
         let [x, w, v] = [DVec3::new(0.3, -1.2, 2.0), DVec3::new(0.02, -0.5, 0.1), DVec3::new(-0.4, 0.1, 0.7)];
-        let of = [DVec3::new(3.0, 1.0, -2.0), DVec3::new(0.5, -4.0, 1.0)];
-        let wide = |by: f64| moved(x + by * DVec3::Y, w + by * of[0], v + by * of[1]);
+        let slopes = [DVec3::new(3.0, 1.0, -2.0), DVec3::new(0.5, -4.0, 1.0)];
+        let wide = |by: f64| apply_screw(x + by * DVec3::Y, w + by * slopes[0], v + by * slopes[1]);
         // Reference value: Richardson extrapolation of wider differences.
         let [one, two] = [1e-3, 2e-3].map(|by| (wide(by) - wide(-by)) / (2.0 * by));
         let expected = (4.0 * one - two) / 3.0;
-        let found = slope(x, w, v, DVec3::Y, of);
+        let found = slope(x, w, v, DVec3::Y, slopes);
         assert!((found - expected).length() < 1e-8, "{found} {expected}");
     }
 }

@@ -24,8 +24,8 @@ use crate::outputs::kind::OutputKind;
 use crate::progress::Events;
 use crate::recipe::MergeParams;
 use crate::source::{FrameSource, Ids};
-use params::{COLOURS, LOG_SCALES, MEANS, OPACITIES, Params, ROTATIONS};
-use proxies::Settled;
+use params::{COLORS, LOG_SCALES, MEANS, OPACITIES, Params, ROTATIONS};
+use proxies::MergedSource;
 
 /// Name of the file in a model folder.
 const FILE: &str = "params.npz";
@@ -139,9 +139,9 @@ impl InputModel for Params {
 impl Params {
     /// Writes the compressed model as the file `path`.
     fn write_params(&self, reduction: &CompressedModel, path: PathBuf) -> Result<()> {
-        let settled = Settled::new(self, reduction);
+        let merged = MergedSource::new(self, reduction);
         let places: Vec<u32> = reduction.clusters.iter().map(|cluster| cluster.output).collect();
-        let (mut proxies, mut state) = (settled.open(Ids::List(&places))?, Gaussians::zeros(0, 0));
+        let (mut proxies, mut state) = (merged.open(Ids::List(&places))?, Gaussians::zeros(0, 0));
         let by = &reduction.change.0;
         write_like(
             self.npz(),
@@ -151,7 +151,7 @@ impl Params {
                 let column = match name {
                     MEANS => Columns::POSITION,
                     ROTATIONS => Columns::ROTATION,
-                    COLOURS => Columns::SH,
+                    COLORS => Columns::SH,
                     LOG_SCALES => Columns::LOG_SCALE,
                     OPACITIES => Columns::OPACITY,
                     // Proxies keep the segment of their leader.

@@ -19,7 +19,7 @@ pub(super) const MEANS: &str = "means3D";
 /// Array of quaternions.
 pub(super) const ROTATIONS: &str = "unnorm_rotations";
 /// Array of colors.
-pub(super) const COLOURS: &str = "rgb_colors";
+pub(super) const COLORS: &str = "rgb_colors";
 /// Array of log scales.
 pub(super) const LOG_SCALES: &str = "log_scales";
 /// Array of opacity logits.
@@ -48,8 +48,8 @@ impl Params {
     /// Opens `path`. Frame i of T has time i / (T − 1). Arrays that are compressed or not f32 are decoded into
     /// `scratch`.
     ///
-    /// # Errors Fails if the file is not an archive, if arrays are missing or have other shapes, or if the model is
-    /// static.
+    /// # Errors
+    /// Fails if the file is not an archive, if arrays are missing or have other shapes, or if the model is static.
     pub(super) fn open(path: &Path, scratch: &Path) -> Result<Params> {
         let npz = Npz::open(path)?;
         let [frames, count] = match npz.entry(MEANS).map(|entry| &entry.shape[..]) {
@@ -63,12 +63,12 @@ impl Params {
                 return Err(Error::input(path, MEANS, "shape [T, N, 3], T at least 1", found));
             }
         };
-        let said = |shape: &[usize]| format!("shape {shape:?}");
+        let shape_text = |shape: &[usize]| format!("shape {shape:?}");
         let has_segments = npz.entry(SEGMENTS).is_some();
         let expected: [(&str, &[usize]); 6] = [
             (MEANS, &[frames, count, 3]),
             (ROTATIONS, &[frames, count, 4]),
-            (COLOURS, &[frames, count, 3]),
+            (COLORS, &[frames, count, 3]),
             (LOG_SCALES, &[count, 3]),
             (OPACITIES, &[count, 1]),
             (SEGMENTS, &[count, 3]),
@@ -77,7 +77,7 @@ impl Params {
         // Check all shapes and types before decoding any array.
         for &(name, shape) in expected {
             if let Some(entry) = npz.entry(name).filter(|entry| entry.shape != shape) {
-                return Err(Error::input(path, name, said(shape), said(&entry.shape))
+                return Err(Error::input(path, name, shape_text(shape), shape_text(&entry.shape))
                     .hint(format!("{MEANS} has {frames} frames of {count} Gaussians: all arrays must")));
             }
         }
@@ -95,7 +95,7 @@ impl Params {
         Ok(Params {
             means: floats(MEANS)?,
             rotations: floats(ROTATIONS)?,
-            colors: floats(COLOURS)?,
+            colors: floats(COLORS)?,
             log_scales: floats(LOG_SCALES)?,
             opacities: floats(OPACITIES)?,
             segments,
@@ -107,7 +107,8 @@ impl Params {
 
     /// Returns the same frames at other times.
     ///
-    /// # Errors Fails if the number of times is not T, or if times are not finite or do not increase.
+    /// # Errors
+    /// Fails if the number of times is not T, or if times are not finite or do not increase.
     pub(super) fn with_times(mut self, times: Vec<f64>) -> Result<Params> {
         self.info = self.info.with_times(times)?;
         Ok(self)
@@ -131,7 +132,7 @@ impl Params {
     /// Returns the axis of an array that counts Gaussians.
     pub(super) fn axis(entry: &NpzArray) -> ArrayRows {
         match entry.name.as_str() {
-            MEANS | ROTATIONS | COLOURS => ArrayRows::Second,
+            MEANS | ROTATIONS | COLORS => ArrayRows::Second,
             LOG_SCALES | OPACITIES | SEGMENTS => ArrayRows::First,
             _ => ArrayRows::None,
         }

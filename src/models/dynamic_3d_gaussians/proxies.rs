@@ -21,7 +21,8 @@ const CONSTANT: Columns = Columns::LOG_SCALE.union(Columns::OPACITY);
 /// Returns the scales and opacities of the proxies of `clusters` as rows of [`Proxies::raw`]: geometric means of
 /// scales, arithmetic means of opacities.
 ///
-/// # Errors Fails if frames cannot be read.
+/// # Errors
+/// Fails if frames cannot be read.
 pub(super) fn solve(params: &Params, clusters: &[Cluster], merge: &MergeParams) -> Result<Proxies> {
     let leaders: Vec<u32> = clusters.iter().map(|cluster| cluster.leader).collect();
     let members = clusters.iter().zip(0..).map(|(cluster, place)| (place, &cluster.members[..]));
@@ -49,7 +50,7 @@ pub(super) fn solve(params: &Params, clusters: &[Cluster], merge: &MergeParams) 
 /// Returns the frames of the compressed model `reduction`.
 pub(super) fn reduced<'a>(params: &'a Params, reduction: &'a CompressedModel) -> Box<dyn FrameSource + 'a> {
     Box::new(Changed::new(
-        Box::new(Settled::new(params, reduction)),
+        Box::new(MergedSource::new(params, reduction)),
         &reduction.change,
         &reduction.course,
         reduction.sh_degree,
@@ -57,17 +58,17 @@ pub(super) fn reduced<'a>(params: &'a Params, reduction: &'a CompressedModel) ->
 }
 
 /// Merged sequence whose proxies have the scales and opacities computed by [`solve`].
-pub(super) struct Settled<'a> {
+pub(super) struct MergedSource<'a> {
     merged: MergedSequence<'a>,
     reduction: &'a CompressedModel,
     info: SequenceInfo,
 }
 
-impl<'a> Settled<'a> {
+impl<'a> MergedSource<'a> {
     /// Merges `params` as `reduction` says.
-    pub(super) fn new(params: &'a Params, reduction: &'a CompressedModel) -> Settled<'a> {
+    pub(super) fn new(params: &'a Params, reduction: &'a CompressedModel) -> MergedSource<'a> {
         let info = SequenceInfo { count: reduction.len(), ..params.info().clone() };
-        Settled { merged: merged(params, reduction), reduction, info }
+        MergedSource { merged: merged(params, reduction), reduction, info }
     }
 
     /// Returns the proxies among the output indices `places`: position in `places` and number of the proxy.
@@ -83,11 +84,11 @@ impl<'a> Settled<'a> {
     /// Wraps a reader of the merged sequence so that proxies get their constant scales and opacities.
     fn reader<'b>(&'b self, reader: Box<dyn BlockReader + 'b>, ids: Ids<'_>) -> Box<dyn BlockReader + 'b> {
         let raw = self.reduction.proxies.raw.as_ref().map(|raw| &raw.gaussians);
-        Box::new(SettledReader { reader, proxies: self.proxies(ids.iter()), raw })
+        Box::new(MergedReader { reader, proxies: self.proxies(ids.iter()), raw })
     }
 }
 
-impl FrameSource for Settled<'_> {
+impl FrameSource for MergedSource<'_> {
     fn info(&self) -> &SequenceInfo {
         &self.info
     }
@@ -107,14 +108,14 @@ impl FrameSource for Settled<'_> {
 }
 
 /// Reader that replaces the scales and opacities of proxies.
-struct SettledReader<'a> {
+struct MergedReader<'a> {
     reader: Box<dyn BlockReader + 'a>,
     /// Row and number of each proxy that is read.
     proxies: Vec<(usize, usize)>,
     raw: Option<&'a Gaussians>,
 }
 
-impl BlockReader for SettledReader<'_> {
+impl BlockReader for MergedReader<'_> {
     fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
         self.reader.read(frame, want, out)?;
         let Some(raw) = self.raw else { return Ok(()) };

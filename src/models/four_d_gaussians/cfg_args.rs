@@ -12,7 +12,7 @@ use crate::files::python_literal::{Literal, parse_call};
 /// Maximum bytes of a file; larger than any namespace that an argument parser prints.
 const MAX_BYTES: u64 = 1 << 20;
 /// Name of the Python call in the file.
-pub(in crate::models) const NAME: &str = "Namespace";
+pub(in crate::models) const CALL_NAME: &str = "Namespace";
 /// Key of the SH degree.
 const SH_DEGREE: &str = "sh_degree";
 
@@ -64,7 +64,8 @@ pub struct ModelConfig {
 impl ModelConfig {
     /// Reads the `cfg_args` file at `path`.
     ///
-    /// # Errors Fails if the file cannot be read, is no `Namespace(...)`, or a known key has a value of the wrong type.
+    /// # Errors
+    /// Fails if the file cannot be read, is no `Namespace(...)`, or a known key has a value of the wrong type.
     pub fn read(path: &Path) -> Result<Self> {
         Self::parse(&read(path)?, path)
     }
@@ -73,7 +74,7 @@ impl ModelConfig {
     ///
     /// Unknown keys may hold any text whose brackets and quotes are balanced.
     pub fn parse(text: &str, path: &Path) -> Result<Self> {
-        let keys = parse_call(text, NAME).map_err(|error| error.in_file(path, text))?;
+        let keys = parse_call(text, CALL_NAME).map_err(|error| error.in_file(path, text))?;
         let get = |name: &'static str| {
             // Python would refuse a repeated keyword. In a hand-edited file the last one counts.
             keys.iter().rev().find(|key| key.name == name).map_or(
@@ -137,10 +138,11 @@ impl ModelConfig {
                 ("resolution along t", self.resolution.get(3).copied().unwrap_or(0), side(format!("{GRIDS}0.2"), 2)),
             ]);
         }
-        let differs = |(what, said, there): (&str, i64, Option<i64>)| {
-            let there = there.filter(|&there| there != said)?;
+        let differs = |(key, configured, actual): (&str, i64, Option<i64>)| {
+            let actual = actual.filter(|&actual| actual != configured)?;
             Some(format!(
-                "cfg_args says {what} = {said}, the weights in deformation.pth have {there}: the weights are believed"
+                "cfg_args says {key} = {configured}, but the weights in deformation.pth have {actual}: the weights \
+                 are used"
             ))
         };
         found.into_iter().filter_map(differs).collect()
@@ -171,14 +173,14 @@ pub(in crate::models) fn read(path: &Path) -> Result<String> {
     let bytes = read_small(path, MAX_BYTES, "a cfg_args")?;
     String::from_utf8(bytes).map_err(|error| {
         let valid = error.utf8_error().valid_up_to();
-        Error::input(path, format!("byte {valid}"), "UTF-8 text", "a byte that is not")
+        Error::input(path, format!("byte {valid}"), "UTF-8 text", "an invalid byte")
     })
 }
 
 /// Returns `text` with SH degree `degree` and all other bytes unchanged. If `text` does not give the degree, it becomes
 /// the first key. `path` is for error messages.
 pub(in crate::models) fn with_sh_degree(text: &str, degree: usize, path: &Path) -> Result<String> {
-    let keys = parse_call(text, NAME).map_err(|error| error.in_file(path, text))?;
+    let keys = parse_call(text, CALL_NAME).map_err(|error| error.in_file(path, text))?;
     let (place, value) = match keys.iter().rev().find(|key| key.name == SH_DEGREE) {
         Some(key) => (key.place.clone(), degree.to_string()),
         None => {
@@ -201,7 +203,7 @@ pub(in crate::models) fn read_for_degree(path: &Path, own: usize, degree: usize)
 /// made to be shared. The strings of `source_path` and `model_path`, and all strings that are absolute paths, are
 /// replaced by their last components; all other bytes are unchanged.
 pub(in crate::models) fn without_folders(text: &str, path: &Path) -> Result<String> {
-    let keys = parse_call(text, NAME).map_err(|error| error.in_file(path, text))?;
+    let keys = parse_call(text, CALL_NAME).map_err(|error| error.in_file(path, text))?;
     let (mut out, mut end) = (String::with_capacity(text.len()), 0);
     for key in &keys {
         out += &text[end..key.place.start];

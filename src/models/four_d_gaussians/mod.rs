@@ -26,7 +26,7 @@ use crate::files::state_dict::{StoredTensor, TensorValues, is_floating, read_sta
 use crate::limits::Limits;
 use crate::model::{Columns, Gaussians, Jacobian};
 use crate::models::input_model::{InputModel, MemoryProfile, ModelFormat, Timing};
-use crate::models::motion_model::left;
+use crate::models::motion_model::compressed_raw;
 use crate::outputs::container::GAUSSIAN_BLOCK;
 use crate::outputs::kind::OutputKind;
 use crate::progress::Events;
@@ -141,7 +141,8 @@ impl InputModel for ModelFolder {
         let paths = self.paths();
         if !self.can_round_field()? {
             return Err(Error::usage(format!(
-                "an archive holds tensors of 32-bit and 16-bit floating-point numbers: {} has others",
+                "{}: some tensors are not 32-bit or 16-bit floating-point numbers, and an archive holds only these\n  \
+                 write a model folder instead",
                 paths.deformation.shown()
             )));
         }
@@ -156,7 +157,7 @@ impl InputModel for ModelFolder {
         };
         let first = self.info().times.first().copied().unwrap_or(0.0).min(0.0);
         let last = self.info().times.last().copied().unwrap_or(1.0).max(1.0);
-        let cloud = left(self.stored(), reduction).gaussians;
+        let cloud = compressed_raw(self.stored(), reduction).gaussians;
         let cfg_args = self.cfg_args(cloud.sh_degree())?;
         let cfg_args = cfg_args::without_folders(&cfg_args, &paths.cfg_args)?.into_bytes();
         let mut content = Content {
@@ -179,7 +180,7 @@ impl InputModel for ModelFolder {
     }
 
     fn reduced<'a>(&'a self, reduction: &'a CompressedModel) -> Result<Box<dyn FrameSource + 'a>> {
-        let model = self.with_canonical(left(self.stored(), reduction).gaussians);
+        let model = self.with_canonical(compressed_raw(self.stored(), reduction).gaussians);
         Ok(Box::new(match reduction.field {
             Precision::Exact => model,
             Precision::Half => model.rounded()?,
@@ -191,7 +192,10 @@ impl InputModel for ModelFolder {
     }
 
     fn needs_all_bands(&self) -> Option<&'static str> {
-        self.field().active().contains(Columns::SH).then_some("the field's SH head adds to all of them")
+        self.field().active().contains(Columns::SH).then_some(
+            "the SH head of the deformation field adds to \
+                                                               coefficients of every degree",
+        )
     }
 
     fn write(
@@ -216,13 +220,18 @@ impl InputModel for ModelFolder {
                 let bytes = bytes_of(training.map(PathBuf::as_path))?;
                 if bytes > 0 {
                     notes.push(format!(
-                        "deformation_table.pth and deformation_accum.pth, {bytes} bytes that only training reads, were \
-                         left out, and count on neither side"
+                        "deformation_table.pth and deformation_accum.pth ({bytes} bytes, read by training only) were \
+                         not copied; sizes do not include them"
                     ));
                 }
             }
             OutputKind::Ply => self.write_cloud(reduction, path)?,
-            OutputKind::Archive => return Err(Error::internal("an archive is made of a content")),
+            OutputKind::Archive => {
+                return Err(Error::internal(
+                    "an archive is written from its content, not by the \
+                                                               model",
+                ));
+            }
             _ => notes.extend(write_sequence(&*self.reduced(reduction)?, kind, path, limits.frames_held, events)?),
         }
         Ok(notes)
@@ -271,7 +280,7 @@ fn size_of(cloud: &Path, field: &Path, configuration: &Path) -> Result<Size> {
 fn role(config: FieldConfig, name: &str) -> Role {
     let Some(name) = name.strip_prefix("deformation_net.") else { return Role::Unread };
     let part = name.split('.').next().unwrap_or_default();
-    let reads = |is_read: bool, as_what: Role| if is_read { as_what } else { Role::Unread };
+    let reads = |is_read: bool, role_if_read: Role| if is_read { role_if_read } else { Role::Unread };
     match part {
         "grid" if config.no_grid => Role::Unread,
         "grid" => match name.rsplit('.').next() {

@@ -21,7 +21,8 @@ const SAMPLED_FRAMES: usize = 16;
 /// than `max_drift` from its members, it is placed at its leader's canonical position; its shape about the mean stays
 /// the same. A proxy without a finite solution gets all parameters of its leader.
 ///
-/// # Errors Fails if frames cannot be evaluated.
+/// # Errors
+/// Fails if frames cannot be evaluated.
 pub(super) fn solve(
     model: &ModelFolder,
     all: &[Cluster],
@@ -50,7 +51,10 @@ pub(super) fn solve(
     }
     let unsolved = restore_unsolved(&mut raw, &of_leaders);
     if unsolved > 0 {
-        notes.push(format!("{unsolved} proxies kept their leader's parameters: the field's mask leaves no others"));
+        notes.push(format!(
+            "{unsolved} proxies kept the parameters of their leaders: the mask of the deformation \
+                            field allows no others"
+        ));
     }
     let mut placements = vec![merge.placement; leaders.len()];
     let mut deviations = deviations(model, reference, all, &raw, &placements)?;
@@ -61,7 +65,10 @@ pub(super) fn solve(
             raw.position.set_row::<3>(proxy, of_leaders.position.row(proxy));
             placements[proxy] = Placement::Leader;
         }
-        notes.push(format!("{} proxies strayed from their members and were placed at their leaders", strayed.len()));
+        notes.push(format!(
+            "{} proxies drifted too far from their members and were placed at their leaders",
+            strayed.len()
+        ));
         deviations = self::deviations(model, reference, all, &raw, &placements)?;
     }
     let deviation = deviations.into_iter().reduce(f64::max);

@@ -13,10 +13,10 @@ use crate::files::state_dict::{MAX_EXPANSION, StoredTensor, TensorValues};
 
 /// Number of values below which a tensor stays in single precision. Biases, the last layers of heads and the box of the
 /// field take few bytes, and every value of the field depends on them.
-const FEW: usize = 1024;
+const MIN_HALF_VALUES: usize = 1024;
 /// Maximum root mean square error of a tensor in half precision, relative to its root mean square. Rounding of values
 /// within range stays below it; values too large or too small for half precision exceed it.
-const MOST_ERROR: f64 = 1.0 / 2048.0;
+const MAX_ERROR: f64 = 1.0 / 2048.0;
 
 /// Returns the tensors with the values that they have after storage in half precision.
 pub(super) fn rounded(mut tensors: Tensors) -> Tensors {
@@ -39,11 +39,11 @@ pub(super) fn stored(tensors: &Tensors, from_zero: bool) -> Vec<StoredTensor> {
         tensors.iter().map(pack).collect()
     };
     let small = pack(true);
-    let bytes = |values: usize, of: &StoredTensor| (values * of.values.width()) as u64;
-    let kept: u64 = small.iter().map(|tensor| bytes(tensor.values.len(), tensor)).sum();
-    let meant: u64 = small.iter().map(|tensor| bytes(tensor.shape.iter().product(), tensor)).sum();
+    let bytes = |values: usize, tensor: &StoredTensor| (values * tensor.values.width()) as u64;
+    let stored_bytes: u64 = small.iter().map(|tensor| bytes(tensor.values.len(), tensor)).sum();
+    let expanded_bytes: u64 = small.iter().map(|tensor| bytes(tensor.shape.iter().product(), tensor)).sum();
     // Readers limit the ratio of expanded to stored bytes; beyond the limit, tensors are written out in full.
-    if meant > MAX_EXPANSION * kept { pack(false) } else { small }
+    if expanded_bytes > MAX_EXPANSION * stored_bytes { pack(false) } else { small }
 }
 
 /// Returns the compact form of one tensor.
@@ -86,7 +86,7 @@ fn halves(tensor: &Tensor) -> Option<Vec<f16>> {
     let error = square(&mut tensor.data.iter().zip(&halves).map(|(x, half)| f64::from(*x) - half.to_f64()));
     let all = square(&mut tensor.data.iter().map(|&x| f64::from(x)));
     // The comparison is false for values that are not finite.
-    (halves.len() >= FEW && error <= MOST_ERROR.powi(2) * all).then_some(halves)
+    (halves.len() >= MIN_HALF_VALUES && error <= MAX_ERROR.powi(2) * all).then_some(halves)
 }
 
 #[cfg(test)]
@@ -117,7 +117,7 @@ mod tests {
     const TIME: &str = "deformation_net.grid.grids.1.4";
 
     #[test]
-    fn rows_of_time_that_are_read_keep_their_values_and_the_others_take_no_bytes() {
+    fn unread_time_rows_take_no_bytes() {
         for rows in [1, 2, 25, 50] {
             let plane = tensor(&[1, 16, rows, 8], 1.0);
             let tensors = Tensors::from([(TIME.to_owned(), plane.clone())]);
@@ -138,8 +138,8 @@ mod tests {
     }
 
     #[test]
-    fn what_half_precision_cannot_hold_stays_and_so_does_what_is_small() {
-        let few = tensor(&[FEW - 1], 1.0);
+    fn small_or_unrepresentable_tensors_stay_exact() {
+        let few = tensor(&[MIN_HALF_VALUES - 1], 1.0);
         let mut large = tensor(&[64, 32], 1.0);
         large.data[77] = 65_520.0;
         let mut odd = tensor(&[64, 32], 1.0);
@@ -166,7 +166,7 @@ mod tests {
     }
 
     #[test]
-    fn a_constant_is_stored_once_as_long_as_the_file_may_mean_so_much() {
+    fn constant_tensor_is_stored_once_within_the_limit() {
         let constant = Tensor { shape: vec![40, 50], data: vec![0.1; 2000] };
         let zeros = |sign: f32| Tensor { shape: vec![2], data: vec![0.0, sign * 0.0] };
         let tensors = |more: usize| {
@@ -184,7 +184,7 @@ mod tests {
     }
 
     #[test]
-    fn rounding_twice_is_rounding_once() {
+    fn rounding_twice_equals_rounding_once() {
         let tensors = Tensors::from([("a".to_owned(), tensor(&[80, 90], 3.0)), ("b".to_owned(), tensor(&[9], 3.0))]);
         let once = rounded(tensors);
         assert_eq!(rounded(once.clone()), once);

@@ -16,9 +16,9 @@ use crate::source::FrameSource;
 /// Maximum number of frames at which proxies are matched.
 const SAMPLED_FRAMES: usize = 48;
 /// Minimum opacity times window of a proxy at a frame that is used for matching.
-const SEEN: f64 = 1e-4;
+const MIN_VISIBLE: f64 = 1e-4;
 /// Range of proxy opacities, which bounds their logits.
-const OPACITIES: [f64; 2] = [1e-3, 1.0 - 1e-4];
+const OPACITY_RANGE: [f64; 2] = [1e-3, 1.0 - 1e-4];
 
 /// Straight path with a Gaussian window: x(t) = position + velocity·(t − center), window exp(−½((t −
 /// center)/deviation)²).
@@ -37,13 +37,15 @@ pub(in crate::models) struct LinearPath {
 impl LinearPath {
     /// Returns the weighted blend of `members`, whose weights sum to 1.
     pub(in crate::models) fn blended(members: &[(f64, LinearPath)]) -> LinearPath {
-        let lasting: f64 = members.iter().map(|(weight, line)| weight * line.deviation).sum();
-        let mean = |of: &dyn Fn(&LinearPath) -> f64| {
-            members.iter().map(|(weight, line)| weight * line.deviation / lasting * of(line)).sum::<f64>()
+        let total_duration: f64 = members.iter().map(|(weight, line)| weight * line.deviation).sum();
+        let mean = |value_of: &dyn Fn(&LinearPath) -> f64| {
+            members.iter().map(|(weight, line)| weight * line.deviation / total_duration * value_of(line)).sum::<f64>()
         };
         let center = mean(&|line| line.center);
         let variance = mean(&|line| line.deviation.powi(2) + (line.center - center).powi(2));
-        let sum = |of: &dyn Fn(&LinearPath) -> f64| members.iter().map(|(weight, line)| weight * of(line)).sum::<f64>();
+        let sum = |value_of: &dyn Fn(&LinearPath) -> f64| {
+            members.iter().map(|(weight, line)| weight * value_of(line)).sum::<f64>()
+        };
         LinearPath {
             position: [0, 1, 2].map(|c| sum(&|line| line.position[c] + line.velocity[c] * (center - line.center))),
             velocity: [0, 1, 2].map(|c| sum(&|line| line.velocity[c])),
@@ -60,7 +62,7 @@ pub(in crate::models) struct Matched {
     pub(in crate::models) line: LinearPath,
     /// Opacity logit at the center of the window, and covariance (xx xy xz yy yz zz); `None` if the proxy is visible at
     /// no sampled frame.
-    pub(in crate::models) seen: Option<(f32, [f64; 6])>,
+    pub(in crate::models) shape: Option<(f32, [f64; 6])>,
 }
 
 /// Moment match of a proxy's members at one frame.
@@ -79,18 +81,19 @@ pub(in crate::models) struct ProxyAtFrame<'a> {
     pub(in crate::models) row: usize,
 }
 
-/// Matches the proxies of `clusters` to their members. `line_of` returns the path of a member, `fades` the window of a
-/// path at a time. Calls `see` for every sampled frame at which a proxy is visible, with the columns `wanted`.
+/// Matches the proxies of `clusters` to their members. `line_of` returns the path of a member, `window` the window of a
+/// path at a time. Calls `visit` for every sampled frame at which a proxy is visible, with the columns `wanted`.
 ///
-/// # Errors Fails if frames cannot be evaluated.
-pub(in crate::models) fn match_all(
+/// # Errors
+/// Fails if frames cannot be evaluated.
+pub(in crate::models) fn match_proxies(
     source: &dyn FrameSource,
     clusters: &[Cluster],
     rule: &MergeParams,
     line_of: impl Fn(u32) -> LinearPath,
-    fades: impl Fn(&LinearPath, f64) -> f64,
+    window: impl Fn(&LinearPath, f64) -> f64,
     wanted: Columns,
-    mut see: impl FnMut(ProxyAtFrame<'_>),
+    mut visit: impl FnMut(ProxyAtFrame<'_>),
 ) -> Result<Vec<Matched>> {
     let times = &source.info().times;
     let sampled = times.len().min(SAMPLED_FRAMES);
@@ -109,15 +112,15 @@ pub(in crate::models) fn match_all(
         for &frame in &frames {
             let (time, state) = (times[frame], gather_all(&merged, frame, wanted)?);
             for (row, (line, sums)) in lines.iter().zip(&mut sums).enumerate() {
-                let (m, alpha) = (fades(line, time), opacity(state.opacity_logit.row::<1>(row)[0]));
+                let (m, alpha) = (window(line, time), opacity(state.opacity_logit.row::<1>(row)[0]));
                 let weight = m * alpha;
-                if weight > SEEN {
+                if weight > MIN_VISIBLE {
                     sums.add(m, alpha, &state, row);
-                    see(ProxyAtFrame { proxy: first + row, line, time, weight, state: &state, row });
+                    visit(ProxyAtFrame { proxy: first + row, line, time, weight, state: &state, row });
                 }
             }
         }
-        matched.extend(lines.iter().zip(&sums).map(|(&line, sums)| Matched { line, seen: sums.mean() }));
+        matched.extend(lines.iter().zip(&sums).map(|(&line, sums)| Matched { line, shape: sums.mean() }));
     }
     Ok(matched)
 }
@@ -129,7 +132,7 @@ struct FrameSums {
     product: f64,
     /// Σ m².
     square: f64,
-    /// Σ m·α·Σ of the covariances Σ.
+    /// Sum of the covariances, each weighted by m·α.
     covariance: [f64; 6],
 }
 
@@ -139,13 +142,13 @@ impl FrameSums {
         self.product += m * alpha;
         self.square += m * m;
         let scales = state.log_scale.row::<3>(row).map(|x| f64::from(x).exp());
-        let of = covariance(scales, state.rotation.row::<4>(row).map(f64::from));
-        self.covariance.iter_mut().zip(of).for_each(|(sum, of)| *sum += m * alpha * of);
+        let values = covariance(scales, state.rotation.row::<4>(row).map(f64::from));
+        self.covariance.iter_mut().zip(values).for_each(|(sum, value)| *sum += m * alpha * value);
     }
 
     /// Returns the opacity logit and the mean covariance; `None` without visible frames.
     fn mean(&self) -> Option<(f32, [f64; 6])> {
-        let visible = (self.product / self.square).clamp(OPACITIES[0], OPACITIES[1]);
+        let visible = (self.product / self.square).clamp(OPACITY_RANGE[0], OPACITY_RANGE[1]);
         let found = (logit(visible) as f32, self.covariance.map(|sum| sum / self.product));
         (self.product > 0.0).then_some(found)
     }
@@ -170,7 +173,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_blended_path_is_the_weighted_mean_of_its_members_at_every_time() {
+    fn blended_path_is_the_weighted_mean_at_every_time() {
         let line = |k: f64| LinearPath {
             position: [k, 1.0 - k * k, 0.3],
             velocity: [0.2 * k, -1.0 / (1.0 + k), 5.0],

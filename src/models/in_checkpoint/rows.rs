@@ -61,38 +61,43 @@ pub(in crate::models) struct RowTensors {
     count: usize,
     params: Vec<Param>,
     /// Tensors that only training reads.
-    beside: Vec<TensorView>,
+    training_only: Vec<TensorView>,
 }
 
 /// Checkpoint that is being read.
 #[derive(Debug)]
-pub(in crate::models) struct Reading {
+pub(in crate::models) struct CheckpointReader {
     /// Tensors read so far.
-    pub(in crate::models) table: RowTensors,
+    pub(in crate::models) tensors: RowTensors,
     /// Parameters read so far.
     pub(in crate::models) raw: Raw,
 }
 
-impl Reading {
+impl CheckpointReader {
     /// Allocates `count` Gaussians with `own` format-specific planes, all values zero.
     ///
-    /// # Errors Fails if this needs more memory than allowed.
+    /// # Errors
+    /// Fails if this needs more memory than allowed.
     pub(in crate::models) fn new(
         checkpoint: Checkpoint,
         count: usize,
         sh_degree: usize,
         own: usize,
-    ) -> Result<Reading> {
+    ) -> Result<CheckpointReader> {
         let row = state_bytes(sh_degree, Columns::all()) + 4 * own as u64;
         checkpoint.allow("", &format!("its {count} Gaussians"), row.saturating_mul(count as u64))?;
         let raw = Raw { gaussians: Gaussians::zeros(count, sh_degree), own: Column::zeros(own, count) };
-        Ok(Reading { table: RowTensors { checkpoint, count, params: Vec::new(), beside: Vec::new() }, raw })
+        Ok(CheckpointReader {
+            tensors: RowTensors { checkpoint, count, params: Vec::new(), training_only: Vec::new() },
+            raw,
+        })
     }
 
     /// Reads the tensor at `id`. `name` is its name in messages, `row` the expected shape of a row, `planes` the
     /// meaning of its elements.
     ///
-    /// # Errors Fails if there is no floating-point tensor of that shape, or if values are missing or not finite.
+    /// # Errors
+    /// Fails if there is no floating-point tensor of that shape, or if values are missing or not finite.
     pub(in crate::models) fn read(
         &mut self,
         id: NodeId,
@@ -100,9 +105,9 @@ impl Reading {
         row: &[usize],
         planes: Vec<RowElement>,
     ) -> Result<()> {
-        let checkpoint = &self.table.checkpoint;
+        let checkpoint = &self.tensors.checkpoint;
         let tensor = checkpoint.float_tensor(id, name)?;
-        let shape = [&[self.table.count], row].concat();
+        let shape = [&[self.tensors.count], row].concat();
         if tensor.shape != shape {
             return Err(checkpoint.wrong(name, format!("shape {shape:?}"), format!("shape {:?}", tensor.shape)));
         }
@@ -116,21 +121,23 @@ impl Reading {
             };
             to.iter_mut().zip(values.iter().skip(c).step_by(width)).for_each(|(to, from)| *to = *from);
         }
-        self.table.params.push(Param { name: name.to_owned(), tensor, planes });
+        self.tensors.params.push(Param { name: name.to_owned(), tensor, planes });
         Ok(())
     }
 
     /// Adds the tensor at `id` to those that only training reads, if it has a row per Gaussian.
-    pub(in crate::models) fn beside(&mut self, id: NodeId) {
-        let tensor = self.table.checkpoint.tensor(id).filter(|tensor| tensor.shape.first() == Some(&self.table.count));
-        self.table.beside.extend(tensor);
+    pub(in crate::models) fn add_training_tensor(&mut self, id: NodeId) {
+        let tensor =
+            self.tensors.checkpoint.tensor(id).filter(|tensor| tensor.shape.first() == Some(&self.tensors.count));
+        self.tensors.training_only.extend(tensor);
     }
 }
 
 /// Returns the number of rows of the tensor at `id`, called `name` in messages.
 ///
-/// # Errors Fails if there is no tensor with rows.
-pub(in crate::models) fn count_of(checkpoint: &Checkpoint, id: NodeId, name: &str) -> Result<usize> {
+/// # Errors
+/// Fails if there is no tensor with rows.
+pub(in crate::models) fn row_count(checkpoint: &Checkpoint, id: NodeId, name: &str) -> Result<usize> {
     let tensor = checkpoint.float_tensor(id, name)?;
     let rows = tensor.shape.first().copied();
     rows.ok_or_else(|| checkpoint.wrong(name, "a row per Gaussian", tensor.describe()))
@@ -138,22 +145,26 @@ pub(in crate::models) fn count_of(checkpoint: &Checkpoint, id: NodeId, name: &st
 
 impl RowTensors {
     /// Writes the checkpoint of the compressed model to `path`. Rows of parameters are copied byte for byte unless
-    /// `left` (the compressed parameters) differs from `before`. Rows of merged Gaussians in tensors that only training
+    /// `raw_left` (the compressed parameters) differs from `before`. Rows of merged Gaussians in tensors that only training
     /// reads become zero.
     ///
-    /// # Errors Fails if a tensor cannot be read or a write fails.
+    /// # Errors
+    /// Fails if a tensor cannot be read or a write fails.
     pub(in crate::models) fn write(
         &self,
         before: &Raw,
-        left: &Raw,
+        raw_left: &Raw,
         reduction: &CompressedModel,
         path: &Path,
     ) -> Result<()> {
         let mut rows = Vec::new();
         for Param { name, tensor, planes } in &self.params {
-            let pairs: Vec<_> = planes.iter().map(|plane| plane.get(left).zip(plane.get(before))).collect();
+            let pairs: Vec<_> = planes.iter().map(|plane| plane.get(raw_left).zip(plane.get(before))).collect();
             let differs = |place: usize, row: u32| {
-                pairs.iter().flatten().any(|(left, before)| left[place].to_bits() != before[row as usize].to_bits())
+                pairs
+                    .iter()
+                    .flatten()
+                    .any(|(raw_left, before)| raw_left[place].to_bits() != before[row as usize].to_bits())
             };
             let changed: Vec<u32> = (0u32..)
                 .zip(&reduction.kept)
@@ -166,7 +177,7 @@ impl RowTensors {
             for &place in &changed {
                 let row = reduction.kept[place as usize] as usize * planes.len();
                 values.extend(pairs.iter().enumerate().map(|(c, pair)| match pair {
-                    Some((left, _)) => left[place as usize],
+                    Some((raw_left, _)) => raw_left[place as usize],
                     None => stored[row + c],
                 }));
             }
@@ -174,8 +185,8 @@ impl RowTensors {
         }
         let mut merged: Vec<u32> = reduction.clusters.iter().map(|cluster| cluster.output).collect();
         merged.sort_unstable();
-        let beside = self.beside.iter();
-        rows.extend(beside.map(|tensor| GaussianRows {
+        let training_only = self.training_only.iter();
+        rows.extend(training_only.map(|tensor| GaussianRows {
             tensor: tensor.clone(),
             changed: merged.clone(),
             values: Vec::new(),

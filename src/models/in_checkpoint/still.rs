@@ -35,7 +35,7 @@ impl MotionModel for Still {
 }
 
 impl ProxyRule for Still {
-    fn proposed(model: &MotionModelFrames<Still>, clusters: &[Cluster], rule: &MergeParams) -> Result<Raw> {
+    fn propose(model: &MotionModelFrames<Still>, clusters: &[Cluster], rule: &MergeParams) -> Result<Raw> {
         let leaders: Vec<u32> = clusters.iter().map(|cluster| cluster.leader).collect();
         let members = clusters.iter().zip(0..).map(|(cluster, place)| (place, &cluster.members[..]));
         let merged = MergedSequence::new(model, &leaders, members, rule);
@@ -44,5 +44,5 @@ impl ProxyRule for Still {
         Ok(raw)
     }
 
-    fn follow(&self, _: &mut Xxh3) {}
+    fn hash_settings(&self, _: &mut Xxh3) {}
 }

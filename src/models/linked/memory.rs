@@ -12,23 +12,23 @@ use crate::tracking::{Joiner, Linker};
 /// Maximum bytes of frames that are packed or unpacked together; at least one frame is.
 pub(super) const TOGETHER_BYTES: u64 = 128 << 20;
 /// Bytes of a row in the list of rows of a frame: the row and a copy for sorting.
-const PER_ROW: u64 = 16;
+const BYTES_PER_ROW: u64 = 16;
 /// Number of frames rendered before and after tracks are joined or attributes made constant.
-pub(super) const LOOKED_AT: usize = 3;
+pub(super) const SAMPLED_FRAMES: usize = 3;
 /// Bytes of two renders by a virtual camera and of their comparison.
-const PICTURES: u64 = 16 << 20;
+const RENDER_BYTES: u64 = 16 << 20;
 
-/// Figures that determine the memory of linked frames.
+/// Counts from which the memory of linked frames is estimated.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Sizes {
     /// Maximum number of Gaussians in a frame.
-    pub(super) of_frame: u64,
+    pub(super) frame_gaussians: u64,
     /// SH degree.
     pub(super) sh_degree: usize,
     /// Number of tracks found by linking, before any are joined.
     pub(super) linked: u64,
     /// Peak number of tracks that may continue in the next frame.
-    pub(super) living: u64,
+    pub(super) live_tracks: u64,
 }
 
 impl Sizes {
@@ -45,7 +45,7 @@ impl Sizes {
 
     /// Returns the bytes of the largest frame file.
     pub(super) fn frame_file(&self) -> u64 {
-        self.of_frame * self.file()
+        self.frame_gaussians * self.file()
     }
 
     /// Returns the number of frames that are packed together: whole tiles if frames are small.
@@ -67,10 +67,10 @@ impl Sizes {
     /// Returns the bytes of linking: a frame and its compared attributes, the tracks that may continue, and for every
     /// track its first row and its last state.
     fn linking(&self) -> u64 {
-        let of_frame = self.file() + self.state() + Linker::BYTES_PER_GAUSSIAN as u64 + PER_ROW;
+        let of_frame = self.file() + self.state() + Linker::BYTES_PER_GAUSSIAN as u64 + BYTES_PER_ROW;
         let of_living = (Linker::BYTES_PER_TRACK + Joiner::BYTES_PER_LIVING) as u64;
         let of_track = 2 * 8 + Joiner::BYTES_PER_TRACK as u64;
-        self.of_frame * of_frame + self.living * of_living + self.linked * of_track
+        self.frame_gaussians * of_frame + self.live_tracks * of_living + self.linked * of_track
     }
 
     /// Returns the bytes of the larger of two steps: summing (sums of a batch of tracks and a frame, per thread), or
@@ -79,12 +79,12 @@ impl Sizes {
     fn holding(&self) -> u64 {
         let threads = rayon::current_num_threads() as u64;
         let sums = self.linked.min(BATCH as u64) * TrackSums::bytes(self.sh_degree);
-        let summing = threads * (sums + self.of_frame * (self.file() + self.state() + PER_ROW));
-        let frames = (2 * LOOKED_AT as u64 + 1) * self.state() + self.file() + 2 * PER_ROW;
-        let pictures = PICTURES + threads * STRIP_BYTES as u64;
-        let looking = self.of_frame * (frames + 2 * BYTES_PER_VISIBLE as u64) + pictures;
+        let summing = threads * (sums + self.frame_gaussians * (self.file() + self.state() + BYTES_PER_ROW));
+        let frames = (2 * SAMPLED_FRAMES as u64 + 1) * self.state() + self.file() + 2 * BYTES_PER_ROW;
+        let renders = RENDER_BYTES + threads * STRIP_BYTES as u64;
+        let rendering = self.frame_gaussians * (frames + 2 * BYTES_PER_VISIBLE as u64) + renders;
         // First row of each track, a copy in the order of joined tracks, and the lengths of tracks.
-        self.open() + 2 * 8 * self.linked + summing.max(looking)
+        self.open() + 2 * 8 * self.linked + summing.max(rendering)
     }
 
     /// Returns the bytes of packing: a block of frames, the last row of each track, and a tile of every column per
@@ -92,10 +92,10 @@ impl Sizes {
     fn packing(&self) -> u64 {
         let frames = self.frame_block() as u64;
         let blocks = (GAUSSIAN_BLOCK as u64).min(self.linked) * (3 * frames + 4) * self.state();
-        let of_frame = self.file() + PER_ROW;
+        let of_frame = self.file() + BYTES_PER_ROW;
         self.open()
             + 8 * self.linked
-            + frames * self.of_frame * of_frame
+            + frames * self.frame_gaussians * of_frame
             + 2 * rayon::current_num_threads() as u64 * blocks
     }
 }

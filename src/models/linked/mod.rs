@@ -13,8 +13,8 @@
 //! Gaussian and frame, and 4 per track and value that may be constant.
 
 mod arrival;
-mod lives;
 mod memory;
+mod simplify;
 mod steady;
 mod tracks;
 mod write;
@@ -51,11 +51,11 @@ pub struct LinkedFrames {
     /// Owner of the container's file, which is deleted when the input is dropped.
     _scratch: ScratchFile,
     /// Origin of the frames if they were not read from PLY files of the user.
-    arrived: Option<Arrived>,
+    origin: Option<Origin>,
 }
 
 /// Origin of frames that did not come from PLY files of the user.
-struct Arrived {
+struct Origin {
     /// Owner of their temporary PLY files, which are deleted when the input is dropped.
     _folder: ScratchFolder,
     /// Name of the input, shown to users.
@@ -70,8 +70,9 @@ impl LinkedFrames {
     /// Links `frames`. If `joins`, also joins tracks of the same Gaussian and makes nearly constant attributes
     /// constant. The notes give the reason `why` frames were linked. Messages call the frames `name`.
     ///
-    /// # Errors Fails if a frame cannot be read or has changed meanwhile, if linking needs more memory than `options`
-    /// allow, or if a write fails.
+    /// # Errors
+    /// Fails if a frame cannot be read or has changed meanwhile, if linking needs more memory than `options` allow, or
+    /// if a write fails.
     pub(super) fn open(
         frames: PlyFrames,
         name: &Path,
@@ -82,9 +83,9 @@ impl LinkedFrames {
         let scratch = &*options.scratch;
         let mut joiner = joins.then(Joiner::default);
         let (mut tracks, found, linker) = LinkedTracks::link(frames, name, joiner.as_mut(), options)?;
-        let joined = joiner.map(|joiner| lives::join(joiner, &linker, &mut tracks)).transpose()?.flatten();
+        let joined = joiner.map(|joiner| simplify::join(joiner, &linker, &mut tracks)).transpose()?.flatten();
         drop(linker);
-        let held = if joins { lives::hold(&mut tracks, scratch)? } else { None };
+        let held = if joins { simplify::hold_steady(&mut tracks, scratch)? } else { None };
         let packed = ScratchFile::new(scratch)?;
         tracks.pack(packed.path(), &options.events)?;
         let container = Container::open(packed.path())?;
@@ -92,7 +93,7 @@ impl LinkedFrames {
         let mut notes = vec![format!("frames were linked: {why}")];
         notes.extend(found.notes(&tracks)?);
         notes.extend(joined.into_iter().chain(held));
-        Ok(LinkedFrames { tracks, container, info, notes, _scratch: packed, arrived: None })
+        Ok(LinkedFrames { tracks, container, info, notes, _scratch: packed, origin: None })
     }
 }
 
@@ -120,7 +121,7 @@ impl FrameSource for LinkedFrames {
 
 impl InputModel for LinkedFrames {
     fn kind(&self) -> &'static str {
-        self.arrived.as_ref().map_or("linked PLY frames", |arrived| arrived.kind)
+        self.origin.as_ref().map_or("linked PLY frames", |origin| origin.kind)
     }
 
     fn source(&self) -> &dyn FrameSource {
@@ -134,9 +135,9 @@ impl InputModel for LinkedFrames {
     }
 
     fn bytes(&self) -> Result<u64> {
-        match &self.arrived {
+        match &self.origin {
             None => bytes_of(self.tracks.frames().paths().iter().map(PathBuf::as_path)),
-            Some(arrived) => Ok(arrived.bytes),
+            Some(origin) => Ok(origin.bytes),
         }
     }
 
@@ -150,10 +151,10 @@ impl InputModel for LinkedFrames {
 
     fn residence(&self) -> MemoryProfile {
         let (sizes, count) = (self.tracks.sizes(), self.info.count.max(1) as u64);
-        let arriving = self.arrived.as_ref().map_or(0, |arrived| arrived.memory);
+        let receiving = self.origin.as_ref().map_or(0, |origin| origin.memory);
         MemoryProfile {
             per_gaussian: sizes.open().div_ceil(count),
-            opening: sizes.opening().max(arriving).div_ceil(count),
+            opening: sizes.opening().max(receiving).div_ceil(count),
             file: sizes.frame_file().div_ceil(count),
             ..self.container.residence()
         }
@@ -164,7 +165,7 @@ impl InputModel for LinkedFrames {
     }
 
     fn timing(&self) -> Timing {
-        match self.arrived {
+        match self.origin {
             None => Timing::Numbered,
             Some(_) => Timing::Stamped,
         }

@@ -21,7 +21,7 @@ use crate::error::Result;
 use crate::model::{Columns, Gaussians};
 
 /// Columns that may become constant. Positions always move.
-const HELD: Columns = Columns::all().difference(Columns::POSITION);
+const STEADY_COLUMNS: Columns = Columns::all().difference(Columns::POSITION);
 /// Number of tracks per batch in which a thread computes means.
 pub(super) const BATCH: usize = 1 << 16;
 
@@ -38,7 +38,7 @@ pub(super) struct Bound {
 pub(super) struct Steady {
     /// Constant columns of every track.
     columns: Vec<Columns>,
-    /// Means of the columns [`HELD`] of every track, track by track, plane by plane.
+    /// Means of the columns [`STEADY_COLUMNS`] of every track, track by track, plane by plane.
     means: Spill,
     sh_degree: usize,
 }
@@ -53,7 +53,8 @@ impl Steady {
     /// Finds the columns that change by at most `bound` along each of `count` tracks. `sums` returns the sums of a
     /// range of tracks.
     ///
-    /// # Errors Fails if `sums` fails or a write to `scratch` fails.
+    /// # Errors
+    /// Fails if `sums` fails or a write to `scratch` fails.
     pub(super) fn from_sums(
         count: usize,
         sh_degree: usize,
@@ -63,8 +64,8 @@ impl Steady {
     ) -> Result<Steady> {
         let (mut columns, mut means) = (Vec::with_capacity(count), SpillWriter::new(scratch)?);
         let batches: Vec<Range<usize>> = (0..count).step_by(BATCH).map(|at| at..count.min(at + BATCH)).collect();
-        for at_once in batches.chunks(rayon::current_num_threads()) {
-            for sums in at_once.par_iter().cloned().map(&sums).collect::<Result<Vec<TrackSums>>>()? {
+        for batch in batches.chunks(rayon::current_num_threads()) {
+            for sums in batch.par_iter().cloned().map(&sums).collect::<Result<Vec<TrackSums>>>()? {
                 for track in 0..sums.len() {
                     columns.push(sums.steady(track, bound));
                     means.write(bytemuck::cast_slice(&sums.means(track)))?;
@@ -83,15 +84,16 @@ impl Steady {
     }
 
     /// Returns whether any column of `track` is constant.
-    pub(super) fn holds(&self, track: u32) -> bool {
+    pub(super) fn has_steady(&self, track: u32) -> bool {
         !self.columns[track as usize].is_empty()
     }
 
     /// Returns the constant columns of `tracks`, in their order. Cheap if `tracks` are in increasing order.
     ///
-    /// # Errors Fails if a read fails.
+    /// # Errors
+    /// Fails if a read fails.
     pub(super) fn means(&self, tracks: &[u32]) -> Result<HeldMeans> {
-        let width = HELD.width(self.sh_degree);
+        let width = STEADY_COLUMNS.width(self.sh_degree);
         let mut values = Gaussians::zeros(tracks.len(), self.sh_degree);
         let (mut at, mut read) = (0, Vec::new());
         for following in tracks.chunk_by(|a, b| a + 1 == *b) {
@@ -99,7 +101,7 @@ impl Steady {
             self.means.read(4 * width as u64 * u64::from(following[0]), bytemuck::cast_slice_mut(&mut read))?;
             for row in read.chunks_exact(width) {
                 let mut row = row.iter();
-                for column in values.columns_mut(HELD) {
+                for column in values.columns_mut(STEADY_COLUMNS) {
                     (0..column.width()).zip(&mut row).for_each(|(c, &value)| column.plane_mut(c)[at] = value);
                 }
                 at += 1;
@@ -112,9 +114,9 @@ impl Steady {
 impl HeldMeans {
     /// Writes constant columns to `state`. Each pair of `places` is the index of a track in this object and a row of
     /// `state`.
-    pub(super) fn hold(&self, places: impl Iterator<Item = (usize, usize)>, state: &mut Gaussians) {
+    pub(super) fn write_to(&self, places: impl Iterator<Item = (usize, usize)>, state: &mut Gaussians) {
         let places: Vec<(usize, usize)> = places.filter(|&(at, _)| !self.columns[at].is_empty()).collect();
-        for column in HELD.iter() {
+        for column in STEADY_COLUMNS.iter() {
             let held = places.iter().filter(|(at, _)| self.columns[*at].contains(column));
             let (from, to) = (self.values.column(column), state.column_mut(column));
             for c in 0..to.width() {
@@ -130,10 +132,10 @@ pub(super) struct TrackSums {
     sh_width: usize,
     /// Σ 1, Σ α, Σ α² of each track.
     opacity: Vec<[f64; 3]>,
-    /// Σ α·v of the columns [`HELD`].
+    /// Σ α·v of the columns [`STEADY_COLUMNS`].
     values: Vec<f64>,
     /// Σ α·q/|q| of the quaternions.
-    turns: Vec<[f64; 4]>,
+    rotations: Vec<[f64; 4]>,
     /// Σ α·v² of the log scales.
     scales: Vec<[f64; 3]>,
     /// Σ α·Σₖ vₖ² of each color channel.
@@ -148,8 +150,8 @@ impl TrackSums {
         TrackSums {
             sh_width: Columns::SH.width(sh_degree),
             opacity: vec![[0.0; 3]; len],
-            values: vec![0.0; HELD.width(sh_degree) * len],
-            turns: vec![[0.0; 4]; len],
+            values: vec![0.0; STEADY_COLUMNS.width(sh_degree) * len],
+            rotations: vec![[0.0; 4]; len],
             scales: vec![[0.0; 3]; len],
             colors: vec![[0.0; 3]; len],
             first: vec![[0.0; 4]; len],
@@ -158,7 +160,7 @@ impl TrackSums {
 
     /// Returns the bytes per track.
     pub(super) fn bytes(sh_degree: usize) -> u64 {
-        (8 * (3 + HELD.width(sh_degree) + 4 + 3 + 3) + 16) as u64
+        (8 * (3 + STEADY_COLUMNS.width(sh_degree) + 4 + 3 + 3) + 16) as u64
     }
 
     fn len(&self) -> usize {
@@ -179,17 +181,17 @@ impl TrackSums {
         let along: f32 = turn.iter().zip(&self.first[track]).map(|(a, b)| a * b).sum();
         let turn = turn.map(|q| f64::from(if along < 0.0 { -q } else { q }));
         let length = turn.iter().map(|q| q * q).sum::<f64>().sqrt();
-        for (sum, q) in self.turns[track].iter_mut().zip(turn) {
+        for (sum, q) in self.rotations[track].iter_mut().zip(turn) {
             *sum += alpha * q / length;
         }
         let width = self.values.len() / self.opacity.len();
         let values = &mut self.values[track * width..][..width];
-        let (sums_of_turns, others) = values.split_at_mut(4);
-        for (sum, q) in sums_of_turns.iter_mut().zip(turn) {
+        let (rotation_sums, others) = values.split_at_mut(4);
+        for (sum, q) in rotation_sums.iter_mut().zip(turn) {
             *sum += alpha * q;
         }
-        let (sums_of_scales, others) = others.split_at_mut(3);
-        for (c, sum) in sums_of_scales.iter_mut().enumerate() {
+        let (scale_sums, others) = others.split_at_mut(3);
+        for (c, sum) in scale_sums.iter_mut().enumerate() {
             let value = f64::from(state.log_scale.plane(c)[at]);
             *sum += alpha * value;
             self.scales[track][c] += alpha * value * value;
@@ -202,7 +204,7 @@ impl TrackSums {
         }
     }
 
-    /// Returns the means of the columns [`HELD`] of `track`.
+    /// Returns the means of the columns [`STEADY_COLUMNS`] of `track`.
     fn means(&self, track: usize) -> Vec<f32> {
         let width = self.values.len() / self.opacity.len();
         let [_, weight, _] = self.opacity[track];
@@ -215,7 +217,7 @@ impl TrackSums {
         let width = self.values.len() / self.opacity.len();
         let mean: Vec<f64> = self.values[track * width..][..width].iter().map(|sum| sum / weight).collect();
         let (scales, colors) = (&mean[4..7], &mean[width - self.sh_width..]);
-        let turn = 4.0 * (1.0 - self.turns[track].iter().map(|sum| (sum / weight).powi(2)).sum::<f64>());
+        let turn = 4.0 * (1.0 - self.rotations[track].iter().map(|sum| (sum / weight).powi(2)).sum::<f64>());
         let within = |variance: f64, bound: f64| variance <= bound * bound;
         let are_scales = (0..3).all(|c| within(self.scales[track][c] / weight - scales[c].powi(2), bound.other));
         let are_colors = (0..3).all(|channel| {

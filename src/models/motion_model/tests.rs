@@ -53,7 +53,7 @@ fn model() -> MotionModelFrames<Straight> {
 }
 
 #[test]
-fn the_same_gaussian_at_the_same_frame_has_the_same_bits_however_it_is_read() {
+fn every_reader_returns_the_same_bits() {
     let model = model();
     let all = gather_all(&model, 2, Columns::all()).unwrap();
     let ids: Vec<u32> = (0..model.info().count as u32).rev().step_by(2).collect();
@@ -71,7 +71,7 @@ fn the_same_gaussian_at_the_same_frame_has_the_same_bits_however_it_is_read() {
 }
 
 #[test]
-fn what_is_left_has_its_own_values_proxies_in_their_places_and_its_changes() {
+fn compressed_model_has_survivors_proxies_and_deltas() {
     let (model, rule) = (model(), Recipe::preset("default").unwrap().merge);
     let mut reduction = CompressedModel::pruned(vec![3, 8, 11], &rule);
     reduction.clusters.push(Cluster { output: 1, leader: 8, members: vec![(8, 0.5), (9, 0.5)] });
@@ -87,7 +87,7 @@ fn what_is_left_has_its_own_values_proxies_in_their_places_and_its_changes() {
 }
 
 #[test]
-fn proxies_that_stray_at_any_frame_are_refused() {
+fn proxies_that_drift_at_any_frame_are_refused() {
     let (model, mut rule) = (model(), Recipe::preset("default").unwrap().merge);
     rule.max_drift = 0.1;
     let reference = Reference { frame: 0, extent: 1.0 };

@@ -7,7 +7,7 @@ use crate::error::{Error, Result, quoted};
 use crate::files::python_literal::{Literal, parse_call};
 use crate::files::text::read_text;
 use crate::models::four_d_gaussians::cfg_args;
-use crate::models::in_checkpoint::texts_in;
+use crate::models::in_checkpoint::yaml_files_in;
 
 /// Values of the training configuration that are used.
 #[derive(Debug, Default)]
@@ -24,7 +24,8 @@ pub(super) struct TrainingConfig {
 impl TrainingConfig {
     /// Reads the configuration of the model in the folder `root`.
     ///
-    /// # Errors Fails if a file cannot be read or parsed, or if two files contradict each other.
+    /// # Errors
+    /// Fails if a file cannot be read or parsed, or if two files contradict each other.
     pub(super) fn read(root: &Path) -> Result<TrainingConfig> {
         let mut found = TrainingConfig { time_duration: time_duration(root)?, ..TrainingConfig::default() };
         let path = root.join("cfg_args");
@@ -48,10 +49,10 @@ impl TrainingConfig {
 /// Returns the period L from the YAML files in `root`, and the name of the file.
 fn time_duration(root: &Path) -> Result<Option<(f64, String)>> {
     let mut found: Option<(f64, String)> = None;
-    for path in texts_in(root) {
+    for path in yaml_files_in(root) {
         // Unrelated text files may be unreadable.
         let Ok(text) = read_text(&path, 1 << 20) else { continue };
-        let Some(span) = span(&text) else { continue };
+        let Some(span) = time_duration_entries(&text) else { continue };
         let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
         let wrong = |expected: String, found: String| Err(Error::input(&path, "key time_duration", expected, found));
         let length = match span[..] {
@@ -72,7 +73,7 @@ fn time_duration(root: &Path) -> Result<Option<(f64, String)>> {
 }
 
 /// Returns the entries of the list `time_duration` of a YAML, written in one line or one per line.
-fn span(text: &str) -> Option<Vec<&str>> {
+fn time_duration_entries(text: &str) -> Option<Vec<&str>> {
     let mut lines = text.lines().map(|line| line.split('#').next().unwrap_or_default().trim_end());
     let after = lines.find_map(|line| line.strip_prefix("time_duration:"))?.trim();
     Some(match after.is_empty() {
@@ -88,19 +89,19 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_span_is_found_however_its_list_is_written() {
+    fn time_duration_is_found_in_every_list_notation() {
         for (text, expected) in [
             ("gaussian_dim: 4\ntime_duration: [0.0, 10.0] # seconds\nModelParams:\n", Some(vec!["0.0", "10.0"])),
             ("time_duration:\n- -0.5\n  - 0.5\nrot_4d: True\n", Some(vec!["-0.5", "0.5"])),
             ("time_duration: soon\n", Some(vec!["soon"])),
             ("ModelParams:\n  time_duration: [0, 1]\n", None),
         ] {
-            assert_eq!(span(text), expected, "{text}");
+            assert_eq!(time_duration_entries(text), expected, "{text}");
         }
     }
 
     #[test]
-    fn configurations_beside_a_model_say_its_length_or_what_is_wrong() {
+    fn configuration_files_give_the_duration_or_an_error() {
         let root = tempfile::tempdir().unwrap();
         let write = |name: &str, text: &str| fs::write(root.path().join(name), text).unwrap();
         let read = || time_duration(root.path());

@@ -5,12 +5,12 @@
 //! moment match at the sampled frames are fitted by 1, cos and cos of the double angle (least squares, with a ridge
 //! term on the waves).
 
-use super::law::{Native, ROTATION_R, SCALING_T, TERM, TERMS, TIME};
+use super::frame_state::{Native, ROTATION_R, SCALING_T, TERM_WIDTH, TERMS, TIME};
 use super::rotation::{decomposed, quaternions};
 use crate::compressed_model::Cluster;
 use crate::error::Result;
 use crate::model::{Columns, Raw, scale_rotation};
-use crate::models::in_checkpoint::linear::{LinearPath, match_all};
+use crate::models::in_checkpoint::linear::{LinearPath, match_proxies};
 use crate::models::motion_model::MotionModelFrames;
 use crate::recipe::MergeParams;
 
@@ -20,11 +20,12 @@ const RIDGE: f64 = 1e-3;
 
 /// Returns the raw parameters of the proxies of `clusters`.
 ///
-/// # Errors Fails if frames cannot be evaluated.
-pub(super) fn proposed(model: &MotionModelFrames<Native>, clusters: &[Cluster], rule: &MergeParams) -> Result<Raw> {
-    let (raw, law) = (model.raw(), model.law());
+/// # Errors
+/// Fails if frames cannot be evaluated.
+pub(super) fn propose(model: &MotionModelFrames<Native>, clusters: &[Cluster], rule: &MergeParams) -> Result<Raw> {
+    let (raw, motion_model) = (model.raw(), model.motion_model());
     let line = |id: u32| {
-        let slice = law.slice(raw, id as usize);
+        let slice = motion_model.slice(raw, id as usize);
         LinearPath {
             position: raw.gaussians.position.row::<3>(id as usize).map(f64::from),
             velocity: slice.velocity,
@@ -32,32 +33,32 @@ pub(super) fn proposed(model: &MotionModelFrames<Native>, clusters: &[Cluster], 
             deviation: slice.variance.sqrt(),
         }
     };
-    let fades = |line: &LinearPath, time: f64| law.marginal(time, line.center, line.deviation.powi(2));
+    let window = |line: &LinearPath, time: f64| motion_model.marginal(time, line.center, line.deviation.powi(2));
     let mut fits = vec![ThreeFunctionFit::default(); clusters.len()];
-    let matched = match_all(model, clusters, rule, line, fades, Columns::SH, |seen| {
-        let [first, second] = law.waves(seen.time, seen.line.center);
-        let of = &seen.state.sh;
-        let values = (0..of.width()).map(|c| f64::from(of.plane(c)[seen.row]));
+    let matched = match_proxies(model, clusters, rule, line, window, Columns::SH, |seen| {
+        let [first, second] = motion_model.waves(seen.time, seen.line.center);
+        let sh = &seen.state.sh;
+        let values = (0..sh.width()).map(|c| f64::from(sh.plane(c)[seen.row]));
         fits[seen.proxy].add(seen.weight, [1.0, first, second], values);
     })?;
     let leaders: Vec<u32> = clusters.iter().map(|cluster| cluster.leader).collect();
     let mut proxies = raw.pick(&leaders);
     for (row, (matched, fit)) in matched.iter().zip(&fits).enumerate() {
-        let Some((opacity, covariance)) = matched.seen else { continue };
+        let Some((opacity, covariance)) = matched.shape else { continue };
         let Raw { gaussians, own } = &mut proxies;
         let LinearPath { position, velocity, center, deviation } = matched.line;
         let variance = deviation.powi(2);
         gaussians.position.set_row(row, position.map(|x| x as f32));
         gaussians.opacity_logit.set_row(row, [opacity]);
         own.plane_mut(TIME)[row] = center as f32;
-        if law.turns {
+        if motion_model.has_4d_rotation {
             let [xx, xy, xz, yy, yz, zz] = covariance;
             let space = [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]];
             let velocity = [velocity[0], velocity[1], velocity[2], 1.0];
             let mut whole = [0, 1, 2, 3].map(|i| [0, 1, 2, 3].map(|j| velocity[i] * velocity[j] * variance));
             (0..3).for_each(|i| (0..3).for_each(|j| whole[i][j] += space[i][j]));
             let (scales, rotation) = decomposed(&whole);
-            let [l, r] = quaternions(&rotation, law.flipped);
+            let [l, r] = quaternions(&rotation, motion_model.flipped);
             let [x, y, z, along] = scales.map(|scale| scale.ln() as f32);
             gaussians.log_scale.set_row(row, [x, y, z]);
             gaussians.rotation.set_row(row, l.map(|q| q as f32));
@@ -69,9 +70,10 @@ pub(super) fn proposed(model: &MotionModelFrames<Native>, clusters: &[Cluster], 
             gaussians.rotation.set_row(row, rotation.map(|q| q as f32));
             own.plane_mut(SCALING_T)[row] = variance.ln() as f32;
         }
-        for (c, [constant, waves @ ..]) in fit.solve(law.terms).enumerate() {
+        for (c, [constant, waves @ ..]) in fit.solve(motion_model.terms).enumerate() {
             gaussians.sh.plane_mut(c)[row] = constant as f32;
-            (0..law.terms).for_each(|term| own.plane_mut(TERMS + term * TERM + c)[row] = waves[term] as f32);
+            (0..motion_model.terms)
+                .for_each(|term| own.plane_mut(TERMS + term * TERM_WIDTH + c)[row] = waves[term] as f32);
         }
     }
     Ok(proxies)
@@ -111,8 +113,8 @@ impl ThreeFunctionFit {
         }
         let inverse = glam::DMat3::from_cols_array_2d(&normal).transpose().inverse();
         self.by_value.iter().map(move |&[a, b, c]| {
-            let of = [a, if terms > 0 { b } else { 0.0 }, if terms > 1 { c } else { 0.0 }];
-            (inverse * glam::DVec3::from(of)).to_array()
+            let sums = [a, if terms > 0 { b } else { 0.0 }, if terms > 1 { c } else { 0.0 }];
+            (inverse * glam::DVec3::from(sums)).to_array()
         })
     }
 }
@@ -122,7 +124,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn waves_are_found_where_frames_show_them_and_small_where_they_do_not() {
+    fn waves_are_fitted_only_if_frames_show_them() {
         let wave = |k: i32, center: f64| {
             let turn = std::f64::consts::TAU * (center - 0.05 * f64::from(k));
             [1.0, turn.cos(), (2.0 * turn).cos()]

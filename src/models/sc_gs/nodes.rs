@@ -34,13 +34,14 @@ pub(super) struct Share {
     /// Normalized weight u, between 0 and 1.
     pub(super) weight: f64,
     /// Kernel of the node before 1e-7 is added.
-    counts: f64,
+    kernel: f64,
 }
 
 impl Nodes {
     /// Reads the nodes from `tensors`. `nearest` is the number K of nodes that move a Gaussian.
     ///
-    /// # Errors Fails if tensors are missing, have other shapes or are not finite.
+    /// # Errors
+    /// Fails if tensors are missing, have other shapes or are not finite.
     pub(super) fn new(tensors: &Tensors, nearest: usize, file: &Path) -> Result<Nodes> {
         let get = |name: &str, expected: &str, fits: &dyn Fn(&[usize]) -> bool| -> Result<&Tensor> {
             let place = format!("tensor {name}");
@@ -104,28 +105,28 @@ impl Nodes {
                 nearest.truncate(self.nearest);
             }
         }
-        let counts = |&(distance, node): &(f64, u32)| {
+        let kernel = |&(distance, node): &(f64, u32)| {
             let [sharpness, weight] = self.kernels[node as usize];
             (-distance * sharpness).exp() * weight
         };
-        let sum: f64 = nearest.iter().map(|found| counts(found) + FLOOR).sum();
+        let sum: f64 = nearest.iter().map(|found| kernel(found) + FLOOR).sum();
         out.extend(nearest.iter().map(|found| {
-            let counts = counts(found);
-            Share { node: found.1, weight: (counts + FLOOR) / sum, counts }
+            let kernel = kernel(found);
+            Share { node: found.1, weight: (kernel + FLOOR) / sum, kernel }
         }));
     }
 
     /// Returns the derivative of each weight in `shares` with respect to the position `x`.
     pub(super) fn slopes(&self, x: [f32; 3], shares: &[Share]) -> Vec<[f64; 3]> {
-        let sum: f64 = shares.iter().map(|share| share.counts + FLOOR).sum();
+        let sum: f64 = shares.iter().map(|share| share.kernel + FLOOR).sum();
         let own = |share: &Share| {
             let node = &self.values[share.node as usize * self.width..][..3];
-            let by = -2.0 * self.kernels[share.node as usize][0] * share.counts;
+            let by = -2.0 * self.kernels[share.node as usize][0] * share.kernel;
             [0, 1, 2].map(|c| by * (f64::from(x[c]) - f64::from(node[c])))
         };
         let all: Vec<[f64; 3]> = shares.iter().map(own).collect();
         let total = [0, 1, 2].map(|c| all.iter().map(|own| own[c]).sum::<f64>());
-        let of = |(share, own): (&Share, &[f64; 3])| [0, 1, 2].map(|c| (own[c] - share.weight * total[c]) / sum);
-        shares.iter().zip(&all).map(of).collect()
+        let slope = |(share, own): (&Share, &[f64; 3])| [0, 1, 2].map(|c| (own[c] - share.weight * total[c]) / sum);
+        shares.iter().zip(&all).map(slope).collect()
     }
 }

@@ -32,7 +32,8 @@ pub(super) fn check_kind(kind: OutputKind, is_full: bool) -> Result<()> {
     match kind {
         OutputKind::Archive => Err(Error::usage(NO_ARCHIVE)),
         OutputKind::Splatv if is_full => Err(Error::usage(
-            "a .splatv has colours, not features: it holds lite models of SpacetimeGaussians alone\n  write a model folder or a .gseq",
+            "a .splatv stores colors, not features: it holds only lite models of SpacetimeGaussians\n  write a model \
+             folder or a .gseq",
         )),
         _ => Ok(()),
     }

@@ -18,7 +18,7 @@ const HIDDEN: usize = 6;
 
 /// Function applied to a color as the last step.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Act {
+pub(super) enum ColorActivation {
     /// Logistic function.
     Sigmoid,
     /// Clamp to 0 … 1.
@@ -27,13 +27,13 @@ pub(super) enum Act {
     None,
 }
 
-impl Act {
+impl ColorActivation {
     /// Returns the function that `rgbfunction` of `cfg_args` names; `None` for other names.
-    pub(super) fn named(name: &str) -> Option<Act> {
+    pub(super) fn named(name: &str) -> Option<ColorActivation> {
         match name {
-            "sandwich" => Some(Act::Sigmoid),
-            "sandwichnoact" => Some(Act::Clamp),
-            "sandwichnoactss" => Some(Act::None),
+            "sandwich" => Some(ColorActivation::Sigmoid),
+            "sandwichnoact" => Some(ColorActivation::Clamp),
+            "sandwichnoactss" => Some(ColorActivation::None),
             _ => None,
         }
     }
@@ -41,9 +41,9 @@ impl Act {
     /// Applies the function to a color value.
     pub(super) fn apply(self, x: f64) -> f64 {
         match self {
-            Act::Sigmoid => 1.0 / (1.0 + (-x).exp()),
-            Act::Clamp => x.clamp(0.0, 1.0),
-            Act::None => x,
+            ColorActivation::Sigmoid => 1.0 / (1.0 + (-x).exp()),
+            ColorActivation::Clamp => x.clamp(0.0, 1.0),
+            ColorActivation::None => x,
         }
     }
 }
@@ -53,14 +53,15 @@ impl Act {
 pub(super) struct ColorDecoder {
     first: [[f64; INPUTS]; HIDDEN],
     second: [[f64; HIDDEN]; 3],
-    act: Act,
+    activation: ColorActivation,
 }
 
 impl ColorDecoder {
     /// Reads the network from the state dict `tensors` of the file `path`.
     ///
-    /// # Errors Fails if weights are missing, have other shapes or are not finite.
-    pub(super) fn new(tensors: &Tensors, act: Act, path: &Path) -> Result<ColorDecoder> {
+    /// # Errors
+    /// Fails if weights are missing, have other shapes or are not finite.
+    pub(super) fn new(tensors: &Tensors, activation: ColorActivation, path: &Path) -> Result<ColorDecoder> {
         let weights = |name: &str, shape: [usize; 4]| {
             let place = || format!("tensor {name}");
             let expected = format!("shape {shape:?}");
@@ -88,7 +89,7 @@ impl ColorDecoder {
         Ok(ColorDecoder {
             first: std::array::from_fn(|i| std::array::from_fn(|j| first[i * INPUTS + j].into())),
             second: std::array::from_fn(|i| std::array::from_fn(|j| second[i * HIDDEN + j].into())),
-            act,
+            activation,
         })
     }
 
@@ -98,9 +99,9 @@ impl ColorDecoder {
         let mut inputs = [0.0; INPUTS];
         let all = features[3..].iter().chain(&center).chain(&ray);
         inputs.iter_mut().zip(all).for_each(|(to, &of)| *to = of.into());
-        let sum = |weights: &[f64], of: &[f64]| weights.iter().zip(of).map(|(w, x)| w * x).sum::<f64>();
+        let sum = |weights: &[f64], values: &[f64]| weights.iter().zip(values).map(|(w, x)| w * x).sum::<f64>();
         let hidden = self.first.map(|row| sum(&row, &inputs).max(0.0));
-        std::array::from_fn(|c| self.act.apply(f64::from(features[c]) + sum(&self.second[c], &hidden)) as f32)
+        std::array::from_fn(|c| self.activation.apply(f64::from(features[c]) + sum(&self.second[c], &hidden)) as f32)
     }
 }
 
@@ -121,20 +122,21 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn a_network_without_hidden_light_leaves_the_first_features() {
+    fn network_with_zero_output_returns_the_first_features() {
         let mut tensors = weights();
         tensors.get_mut("mlp2.weight").unwrap().data.fill(0.0);
         let features = [0.5, -1.0, 2.0, 9.0, 9.0, 9.0, 9.0, 9.0, 9.0];
-        let color =
-            |act| ColorDecoder::new(&tensors, act, Path::new("x.pt")).unwrap().color(&features, [1.0; 3], [1.0; 3]);
-        assert_eq!(color(Act::None), [0.5, -1.0, 2.0]);
-        assert_eq!(color(Act::Clamp), [0.5, 0.0, 1.0]);
-        let sigmoid = color(Act::Sigmoid);
+        let color = |activation| {
+            ColorDecoder::new(&tensors, activation, Path::new("x.pt")).unwrap().color(&features, [1.0; 3], [1.0; 3])
+        };
+        assert_eq!(color(ColorActivation::None), [0.5, -1.0, 2.0]);
+        assert_eq!(color(ColorActivation::Clamp), [0.5, 0.0, 1.0]);
+        let sigmoid = color(ColorActivation::Sigmoid);
         assert!((0..3).all(|c| (f64::from(sigmoid[c]) - opacity(features[c])).abs() < 1e-7), "{sigmoid:?}");
     }
 
     #[test]
-    fn hidden_light_is_cut_at_zero_before_it_is_summed() {
+    fn hidden_units_are_clamped_at_zero() {
         let mut tensors = weights();
         let first = &mut tensors.get_mut("mlp1.weight").unwrap().data;
         first.fill(0.0);
@@ -143,7 +145,7 @@ pub(crate) mod tests {
         let second = &mut tensors.get_mut("mlp2.weight").unwrap().data;
         second.fill(0.0);
         (second[0], second[1], second[6 + 1]) = (1.0, 10.0, -1.0);
-        let decoder = ColorDecoder::new(&tensors, Act::None, Path::new("x.pt")).unwrap();
+        let decoder = ColorDecoder::new(&tensors, ColorActivation::None, Path::new("x.pt")).unwrap();
         let mut features = [0.0; 9];
         features[3] = 0.25;
         assert_eq!(decoder.color(&features, [0.0; 3], [0.0, 0.0, 1.0]), [0.5 + 30.0, -3.0, 0.0]);
@@ -151,19 +153,21 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn weights_that_are_missing_or_wrong_are_named_with_what_is_there() {
-        let said = |change: &dyn Fn(&mut Tensors)| {
+    fn missing_or_wrong_weights_are_named() {
+        let error_message = |change: &dyn Fn(&mut Tensors)| {
             let mut tensors = weights();
             change(&mut tensors);
-            ColorDecoder::new(&tensors, Act::None, Path::new("some/point_cloud.pt")).unwrap_err().to_string()
+            ColorDecoder::new(&tensors, ColorActivation::None, Path::new("some/point_cloud.pt"))
+                .unwrap_err()
+                .to_string()
         };
-        let missing = said(&|tensors| drop(tensors.remove("mlp2.weight")));
+        let missing = error_message(&|tensors| drop(tensors.remove("mlp2.weight")));
         for part in ["some/point_cloud.pt", "mlp2.weight", "[3, 6, 1, 1]", "mlp1.weight"] {
             assert!(missing.contains(part), "{missing}");
         }
-        let wide = said(&|tensors| tensors.get_mut("mlp1.weight").unwrap().shape = vec![6, 6, 2, 1]);
+        let wide = error_message(&|tensors| tensors.get_mut("mlp1.weight").unwrap().shape = vec![6, 6, 2, 1]);
         assert!(wide.contains("[6, 12, 1, 1]") && wide.contains("[6, 6, 2, 1]"), "{wide}");
-        let nan = said(&|tensors| tensors.get_mut("mlp1.weight").unwrap().data[5] = f32::NAN);
+        let nan = error_message(&|tensors| tensors.get_mut("mlp1.weight").unwrap().data[5] = f32::NAN);
         assert!(nan.contains("mlp1.weight") && nan.contains("value 5") && nan.contains("NaN"), "{nan}");
     }
 }

@@ -9,8 +9,8 @@
 use glam::{DQuat, DVec3};
 use rayon::prelude::*;
 
-use super::decoder::Act;
-use super::law::{FEATURES, FULL_WIDTH, Spacetime, WIDTH};
+use super::decoder::ColorActivation;
+use super::frame_state::{FEATURES, FULL_WIDTH, Spacetime, WIDTH};
 use super::motion::{SpacetimeMotion, TargetState, dot, fitted, mean, merged_window, product};
 use crate::compressed_model::Cluster;
 use crate::error::Result;
@@ -23,26 +23,28 @@ use crate::source::FrameSource;
 
 /// Windows are treated as different if one is wider than another by more than this factor, or off the proxy's center by
 /// more than half of its width.
-const MOST_WIDER: f64 = 1.5;
+const MAX_WIDTH_RATIO: f64 = 1.5;
 /// Fraction of its maximum below which a window is ignored.
-const OPEN: f64 = 0.05;
+const MIN_WINDOW: f64 = 0.05;
 /// Maximum number of times at which shape and opacity are compared.
 const SAMPLED_TIMES: usize = 12;
 /// Margin of proxy opacities from 0 and 1.
 const OPACITY_MARGIN: f64 = 1e-6;
 
-/// Computes one proxy for each of `clusters`. `act` turns the first features of the full model into colors.
+/// Computes one proxy for each of `clusters`. `activation` turns the first features of the full model into colors.
 ///
-/// # Errors Fails if states cannot be evaluated.
+/// # Errors
+/// Fails if states cannot be evaluated.
 pub(super) fn propose(
     model: &MotionModelFrames<Spacetime>,
     clusters: &[Cluster],
     rule: &MergeParams,
-    act: Act,
+    activation: ColorActivation,
 ) -> Result<Raw> {
     let leaders: Vec<u32> = clusters.iter().map(|cluster| cluster.leader).collect();
     let mut raw = model.raw().pick(&leaders);
-    let made: Vec<Raw> = clusters.par_iter().map(|cluster| proxy(model, cluster, rule, act)).collect::<Result<_>>()?;
+    let made: Vec<Raw> =
+        clusters.par_iter().map(|cluster| proxy_parameters(model, cluster, rule, activation)).collect::<Result<_>>()?;
     made.iter().enumerate().for_each(|(row, made)| raw.set_row(row, made, 0));
     Ok(raw)
 }
@@ -69,24 +71,24 @@ impl ClusterMembers<'_> {
         let motions =
             rows.iter().map(|&(row, weight)| (weight, SpacetimeMotion::from_raw(&raw, row as usize))).collect();
         let leader = ids.iter().position(|&id| id == cluster.leader).unwrap_or(0) as u32;
-        ClusterMembers { prepared: model.law().prepare(&raw), model, raw, motions, rows, leader }
+        ClusterMembers { prepared: model.motion_model().prepare(&raw), model, raw, motions, rows, leader }
     }
 
     /// Returns the states of all members at `time`.
     fn state(&self, time: f64) -> Result<Gaussians> {
         let mut state = Gaussians::zeros(self.raw.len(), self.raw.gaussians.sh_degree());
-        self.model.law().state(time, &self.raw, &self.prepared, Columns::all(), &mut state)?;
+        self.model.motion_model().state(time, &self.raw, &self.prepared, Columns::all(), &mut state)?;
         Ok(state)
     }
 
-    /// Returns up to [`SAMPLED_TIMES`] frame times at which the window of `of` counts, evenly spread; its center if
+    /// Returns up to [`SAMPLED_TIMES`] frame times at which the window of `motion` counts, evenly spread; its center if
     /// there are none.
-    fn times(&self, of: &SpacetimeMotion) -> Vec<f64> {
+    fn times(&self, motion: &SpacetimeMotion) -> Vec<f64> {
         let times = &self.model.info().times;
-        let open: Vec<f64> = times.iter().copied().filter(|&time| of.window(time) >= OPEN).collect();
+        let open: Vec<f64> = times.iter().copied().filter(|&time| motion.window(time) >= MIN_WINDOW).collect();
         let count = open.len().min(SAMPLED_TIMES);
         match count {
-            0 => vec![of.center],
+            0 => vec![motion.center],
             1 => open,
             _ => (0..count).map(|k| open[k * (open.len() - 1) / (count - 1)]).collect(),
         }
@@ -94,16 +96,21 @@ impl ClusterMembers<'_> {
 }
 
 /// Computes the raw parameters of the proxy of `cluster`, in one row.
-fn proxy(model: &MotionModelFrames<Spacetime>, cluster: &Cluster, rule: &MergeParams, act: Act) -> Result<Raw> {
+fn proxy_parameters(
+    model: &MotionModelFrames<Spacetime>,
+    cluster: &Cluster,
+    rule: &MergeParams,
+    activation: ColorActivation,
+) -> Result<Raw> {
     let members = ClusterMembers::new(model, cluster);
     let (center, log_width) = merged_window(&members.motions);
-    let about: Vec<(f64, SpacetimeMotion)> =
-        members.motions.iter().map(|(weight, motion)| (*weight, motion.about(center))).collect();
+    let recentered: Vec<(f64, SpacetimeMotion)> =
+        members.motions.iter().map(|(weight, motion)| (*weight, motion.recentered(center))).collect();
     let mut out = members.raw.pick(&[members.leader]);
-    let Some(mean) = mean(&about) else { return Ok(out) };
+    let Some(mean) = mean(&recentered) else { return Ok(out) };
     let mut motion = SpacetimeMotion { center, log_width, ..mean };
-    if differ(&members.motions, &motion) {
-        motion = fitted(&motion, &wanted(&members, &about, &motion));
+    if windows_differ(&members.motions, &motion) {
+        motion = fitted(&motion, &target_states(&members, &recentered, &motion));
     }
     let times = members.times(&motion);
     let states: Vec<Gaussians> = times.iter().map(|&time| members.state(time)).collect::<Result<_>>()?;
@@ -116,13 +123,13 @@ fn proxy(model: &MotionModelFrames<Spacetime>, cluster: &Cluster, rule: &MergePa
         let plane = members.raw.gaussians.sh.plane(c);
         out.gaussians.sh.plane_mut(c)[0] = average(&members, plane) as f32;
     }
-    if model.law().is_full {
+    if model.motion_model().is_full {
         for plane in WIDTH..FULL_WIDTH {
             out.own.plane_mut(plane)[0] = average(&members, members.raw.own.plane(plane)) as f32;
         }
         for c in 0..3 {
             let feature = f64::from(out.own.plane(FEATURES + c)[0]);
-            out.gaussians.sh.plane_mut(c)[0] = harmonic(act.apply(feature));
+            out.gaussians.sh.plane_mut(c)[0] = harmonic(activation.apply(feature));
         }
     }
     Ok(out)
@@ -135,20 +142,24 @@ fn average(members: &ClusterMembers<'_>, plane: &[f32]) -> f64 {
 }
 
 /// Returns whether the windows differ so much that different members are visible at different times.
-fn differ(members: &[(f64, SpacetimeMotion)], proxy: &SpacetimeMotion) -> bool {
+fn windows_differ(members: &[(f64, SpacetimeMotion)], proxy: &SpacetimeMotion) -> bool {
     members.iter().any(|(_, member)| {
-        let wider = (member.log_width - proxy.log_width).abs() > MOST_WIDER.ln();
+        let wider = (member.log_width - proxy.log_width).abs() > MAX_WIDTH_RATIO.ln();
         wider || (member.center - proxy.center).abs() > 0.5 * proxy.log_width.exp()
     })
 }
 
 /// Returns the states that the proxy should approximate at each frame: the mean of the members, weighted by their
 /// windows. Quaternions have the sign nearest to `mean`.
-fn wanted(members: &ClusterMembers<'_>, about: &[(f64, SpacetimeMotion)], mean: &SpacetimeMotion) -> Vec<TargetState> {
+fn target_states(
+    members: &ClusterMembers<'_>,
+    recentered: &[(f64, SpacetimeMotion)],
+    mean: &SpacetimeMotion,
+) -> Vec<TargetState> {
     let of_time = |&time: &f64| {
         let (mut total, mut position, mut rotation) = (0.0, [0.0; 3], [0.0; 4]);
         let near = mean.rotation(time);
-        for ((weight, motion), (_, member)) in about.iter().zip(&members.motions) {
+        for ((weight, motion), (_, member)) in recentered.iter().zip(&members.motions) {
             let weight = weight * member.window(time);
             let (x, q) = (motion.position(time), motion.rotation(time));
             let sign = if dot(&q, &near) < 0.0 { -weight } else { weight };

@@ -9,8 +9,8 @@ use std::path::Path;
 use xxhash_rust::xxh3::Xxh3;
 
 use super::common::{check_kind, residence};
-use super::decoder::Act;
-use super::law::{CENTRE, LOG_WIDTH, MOTION, OMEGA, Spacetime, WIDTH};
+use super::decoder::ColorActivation;
+use super::frame_state::{CENTER, LOG_WIDTH, MOTION, OMEGA, Spacetime, WIDTH};
 use super::proxies;
 use crate::compressed_model::{Cluster, CompressedModel, Proxies, Reference};
 use crate::error::{Error, Result};
@@ -25,8 +25,8 @@ use crate::files::splatv::{MAGIC, Splatv, SplatvGaussian};
 use crate::limits::Limits;
 use crate::model::{Column, Columns, Gaussians, Raw, color, harmonic, logit, opacity};
 use crate::models::input_model::{InputModel, MemoryProfile, ModelFormat, OpenOptions, Timing};
-use crate::models::motion_model::window::MOST;
-use crate::models::motion_model::{MotionModelFrames, left, solve};
+use crate::models::motion_model::window::MAX_LOGIT;
+use crate::models::motion_model::{MotionModelFrames, compressed_raw, solve};
 use crate::models::size::{Size, bytes_below, bytes_of};
 use crate::models::trajectories::write_sequence;
 use crate::outputs::kind::OutputKind;
@@ -37,7 +37,7 @@ use crate::source::FrameSource;
 /// Maximum bytes of a camera list that is copied to the output: about seven thousand cameras.
 const MAX_LISTED: u64 = 4 << 20;
 /// Minimum scale and width, so that their logarithms are finite.
-const LEAST_LENGTH: f64 = 1e-7;
+const MIN_LENGTH: f64 = 1e-7;
 /// Natural logarithm of the width of an unbounded window. It is finite, so that no inf·0 arises, and so wide that the
 /// window exp(−(dt/width)²) is exactly 1 in f64 for |dt| below 10⁹.
 const UNBOUNDED_LOG_WIDTH: f32 = 40.0;
@@ -75,7 +75,7 @@ impl SplatvModel {
         let count = file.count() - defects.dropped;
         let mut raw = Raw { gaussians: Gaussians::zeros(count, 0), own: Column::zeros(WIDTH, count) };
         for i in 0..count {
-            set(&mut raw, i, &SplatvGaussian::of_words(&file.words(file_row(rows.as_deref(), i))));
+            set_from_row(&mut raw, i, &SplatvGaussian::of_words(&file.words(file_row(rows.as_deref(), i))));
         }
         let model = MotionModelFrames::new(Spacetime { is_full: false, decoder: None }, raw, 0);
         Ok(SplatvModel { file, rows, defects, model })
@@ -88,23 +88,23 @@ fn file_row(rows: Option<&[u32]>, i: usize) -> usize {
 }
 
 /// Sets Gaussian `i` to the values of `row`.
-fn set(raw: &mut Raw, i: usize, row: &SplatvGaussian) {
-    let log = |length: f32| f64::from(length).max(LEAST_LENGTH).ln() as f32;
+fn set_from_row(raw: &mut Raw, i: usize, row: &SplatvGaussian) {
+    let log = |length: f32| f64::from(length).max(MIN_LENGTH).ln() as f32;
     raw.gaussians.position.set_row(i, row.position);
     raw.gaussians.rotation.set_row(i, if is_unturned(row) { [1.0, 0.0, 0.0, 0.0] } else { row.rotation });
     // Players square the scales, so the sign has no effect.
     raw.gaussians.log_scale.set_row(i, row.scale.map(|scale| log(scale.abs())));
-    raw.gaussians.opacity_logit.set_row(i, [logit(row.opacity).clamp(-MOST, MOST) as f32]);
+    raw.gaussians.opacity_logit.set_row(i, [logit(row.opacity).clamp(-MAX_LOGIT, MAX_LOGIT) as f32]);
     raw.gaussians.sh.set_row(i, row.rgb.map(harmonic));
     let mut own = |plane: usize, value: f32| raw.own.plane_mut(plane)[i] = value;
-    own(CENTRE, row.center);
+    own(CENTER, row.center);
     own(LOG_WIDTH, if row.width.is_finite() { log(row.width) } else { UNBOUNDED_LOG_WIDTH });
     row.motion.into_iter().enumerate().for_each(|(k, x)| own(MOTION + k, x));
     row.omega.into_iter().enumerate().for_each(|(k, x)| own(OMEGA + k, x));
 }
 
 /// Returns Gaussian `i` as a row of a `.splatv`.
-fn row(raw: &Raw, i: usize) -> SplatvGaussian {
+fn to_row(raw: &Raw, i: usize) -> SplatvGaussian {
     let own = |plane: usize| raw.own.plane(plane)[i];
     SplatvGaussian {
         position: raw.gaussians.position.row(i),
@@ -114,7 +114,7 @@ fn row(raw: &Raw, i: usize) -> SplatvGaussian {
         scale: raw.gaussians.log_scale.row::<3>(i).map(|log| f64::from(log).exp() as f32),
         rgb: raw.gaussians.sh.row::<3>(i).map(color),
         opacity: opacity(raw.gaussians.opacity_logit.row::<1>(i)[0]),
-        center: own(CENTRE),
+        center: own(CENTER),
         width: f64::from(own(LOG_WIDTH)).exp() as f32,
     }
 }
@@ -122,7 +122,8 @@ fn row(raw: &Raw, i: usize) -> SplatvGaussian {
 /// Writes `raw` to `path`. `known` returns the exact color of a Gaussian if it has one. The cameras are those of the
 /// 3DGS file `cameras`, or else one camera that sees most of the Gaussians.
 ///
-/// # Errors Fails if half precision cannot hold the values or a write fails.
+/// # Errors
+/// Fails if half precision cannot hold the values or a write fails.
 pub(super) fn write(
     raw: &Raw,
     known: impl Fn(usize) -> Option<[f32; 3]>,
@@ -134,14 +135,14 @@ pub(super) fn write(
     let listed = cameras.filter(is_small).map(|path| read_json(path, MAX_LISTED)).transpose()?;
     let listed = listed.filter(|cameras| !cameras[0]["rotation"].is_null());
     let cameras = listed.unwrap_or_else(|| seen_whole(&raw.gaussians.position));
-    let row_of = |i: usize| {
-        let row = row(raw, i);
+    let output_row = |i: usize| {
+        let row = to_row(raw, i);
         SplatvGaussian { rgb: known(i).map_or(row.rgb, |rgb| rgb.map(f64::from)), ..row }
     };
     let mut accuracy = Accuracy::new(&raw.gaussians.position);
-    (0..raw.len()).for_each(|i| measure(&row_of(i), i, &mut accuracy));
+    (0..raw.len()).for_each(|i| measure(&output_row(i), i, &mut accuracy));
     accuracy.check("a .splatv")?;
-    write_file(path, raw.len(), (0..raw.len()).map(|i| words(&row_of(i))), &cameras)
+    write_file(path, raw.len(), (0..raw.len()).map(|i| words(&output_row(i))), &cameras)
 }
 
 impl InputModel for SplatvModel {
@@ -208,7 +209,8 @@ impl InputModel for SplatvModel {
     fn check_output(&self, kind: OutputKind, _: &Path) -> Result<()> {
         match kind {
             OutputKind::Model | OutputKind::Ply => Err(Error::usage(
-                "a .splatv has halves of what a trained model has\n  write a .splatv, a .gseq or --as ply-sequence",
+                "a .splatv has less precision than a trained model and cannot be written as one\n  write a .splatv, a \
+                 .gseq or --as ply-sequence",
             )),
             _ => check_kind(kind, false),
         }
@@ -216,7 +218,7 @@ impl InputModel for SplatvModel {
 
     fn solve(&self, clusters: &[Cluster], reference: Reference, rule: &MergeParams) -> Result<Proxies> {
         solve(&self.model, clusters, reference, rule, |clusters| {
-            proxies::propose(&self.model, clusters, rule, Act::None)
+            proxies::propose(&self.model, clusters, rule, ColorActivation::None)
         })
     }
 
@@ -236,10 +238,10 @@ impl InputModel for SplatvModel {
             return write_sequence(&*self.reduced(reduction)?, kind, path, limits.frames_held, events);
         }
         self.file.check()?;
-        let raw = left(self.model.raw(), reduction);
+        let raw = compressed_raw(self.model.raw(), reduction);
         let unchanged = self.model.raw().pick(&reduction.kept);
         let words_of = |i: usize| {
-            let (now, before) = (row(&raw, i), row(&unchanged, i));
+            let (now, before) = (to_row(&raw, i), to_row(&unchanged, i));
             if now != before {
                 return words(&now);
             }
@@ -248,8 +250,8 @@ impl InputModel for SplatvModel {
             stored
         };
         let mut accuracy = Accuracy::new(&raw.gaussians.position);
-        let changed = |&i: &usize| row(&raw, i) != row(&unchanged, i);
-        (0..raw.len()).filter(changed).for_each(|i| measure(&row(&raw, i), i, &mut accuracy));
+        let changed = |&i: &usize| to_row(&raw, i) != to_row(&unchanged, i);
+        (0..raw.len()).filter(changed).for_each(|i| measure(&to_row(&raw, i), i, &mut accuracy));
         accuracy.check("a .splatv")?;
         write_file(path, raw.len(), (0..raw.len()).map(words_of), self.file.cameras())?;
         Ok(Vec::new())

@@ -22,7 +22,7 @@ use super::small_field::rounded;
 use crate::files::digest::hash_file;
 use crate::files::ply::{Ply, PlyOptions};
 use crate::files::state_dict::read_state_dict;
-use crate::models::iterations::iteration as iteration_folder;
+use crate::models::iterations::find_iteration;
 
 /// Paths of the files of a model folder.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -46,10 +46,11 @@ pub struct ModelPaths {
 impl ModelPaths {
     /// Finds the files of the model at `root`, of `iteration` or of the largest one.
     ///
-    /// # Errors Fails if a folder or a required file is missing.
+    /// # Errors
+    /// Fails if a folder or a required file is missing.
     pub fn locate(root: &Path, iteration: Option<u32>) -> Result<Self> {
         let clouds = root.join("point_cloud");
-        let (iteration, folder) = iteration_folder(&clouds, iteration)?;
+        let (iteration, folder) = find_iteration(&clouds, iteration)?;
         let optional = |name: &str| Some(folder.join(name)).filter(|path| path.exists());
         let paths = ModelPaths {
             root: root.to_owned(),
@@ -62,7 +63,7 @@ impl ModelPaths {
         };
         for path in paths.required() {
             if !path.is_file() {
-                return Err(Error::input(path, "", "a file of the model folder", "none")
+                return Err(Error::input(path, "", "this file of the model folder", "no such file")
                     .hint("a 4DGaussians model folder holds cfg_args and point_cloud/iteration_K/{point_cloud.ply, deformation.pth}"));
             }
         }
@@ -76,7 +77,8 @@ impl ModelPaths {
 
     /// Returns the xxh3-128 hash of the bytes of point cloud, deformation and `cfg_args`, as 32 hex digits.
     ///
-    /// # Errors Fails if a file cannot be read.
+    /// # Errors
+    /// Fails if a file cannot be read.
     pub fn digest(&self) -> Result<String> {
         let mut hash = Xxh3::new();
         self.required().into_iter().try_for_each(|path| hash_file(path, &mut hash))?;
@@ -104,7 +106,8 @@ impl ModelFolder {
     /// Reads the configuration and field of the model at `paths` within `memory`. `canonical` holds its Gaussians, with
     /// SH degree `sh_degree`. The sequence has no frames yet.
     ///
-    /// # Errors Fails if a file cannot be read, contradicts another, or needs more than `memory`.
+    /// # Errors
+    /// Fails if a file cannot be read, contradicts another, or needs more than `memory`.
     pub fn with_cloud(paths: ModelPaths, canonical: Gaussians, sh_degree: usize, memory: ReadLimit) -> Result<Self> {
         let config = ModelConfig::read(&paths.cfg_args)?;
         let tensors = read_state_dict(&paths.deformation, memory)?;
@@ -124,7 +127,8 @@ impl ModelFolder {
 
     /// Opens the model at `root`, of `iteration` or of the largest one. The sequence has no frames yet.
     ///
-    /// # Errors Fails if a file is missing or damaged.
+    /// # Errors
+    /// Fails if a file is missing or damaged.
     pub fn open(root: &Path, iteration: Option<u32>) -> Result<Self> {
         Self::open_with(root, iteration, &PlyOptions::default())
     }
@@ -151,7 +155,8 @@ impl ModelFolder {
 
     /// Returns the model with the field that it has after storage in half precision.
     ///
-    /// # Errors Fails if the field can no longer be read.
+    /// # Errors
+    /// Fails if the field can no longer be read.
     pub(super) fn rounded(self) -> Result<Self> {
         let (path, degree) = (&self.paths.deformation, self.info.sh_degree);
         let field = Field::new(&rounded(read_state_dict(path, self.memory)?), self.config.field(), degree, path)?;
@@ -165,7 +170,8 @@ impl ModelFolder {
 
     /// Returns the model with frames at `times`.
     ///
-    /// # Errors Fails if times are not finite or not strictly increasing; the message names the frames.
+    /// # Errors
+    /// Fails if times are not finite or not strictly increasing; the message names the frames.
     pub fn with_times(mut self, times: Vec<f64>) -> Result<Self> {
         self.info = self.info.at(times)?;
         Ok(self)
@@ -197,7 +203,7 @@ impl ModelFolder {
     }
 
     /// Returns the time of a frame; fails if the frame does not exist.
-    fn time_of(&self, frame: usize) -> Result<f64> {
+    fn frame_time(&self, frame: usize) -> Result<f64> {
         let times = &self.info.times;
         let missing = || Error::internal(format!("frame {frame} was asked for; the sequence has {}", times.len()));
         times.get(frame).copied().ok_or_else(missing)
@@ -206,7 +212,8 @@ impl ModelFolder {
     /// Returns the field's deltas at `time` for Gaussians at canonical `position` `[N, 3]`, which need not belong to
     /// this model. [`Deltas::solve`] computes raw parameters from a desired state.
     ///
-    /// # Errors Fails if the field cannot be evaluated.
+    /// # Errors
+    /// Fails if the field cannot be evaluated.
     pub fn deltas_at(&self, position: &Column, time: f64) -> Result<Deltas> {
         let prepared = self.field.prepare(position);
         let mut deltas = Deltas::new(self.info.sh_degree);
@@ -269,7 +276,7 @@ impl Deformation for ModelFolder {
     }
 
     fn state(&self, frame: usize, stored: &Raw, want: Columns, out: &mut Gaussians) -> Result<()> {
-        let time = self.time_of(frame)?;
+        let time = self.frame_time(frame)?;
         let ids: Vec<u32> = (0..stored.len() as u32).collect();
         let nothing = || Gaussians::zeros(0, self.info.sh_degree);
         let parts = BlockSlices::split(out, want, ids.len());
@@ -288,7 +295,7 @@ impl Deformation for ModelFolder {
     }
 
     fn jacobian(&self, frame: usize, stored: &Raw, want: Columns) -> Result<Jacobian> {
-        let time = self.time_of(frame)?;
+        let time = self.frame_time(frame)?;
         let ids: Vec<u32> = (0..stored.len() as u32).collect();
         let of_block = |ids: &[u32]| {
             let mut raw = Gaussians::zeros(0, self.info.sh_degree);
@@ -313,7 +320,7 @@ struct FieldReader<'a> {
 
 impl BlockReader for FieldReader<'_> {
     fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
-        let time = self.model.time_of(frame)?;
+        let time = self.model.frame_time(frame)?;
         if !want.is_empty() {
             self.model.states.add(self.raw.len() as u64);
         }

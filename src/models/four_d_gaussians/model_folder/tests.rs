@@ -221,7 +221,7 @@ fn folder(iterations: &[&str]) -> tempfile::TempDir {
 }
 
 #[test]
-fn the_largest_iteration_is_the_default_and_any_can_be_asked_for() {
+fn default_is_the_largest_iteration() {
     let root = folder(&["iteration_900", "iteration_14000", "iteration_x", "coarse_iteration_99999"]);
     assert_eq!(ModelPaths::locate(root.path(), None).unwrap().iteration, 14000);
     let paths = ModelPaths::locate(root.path(), Some(900)).unwrap();
@@ -232,7 +232,7 @@ fn the_largest_iteration_is_the_default_and_any_can_be_asked_for() {
 }
 
 #[test]
-fn a_missing_file_of_the_folder_is_named() {
+fn missing_file_of_the_folder_is_named() {
     let root = folder(&["iteration_1"]);
     for file in ["point_cloud/iteration_1/deformation.pth", "cfg_args"] {
         fs::remove_file(root.path().join(file)).unwrap();
@@ -245,7 +245,7 @@ fn a_missing_file_of_the_folder_is_named() {
 }
 
 #[test]
-fn the_digest_depends_on_every_byte_of_the_three_files() {
+fn digest_depends_on_all_three_files() {
     let root = folder(&["iteration_1"]);
     let paths = ModelPaths::locate(root.path(), None).unwrap();
     let mut digests = vec![paths.digest().unwrap()];
@@ -260,7 +260,7 @@ fn the_digest_depends_on_every_byte_of_the_three_files() {
 }
 
 #[test]
-fn derivatives_of_the_tiny_model_agree_with_differences_of_its_states_for_any_number_of_threads() {
+fn jacobian_agrees_with_differences_on_any_thread_count() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/tiny_model");
     let model = ModelFolder::open(&root, None).unwrap().with_times(vec![0.0, 0.4, 1.0]).unwrap();
     let n = model.info().count;

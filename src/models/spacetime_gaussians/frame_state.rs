@@ -7,11 +7,11 @@ use super::decoder::{self, ColorDecoder};
 use super::motion::SpacetimeMotion;
 use crate::error::Result;
 use crate::model::{Column, Columns, Gaussians, Jacobian, Raw};
-use crate::models::motion_model::window::{faded, odds, slope};
+use crate::models::motion_model::window::{faded_logit, inverse_odds, slope};
 use crate::models::motion_model::{MotionModel, Shading, copy_stored};
 
 /// Plane of the center of the temporal window.
-pub(super) const CENTRE: usize = 0;
+pub(super) const CENTER: usize = 0;
 /// Plane of the natural logarithm of the width of the window.
 pub(super) const LOG_WIDTH: usize = 1;
 /// First of nine planes: coefficients of dt, dt², dt³, each for x, y, z.
@@ -34,7 +34,7 @@ impl SpacetimeMotion {
         let own = |plane: usize| f64::from(raw.own.plane(plane)[row]);
         let path = |k: usize| std::array::from_fn(|c| own(MOTION + 3 * k + c));
         SpacetimeMotion {
-            center: own(CENTRE),
+            center: own(CENTER),
             log_width: own(LOG_WIDTH),
             path: [raw.gaussians.position.row::<3>(row).map(f64::from), path(0), path(1), path(2)],
             rotation: raw.gaussians.rotation.row::<4>(row).map(f64::from),
@@ -45,7 +45,7 @@ impl SpacetimeMotion {
     /// Stores the motion as that of Gaussian `row`, rounded to f32.
     pub(super) fn write(&self, raw: &mut Raw, row: usize) {
         let mut own = |plane: usize, value: f64| raw.own.plane_mut(plane)[row] = value as f32;
-        own(CENTRE, self.center);
+        own(CENTER, self.center);
         own(LOG_WIDTH, self.log_width);
         for (k, terms) in self.path[1..].iter().enumerate() {
             terms.iter().enumerate().for_each(|(c, &term)| own(MOTION + 3 * k + c, term));
@@ -71,12 +71,12 @@ pub(super) struct PreparedGaussian {
     /// 1 / width² of each Gaussian.
     inverse_squared: Vec<f64>,
     /// exp(−o) of each opacity logit o.
-    odds: Vec<f64>,
+    inverse_odds: Vec<f64>,
 }
 
 /// Returns the logarithm of the window at time `dt` from its center.
 #[inline(always)]
-fn exponent(dt: f64, inverse_squared: f64) -> f64 {
+fn window_exponent(dt: f64, inverse_squared: f64) -> f64 {
     -dt * dt * inverse_squared
 }
 
@@ -86,7 +86,7 @@ impl MotionModel for Spacetime {
     fn prepare(&self, raw: &Raw) -> PreparedGaussian {
         PreparedGaussian {
             inverse_squared: raw.own.plane(LOG_WIDTH).iter().map(|&log| (-2.0 * f64::from(log)).exp()).collect(),
-            odds: raw.gaussians.opacity_logit.plane(0).iter().map(|&logit| odds(logit)).collect(),
+            inverse_odds: raw.gaussians.opacity_logit.plane(0).iter().map(|&logit| inverse_odds(logit)).collect(),
         }
     }
 
@@ -108,7 +108,7 @@ impl MotionModel for Spacetime {
         want: Columns,
         out: &mut Gaussians,
     ) -> Result<()> {
-        let (stored, own, centers) = (&raw.gaussians, &raw.own, raw.own.plane(CENTRE));
+        let (stored, own, centers) = (&raw.gaussians, &raw.own, raw.own.plane(CENTER));
         let since = |center: &f32| time - f64::from(*center);
         if want.contains(Columns::POSITION) {
             for c in 0..3 {
@@ -131,10 +131,12 @@ impl MotionModel for Spacetime {
             }
         }
         if want.contains(Columns::OPACITY) {
-            let of = centers.iter().zip(&prepared.inverse_squared).zip(&prepared.odds);
-            out.opacity_logit.plane_mut(0).iter_mut().zip(of).for_each(|(to, ((center, &inverse_squared), &odds))| {
-                *to = faded(odds, exponent(since(center), inverse_squared)) as f32;
-            });
+            let values = centers.iter().zip(&prepared.inverse_squared).zip(&prepared.inverse_odds);
+            out.opacity_logit.plane_mut(0).iter_mut().zip(values).for_each(
+                |(to, ((center, &inverse_squared), &inverse_odds))| {
+                    *to = faded_logit(inverse_odds, window_exponent(since(center), inverse_squared)) as f32;
+                },
+            );
         }
         copy_stored(raw, want.difference(self.varying()), out);
         Ok(())
@@ -143,12 +145,12 @@ impl MotionModel for Spacetime {
     fn jacobian(&self, time: f64, raw: &Raw, prepared: &PreparedGaussian, want: Columns) -> Result<Jacobian> {
         let mut found = Jacobian::default();
         if want.contains(Columns::OPACITY) {
-            let centers = raw.own.plane(CENTRE);
-            let of = |row: usize| {
+            let centers = raw.own.plane(CENTER);
+            let derivative = |row: usize| {
                 let dt = time - f64::from(centers[row]);
-                slope(prepared.odds[row], exponent(dt, prepared.inverse_squared[row])) as f32
+                slope(prepared.inverse_odds[row], window_exponent(dt, prepared.inverse_squared[row])) as f32
             };
-            *found.column_mut(Columns::OPACITY) = Column::from_planes(1, (0..raw.len()).map(of).collect());
+            *found.column_mut(Columns::OPACITY) = Column::from_planes(1, (0..raw.len()).map(derivative).collect());
         }
         Ok(found)
     }
@@ -162,7 +164,7 @@ impl Shading for Spacetime {
     /// Returns six constant features and three that grow with the time since the center.
     fn features(&self, time: f64, raw: &Raw) -> Column {
         let mut found = Column::zeros(decoder::FEATURES, raw.len());
-        let centers = raw.own.plane(CENTRE);
+        let centers = raw.own.plane(CENTER);
         for plane in 0..FEATURES_IN_TIME - FEATURES {
             found.plane_mut(plane).copy_from_slice(raw.own.plane(FEATURES + plane));
         }
