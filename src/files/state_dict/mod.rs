@@ -97,7 +97,7 @@ impl StateDict {
     /// Opens the checkpoint at `path` and finds its tensors.
     ///
     /// # Errors
-    /// The checkpoint is invalid or not a dict; a value is neither a tensor nor ignorable.
+    /// The checkpoint is invalid or not a dict; a value seems to be a tensor of an unknown kind.
     fn open(path: &Path, memory: ReadLimit) -> Result<StateDict> {
         let checkpoint = Checkpoint::open(path, memory)?;
         let (root, nodes) = (checkpoint.pickle().root(), checkpoint.pickle().ids().len());
