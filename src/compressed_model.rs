@@ -77,11 +77,11 @@ impl ParamDelta {
     /// lower.
     pub fn and(self, mut more: ParamDelta) -> ParamDelta {
         for column in self.columns().iter() {
-            let (of, to) = (self.0.column(column), more.0.column_mut(column));
+            let (from, to) = (self.0.column(column), more.0.column_mut(column));
             if to.is_empty() {
-                *to = of.clone();
+                *to = from.clone();
             } else {
-                to.planes_mut().iter_mut().zip(of.planes()).for_each(|(to, of)| *to += of);
+                to.planes_mut().iter_mut().zip(from.planes()).for_each(|(to, from)| *to += from);
             }
         }
         more
@@ -94,10 +94,10 @@ impl ParamDelta {
         back.and(self.clone())
     }
 
-    /// Adds the attributes `of` of the delta to `state`, row by row. A delta of zero leaves the bits of a value
+    /// Adds the attributes `attributes` of the delta to `state`, row by row. A delta of zero leaves the bits of a value
     /// unchanged.
-    pub fn add_to(&self, state: &mut Gaussians, of: Columns) {
-        for column in (self.columns() & of).iter() {
+    pub fn add_to(&self, state: &mut Gaussians, attributes: Columns) {
+        for column in (self.columns() & attributes).iter() {
             let (by, values) = (self.0.column(column), state.column_mut(column));
             for c in 0..by.width().min(values.width()) {
                 for (value, &by) in values.plane_mut(c).iter_mut().zip(by.plane(c)) {

@@ -287,8 +287,8 @@ impl Cache {
     fn note_unusable_shards(&self, dir: &CacheDir, stage: &str, key: CacheKey) -> Result<()> {
         for other in dir.foreign_inputs(stage, key)? {
             self.add_note(format!(
-                "{stage}: parts in the work folder are not used because they come from another input, recipe, program version or \
-                 kind of processor; they belong to {other}"
+                "{stage}: parts in the work folder are not used because they come from another input, recipe, \
+                 program version or kind of processor; they belong to {other}"
             ));
         }
         Ok(())

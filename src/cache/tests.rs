@@ -151,12 +151,12 @@ fn content_on_disk_is_divided_and_unnamed_without_a_folder() {
     let write =
         |some: Range<usize>, to: &mut SpillWriter| some.map(|unit| unit as u8).try_for_each(|byte| to.write(&[byte]));
     let read = |spills: Vec<(Range<usize>, Spill)>| -> Vec<u8> {
-        let of_spill = |(some, spill): &(Range<usize>, Spill)| {
+        let contents = |(some, spill): &(Range<usize>, Spill)| {
             let mut bytes = vec![0; some.len()];
             spill.read(0, &mut bytes).unwrap();
             bytes
         };
-        spills.iter().flat_map(of_spill).collect()
+        spills.iter().flat_map(contents).collect()
     };
     let expected: Vec<u8> = (0..50).collect();
     let folder = tempfile::tempdir().unwrap();
@@ -197,7 +197,7 @@ fn listing_names_contents_and_cleaning_keeps_other_files() {
     let [squares, stage] = [0, 1].map(|k| &listed[k]);
     assert_eq!((&squares.stage[..], squares.parts, &squares.missing[..]), ("squares", 3, &[1, 3][..]));
     assert_eq!((&stage.stage[..], stage.parts, stage.missing.len(), stage.damaged.len()), ("stage", 1, 0, 0));
-    assert!(listed.iter().all(|of| of.belongs_to == "a test" && of.bytes > 48));
+    assert!(listed.iter().all(|entry| entry.belongs_to == "a test" && entry.bytes > 48));
     assert!(text(&listed).contains("3 parts, missing: 1, 3"), "{}", text(&listed));
     fs::write(work.join("mine.txt"), "kept").unwrap();
     assert_eq!(clean(&work).unwrap().0, 2);

@@ -99,8 +99,8 @@ fn constant_curve(track: &FittedTrack) -> CubicTrack {
 
 /// Returns one curve whose window has the mean and the variance of the opacities.
 fn single_window_curve(track: &FittedTrack) -> CubicTrack {
-    let moment = |of: &dyn Fn(f64) -> f64| -> f64 {
-        (0..track.len()).map(|frame| track.opacity[frame] * of(track.times[frame])).sum()
+    let moment = |value: &dyn Fn(f64) -> f64| -> f64 {
+        (0..track.len()).map(|frame| track.opacity[frame] * value(track.times[frame])).sum()
     };
     let whole = moment(&|_| 1.0);
     let center = moment(&|t| t) / whole;
@@ -177,8 +177,8 @@ fn fit_motion(track: &FittedTrack, center: f64, width: f64, weight: impl Fn(usiz
     let rotation: [[f64; 4]; 2] =
         polynomial(samples.iter().map(|&(frame, weight)| (scaled(frame), track.rotation[frame], weight)), RIDGE);
     let whole: f64 = samples.iter().map(|&(_, weight)| weight).sum();
-    let mean = |of: &dyn Fn(usize) -> f64| {
-        samples.iter().map(|&(frame, weight)| weight * of(frame)).sum::<f64>() / whole.max(1e-300)
+    let mean = |value: &dyn Fn(usize) -> f64| {
+        samples.iter().map(|&(frame, weight)| weight * value(frame)).sum::<f64>() / whole.max(1e-300)
     };
     let width_of_sh = track.sh(0).len();
     let unscaled = |k: usize| reach.powi(k as i32);

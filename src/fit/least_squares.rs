@@ -32,9 +32,9 @@ pub(crate) fn polynomial<const K: usize, const C: usize>(
         }
         for i in (0..K).filter(|&i| i != k) {
             let factor = normal[i][k] / by;
-            let (of_normal, of_right) = (normal[k], right[k]);
-            normal[i].iter_mut().zip(of_normal).for_each(|(to, of)| *to -= factor * of);
-            right[i].iter_mut().zip(of_right).for_each(|(to, of)| *to -= factor * of);
+            let (pivot_normal, pivot_right) = (normal[k], right[k]);
+            normal[i].iter_mut().zip(pivot_normal).for_each(|(to, from)| *to -= factor * from);
+            right[i].iter_mut().zip(pivot_right).for_each(|(to, from)| *to -= factor * from);
         }
     }
     std::array::from_fn(|k| right[k].map(|value| value / normal[k][k]))

@@ -75,7 +75,7 @@ fn fit_piece(track: &FittedTrack, frames: Range<usize>) -> LinearPiece {
     let samples = frames.clone().map(|frame| ((track.times[frame] - at) / half, track.position[frame], 1.0));
     let [position, velocity] =
         if frames.len() > 1 { polynomial(samples, 0.0) } else { [track.position[frames.start], [0.0; 3]] };
-    let mean = |of: &dyn Fn(usize) -> f64| frames.clone().map(of).sum::<f64>() / count;
+    let mean = |value: &dyn Fn(usize) -> f64| frames.clone().map(value).sum::<f64>() / count;
     let rotation: [f64; 4] = std::array::from_fn(|c| mean(&|frame| track.rotation[frame][c]));
     let length = rotation.iter().map(|x| x * x).sum::<f64>().sqrt();
     let width = track.sh(frames.start).len();

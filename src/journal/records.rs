@@ -86,7 +86,7 @@ impl LeftOut {
 /// Deserializes pairs of an integer (size or SH degree) and a number; null becomes NaN.
 pub(crate) fn sizes<'de, D: Deserializer<'de>>(from: D) -> std::result::Result<Vec<(usize, f64)>, D::Error> {
     let found = Vec::<(usize, Option<f64>)>::deserialize(from)?;
-    Ok(found.into_iter().map(|(size, of)| (size, of.unwrap_or(f64::NAN))).collect())
+    Ok(found.into_iter().map(|(size, value)| (size, value.unwrap_or(f64::NAN))).collect())
 }
 
 /// Deserializes a number; null, which JSON writes for numbers that are not finite, becomes NaN.
@@ -161,11 +161,11 @@ impl BandsSummary {
     /// Returns the reason for the SH degree as text.
     pub(crate) fn why(&self) -> String {
         let BandsSummary { pictures, tried, result, least, .. } = self;
-        let of = |(degree, apart): &(usize, f64)| format!("{} at degree {degree}", decibels_text(*apart, 1));
-        let tried: Vec<String> = tried.iter().map(of).collect();
+        let line = |(degree, apart): &(usize, f64)| format!("{} at degree {degree}", decibels_text(*apart, 1));
+        let tried: Vec<String> = tried.iter().map(line).collect();
         format!(
-            "PSNR over {pictures} views: {} against all degrees, {} of the result with all degrees against the original; at \
-             least {least:.1} dB against all degrees required",
+            "PSNR over {pictures} views: {} against all degrees, {} of the result with all degrees against the \
+             original; at least {least:.1} dB against all degrees required",
             tried.join(", "),
             decibels_text(*result, 1)
         )

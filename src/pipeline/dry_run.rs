@@ -158,9 +158,9 @@ impl Foreseen {
             None => writeln!(out, "would keep {}", self.size_by),
         };
         let _ = writeln!(out, "{}", self.counts);
-        let of: f64 = self.forecast.stages.iter().map(|stage| stage.core_seconds).sum();
+        let core_seconds: f64 = self.forecast.stages.iter().map(|stage| stage.core_seconds).sum();
         for stage in &self.forecast.stages {
-            let part = 100.0 * stage.core_seconds / of.max(1e-9);
+            let part = 100.0 * stage.core_seconds / core_seconds.max(1e-9);
             let _ = writeln!(out, "  {:<8} {part:>3.0}% of the time", stage.name);
         }
         for left in &self.left_out {

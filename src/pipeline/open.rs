@@ -181,7 +181,8 @@ fn receive_measured(
     scene.follow(&later);
     if measures && measuring.is_none() && quota.arrived() > 0 {
         let note = format!(
-            "statistics were taken from the packed frames, not as they arrived: memory suffices for measuring {to_measure} of them on arrival"
+            "statistics were taken from the packed frames, not as they arrived: memory suffices \
+             for measuring {to_measure} of them on arrival"
         );
         scene.notes.push(note);
     }

@@ -249,7 +249,8 @@ fn checked_output(request: &Request, own: OutputKind) -> Result<OutputKind> {
     let Request { goal, archive_psnr, .. } = request;
     if goal.is_some() && (request.only == Only::Merge || request.target.is_some()) {
         return Err(Error::usage(
-            "a quality or a size on disk is reached by pruning: it cannot be combined with --merge-only or a target count or ratio",
+            "a quality or a size on disk is reached by pruning: it cannot be combined with --merge-only or a \
+             target count or ratio",
         ));
     }
     if request.kind.is_none() {

@@ -44,7 +44,8 @@ impl<'a> QualityMeter<'a> {
         if held == 0 || held == pictures.len() {
             let found = pictures.len();
             return Err(Error::usage(format!(
-                "a search for a quality uses some views to search and others to report: expected 4 or more views, found {found}"
+                "a search for a quality uses some views to search and others to report: expected 4 or more views, \
+                 found {found}"
             )));
         }
         Ok(QualityMeter { scene, cameras, pictures, comparison })
@@ -62,7 +63,7 @@ impl<'a> QualityMeter<'a> {
         let mut found = Vec::with_capacity(pictures.len());
         show([Subject::all(source)], self.cameras, &pictures, Batch::of_frame(&self.scene.limits), |views| {
             let first = found.len();
-            let of_view = |(place, view): (usize, &ViewStates<'_, 1>)| {
+            let view_psnr = |(place, view): (usize, &ViewStates<'_, 1>)| {
                 match &self.comparison {
                     Comparison::Photographs(photographs) => {
                         let picture = view.render(0, background);
@@ -75,7 +76,7 @@ impl<'a> QualityMeter<'a> {
                     }
                 }
             };
-            let of_batch: Vec<f64> = views.par_iter().enumerate().map(of_view).collect::<Result<_>>()?;
+            let of_batch: Vec<f64> = views.par_iter().enumerate().map(view_psnr).collect::<Result<_>>()?;
             found.extend(of_batch);
             Ok(())
         })?;

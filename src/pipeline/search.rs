@@ -151,19 +151,20 @@ impl SearchStage {
             let meter = self.meter(scene, &targets, &parts, photographs, journal)?;
             let mut trial = RunState::new(scene, request, stages, template.clone());
             (trial.scored, trial.ranking) = (Some(scored.clone()), Some(ranking.clone()));
-            let steps =
-                |stage| PruneSteps::new(RefineRun::new(NAME, stage, scene, &scored, &targets, parts.clone()));
+            let steps = |stage| PruneSteps::new(RefineRun::new(NAME, stage, scene, &scored, &targets, parts.clone()));
             trial.prune_steps = self.refine.as_ref().map(steps);
             let (best, tried) = self.bracket(&mut trial, &meter)?;
             if best.value.is_nan() {
                 return Err(Error::usage(format!(
-                    "--{}: the PSNR of renders cannot be measured: expected numbers in every pixel, found NaN in some\n  \
+                    "--{}: the PSNR of renders cannot be measured: expected numbers in every pixel, found NaN in \
+                     some\n  \
                      --non-finite drop removes the Gaussians that are not finite",
                     self.name().replace('_', "-")
                 )));
             }
             let result = scene.input.reduced(&best.result)?;
-            let summary = self.summary(&best, self.value(&meter, &*result, scene, true)?, meter.held_back_names(), tried);
+            let held = self.value(&meter, &*result, scene, true)?;
+            let summary = self.summary(&best, held, meter.held_back_names(), tried);
             drop(result);
             let (count, is_met) = (best.result.len(), self.surplus(summary.searched) >= 0.0);
             journal.left_out.extend(best.journal.left_out);
@@ -191,17 +192,18 @@ impl SearchStage {
         journal: &mut Journal,
     ) -> Result<QualityMeter<'a>> {
         match photographs {
-            Some((of, photographs)) => {
-                journal.notes.push(format!("{} held-out pictures have photographs", of.len()));
-                let of = of.into_iter().enumerate().map(|(k, of)| (of, k % HELD_EVERY == HELD_EVERY - 1));
-                QualityMeter::new(scene, &scene.rig.cameras, of.collect(), Comparison::Photographs(photographs))
+            Some((views, photographs)) => {
+                journal.notes.push(format!("{} test views have photographs", views.len()));
+                let is_held = |k: usize| k % HELD_EVERY == HELD_EVERY - 1;
+                let views = views.into_iter().enumerate().map(|(k, view)| (view, is_held(k)));
+                QualityMeter::new(scene, &scene.rig.cameras, views.collect(), Comparison::Photographs(photographs))
             }
             None => {
                 let mut numbers = [&parts.apart[..], &parts.held[..]].concat();
                 numbers.sort_unstable();
-                let of = |&k: &usize| (targets.pictures[k], parts.held.contains(&k));
-                let of = numbers.iter().map(of).collect();
-                QualityMeter::new(scene, &targets.cameras, of, Comparison::Original(targets, numbers))
+                let view = |&k: &usize| (targets.pictures[k], parts.held.contains(&k));
+                let views = numbers.iter().map(view).collect();
+                QualityMeter::new(scene, &targets.cameras, views, Comparison::Original(targets, numbers))
             }
         }
     }
@@ -238,12 +240,12 @@ impl SearchStage {
     fn photographs(&self, scene: &Scene) -> Result<Option<(Vec<Picture>, Photographs)>> {
         let Quality::Loss { photographs, .. } = &self.searched else { return Ok(None) };
         let times = &scene.source().info().times;
-        let of = pictures(&scene.rig, times, PictureSet::HeldOut)?;
-        let found = Photographs::of_some(photographs, &scene.rig, times, of)?;
+        let views = pictures(&scene.rig, times, PictureSet::HeldOut)?;
+        let found = Photographs::of_some(photographs, &scene.rig, times, views)?;
         if found.0.len() < HELD_EVERY {
             let (folder, found) = (photographs.shown(), found.0.len());
             return Err(Error::usage(format!(
-                "--ground-truth {folder}: expected photographs of {HELD_EVERY} or more held-out pictures, found {found}"
+                "--ground-truth {folder}: expected photographs of {HELD_EVERY} or more test views, found {found}"
             )));
         }
         Ok(Some(found))

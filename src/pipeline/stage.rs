@@ -156,7 +156,8 @@ impl CountPlan {
             }
             (Some(wanted), None) => format!("counts: {alone} {}; refinement removes none", share(wanted)),
             (None, Some(_)) => format!(
-                "counts: ranking leaves {} or more, refinement removes the rest; the number that stays is found during the run",
+                "counts: ranking leaves {} or more, refinement removes the rest; the number that stays is found \
+                 during the run",
                 share(self.before_refinement(0, all))
             ),
             (None, None) => format!("counts: {alone} a number that is found during the run; refinement removes none"),
@@ -224,7 +225,7 @@ impl StageList {
 
     /// Returns the stages of `phase`.
     pub fn in_phase(&self, phase: Phase) -> impl Iterator<Item = &dyn Stage> {
-        self.stages.iter().filter(move |(of, _)| *of == phase).map(|(_, stage)| &**stage)
+        self.stages.iter().filter(move |(stage_phase, _)| *stage_phase == phase).map(|(_, stage)| &**stage)
     }
 
     /// Runs the stages of `phase` in order.

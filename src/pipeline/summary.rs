@@ -381,7 +381,8 @@ impl Summary {
         match (&self.goal, bands.or(field).or(refined)) {
             (Some(goal), _) if goal.name == "max_loss" => {
                 format!(
-                    "{:.2} dB less PSNR than the original against photographs that the search did not use; at most {} dB requested",
+                    "{:.2} dB less PSNR than the original against photographs that the search did not use; at most {} \
+                     dB requested",
                     goal.held, goal.asked
                 )
             }

@@ -123,27 +123,27 @@ impl Calibration {
         on_all_threads(&|renderer, _, camera| _ = renderer.render(&state, camera, scene.background));
         let [look, remove, render] = expected;
         let pace = &mut self.pace;
-        let looked = spent.on(|| {
+        let looked = spent.time(|| {
             on_all_threads(&|renderer, _, camera| {
                 renderer.contribution(&state, camera, NonZeroU32::MIN, &mut Contribution::new(state.len()));
             });
         });
         let errors: Vec<_> = (0..threads).map(|_| Mutex::new(RemovalError::new(state.len(), 0.0))).collect();
-        let removed = spent.on(|| {
+        let removed = spent.time(|| {
             on_all_threads(&|renderer, thread, camera| {
                 let mut errors = errors[thread].lock().unwrap_or_else(PoisonError::into_inner);
                 renderer.removal_error(&state, camera, scene.background, &mut errors);
             });
         });
         let rendered =
-            spent.on(|| on_all_threads(&|renderer, _, camera| _ = renderer.render(&state, camera, scene.background)));
+            spent.time(|| on_all_threads(&|renderer, _, camera| _ = renderer.render(&state, camera, scene.background)));
         for (measured, expected, pace) in
             [(looked, look, &mut pace.look), (removed, remove, &mut pace.remove), (rendered, render, &mut pace.render)]
         {
             *pace *= measured.unwrap_or(expected) / expected;
         }
         let mut sum = RemovalError::new(state.len(), 0.0);
-        errors.into_iter().for_each(|of| sum.merge(&of.into_inner().unwrap_or_else(PoisonError::into_inner)));
+        errors.into_iter().for_each(|errors| sum.merge(&errors.into_inner().unwrap_or_else(PoisonError::into_inner)));
         let pixels: f64 =
             (0..VIEWS_PER_THREAD * threads).map(camera).map(|c| f64::from(c.width) * f64::from(c.height)).sum();
         self.hardly_seen = hardly_seen(sum.sum, 3.0 * pixels);
@@ -170,9 +170,9 @@ fn hardly_seen(mut errors: Vec<u64>, values: f64) -> f64 {
 fn measure_states(scene: &Scene, work: &Workload, budget: f64, spent: &mut MeasuredTime) -> Result<f64> {
     let source = scene.source();
     let frames = work.frames.min(FRAMES_PER_BLOCK.max(work.input.frame_block)) as usize;
-    let of_block = work.reading(BLOCK.min(source.info().count) as f64, frames as f64);
+    let block_seconds = work.reading(BLOCK.min(source.info().count) as f64, frames as f64);
     let all = source.info().count.div_ceil(BLOCK);
-    let blocks = ((0.3 * budget / of_block) as usize).clamp(1, 4 * work.threads as usize).min(all);
+    let blocks = ((0.3 * budget / block_seconds) as usize).clamp(1, 4 * work.threads as usize).min(all);
     // Most stages read every attribute but SH. Readers are opened before the clock starts because stages open them once
     // for many frames.
     let columns = Columns::all().difference(Columns::SH);
@@ -186,13 +186,13 @@ fn measure_states(scene: &Scene, work: &Workload, budget: f64, spent: &mut Measu
     };
     let mut readers = (0..blocks).into_par_iter().map(open).collect::<Result<Vec<_>>>()?;
     let mut done = Ok(());
-    let took = spent.on(|| {
+    let took = spent.time(|| {
         done = readers
             .par_iter_mut()
             .try_for_each(|(reader, state)| (0..frames).try_for_each(|frame| reader.read(frame, columns, state)));
     });
     done?;
-    let expected = of_block * blocks as f64;
+    let expected = block_seconds * blocks as f64;
     Ok(took.map_or(1.0, |took| took / expected).clamp(0.05, 20.0))
 }
 
@@ -205,7 +205,7 @@ struct MeasuredTime {
 
 impl MeasuredTime {
     /// Runs `work` and returns its processor time in seconds; `None` where the system does not report it.
-    fn on(&mut self, work: impl FnOnce()) -> Option<f64> {
+    fn time(&mut self, work: impl FnOnce()) -> Option<f64> {
         let clock = Clock::start();
         work();
         let (processors, wall) = (clock.processor_seconds()?, clock.seconds());

@@ -123,8 +123,8 @@ mod tests {
             pace: Throughput { processors: Some(1.5), ..Throughput::UNKNOWN },
             ..unmeasured
         };
-        let of = |work: &Workload, searches| Forecast::new(work, &[need(40.0)], 40.0, searches, 1 << 20);
-        let all = [of(&measured, false), of(&unmeasured, false), of(&measured, true)];
+        let forecast = |work: &Workload, searches| Forecast::new(work, &[need(40.0)], 40.0, searches, 1 << 20);
+        let all = [forecast(&measured, false), forecast(&unmeasured, false), forecast(&measured, true)];
         for Forecast { seconds, core_seconds, .. } in &all {
             for range in [seconds, core_seconds] {
                 assert!(range.least < range.likely && range.likely < range.most, "{range:?}");

@@ -91,7 +91,7 @@ mod tests {
         let default = Recipe::preset("default").unwrap();
         let at = Effort::ALL.map(|effort| default.at_effort(effort));
         assert_eq!(at[1], default);
-        let rising = |of: fn(&Recipe) -> f64| at.iter().map(of).is_sorted_by(|a, b| a < b);
+        let rising = |value: fn(&Recipe) -> f64| at.iter().map(value).is_sorted_by(|a, b| a < b);
         assert!(rising(|recipe| recipe.scan.look_pictures as f64));
         assert!(rising(|recipe| recipe.select.round_pictures as f64));
         assert!(rising(|recipe| recipe.select.round_fraction));

@@ -69,8 +69,8 @@ impl Stage for ArchiveStage {
         if let Some(goal) = &mut run.goal {
             (goal.searched, goal.held) = (goal.searched - archive.loss, goal.held - archive.loss);
             run.journal.notes.push(format!(
-                "archive: quantization costs {:.2} dB of the {ARCHIVE_HEADROOM} dB that the search reserved for it; at least \
-                 {} dB PSNR requested, {:.2} dB on the views of the search, {:.2} dB on the other views",
+                "archive: quantization costs {:.2} dB of the {ARCHIVE_HEADROOM} dB that the search reserved for it; at \
+                 least {} dB PSNR requested, {:.2} dB on the views of the search, {:.2} dB on the other views",
                 archive.loss, goal.asked, goal.searched, goal.held
             ));
         }
@@ -285,7 +285,8 @@ impl Grids {
         let errors = self.errors(scene, reference_views, content)?;
         let fine = archive::encode(content, &self.steps(0.0))?.bits;
         let coarse = archive::encode(content, &self.steps(0.5))?.bits;
-        let bits = |of: &BTreeMap<String, f64>, group: &ValueGroup| of.get(group.name()).copied().unwrap_or(0.0);
+        let bits =
+            |by_name: &BTreeMap<String, f64>, group: &ValueGroup| by_name.get(group.name()).copied().unwrap_or(0.0);
         // At least 1: a group without bits left could become coarser without end.
         let saved = |group: &ValueGroup| {
             (2.0 * (bits(&fine, group) - bits(&coarse, group))).max(1.0 + 0.05 * bits(&fine, group))
@@ -342,7 +343,7 @@ fn groups(content: &Content) -> Vec<ValueGroup> {
 
 /// Returns the standard deviation of the values of a group, at least 1e-9.
 fn deviation(content: &Content, group: &ValueGroup) -> f64 {
-    let of = |values: &mut dyn Iterator<Item = f32>| {
+    let deviation = |values: &mut dyn Iterator<Item = f32>| {
         let (mut count, mut sum, mut squares) = (0.0, 0.0, 0.0);
         values.for_each(|value| {
             let value = f64::from(value);
@@ -353,8 +354,8 @@ fn deviation(content: &Content, group: &ValueGroup) -> f64 {
         (squares / f64::max(count, 1.0) - (sum / f64::max(count, 1.0)).powi(2)).max(0.0).sqrt()
     };
     let found = match group {
-        ValueGroup::Tensor(name) => of(&mut content.tensors[name].data.iter().copied()),
-        ValueGroup::Attribute(k) => of(&mut archive::attribute(&content.cloud, *k)),
+        ValueGroup::Tensor(name) => deviation(&mut content.tensors[name].data.iter().copied()),
+        ValueGroup::Attribute(k) => deviation(&mut archive::attribute(&content.cloud, *k)),
     };
     found.max(1e-9)
 }

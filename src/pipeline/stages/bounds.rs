@@ -100,8 +100,8 @@ pub(crate) fn find(
                     let least = size(widest)?;
                     if least > most {
                         return Err(Error::usage(format!(
-                            "--target-size: expected at least {least} bytes, the size of an archive of {} Gaussians with the \
-                             widest error bounds, found {most}",
+                            "--target-size: expected at least {least} bytes, the size of an archive of {} Gaussians \
+                             with the widest error bounds, found {most}",
                             source.info().count
                         )));
                     }

@@ -95,14 +95,15 @@ impl Degree {
             }
             // In a tie the higher degree wins.
             let best = tried.iter().rev().max_by(|a, b| a.1.total_cmp(&b.1)).map_or(fits[0], |best| best.0);
-            let of = |(fit, psnr): &(ByteLimitFit, f64)| {
+            let line = |(fit, psnr): &(ByteLimitFit, f64)| {
                 let psnr = if psnr.is_nan() { "no number".to_owned() } else { format!("{psnr:.2}") };
                 format!("{} Gaussians of degree {}: {psnr}", fit.gaussians, fit.sh_degree)
             };
-            let (count, tried) = (targets.parted(false).apart.len(), tried.iter().map(of).collect::<Vec<_>>().join(", "));
+            let tried = tried.iter().map(line).collect::<Vec<_>>().join(", ");
+            let count = targets.parted(false).apart.len();
             journal.notes.push(format!(
-                "SH degree {} gives the best quality within the byte limit; PSNR on {count} validation views after a fifth \
-                 of the optimization steps, dB: {tried}",
+                "SH degree {} gives the best quality within the byte limit; PSNR on {count} validation views after a \
+                 fifth of the optimization steps, dB: {tried}",
                 best.sh_degree
             ));
             Ok((best, best.gaussians))

@@ -108,7 +108,7 @@ impl FieldPrecisionStage {
             return Ok(compressed);
         }
         let halved = CompressedModel { field: Precision::Half, ..compressed.clone() };
-        let [exact, half] = [&compressed, &halved].map(|of| scene.input.reduced(of));
+        let [exact, half] = [&compressed, &halved].map(|model| scene.input.reduced(model));
         let (exact, half) = (exact?, half?);
         let rounding = closeness(scene, [&*exact, &*half], &pictures)?;
         let result = match rounding >= CLOSE_ENOUGH {

@@ -304,7 +304,8 @@ impl<'a> Trial<'a> {
         let left = merged.compressed.len();
         if left > target {
             return Err(Error::usage(format!(
-                "a target of {target} Gaussians, but merging alone leaves {left} at the least\n  allow pruning, or looser merge passes"
+                "a target of {target} Gaussians, but merging alone leaves {left} at the least\n  \
+                 allow pruning, or looser merge passes"
             )));
         }
         Ok(merged)

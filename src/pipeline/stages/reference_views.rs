@@ -121,13 +121,13 @@ impl ReferenceViews<'_> {
         Ok(reference_views)
     }
 
-    fn render<T: Send>(&self, source: &dyn FrameSource, of: impl Fn(usize, Image) -> T + Sync) -> Result<Vec<T>> {
+    fn render<T: Send>(&self, source: &dyn FrameSource, finish: impl Fn(usize, Image) -> T + Sync) -> Result<Vec<T>> {
         let mut rendered = Vec::with_capacity(self.pictures.len());
         let batch = Batch::of_frame(&self.scene.limits);
         show([Subject::all(source)], &self.scene.schedule.cameras, &self.pictures, batch, |views| {
             let first = rendered.len();
             let view = |(k, view): (usize, &crate::passes::ViewStates<'_, 1>)| {
-                of(first + k, render(view.states[0], view.camera, self.scene.background))
+                finish(first + k, render(view.states[0], view.camera, self.scene.background))
             };
             rendered.par_extend(views.par_iter().enumerate().map(view));
             Ok(())
@@ -155,7 +155,8 @@ impl ReferenceViews<'_> {
 pub(crate) fn check_measurable(psnr: f64) -> Result<f64> {
     if psnr.is_nan() {
         return Err(Error::usage(
-            "the quantization of an archive is chosen by renders: expected numbers in every pixel, found NaN in some\n  \
+            "the quantization of an archive is chosen by renders: expected numbers in every pixel, found NaN in \
+             some\n  \
              --non-finite drop removes the Gaussians that are not finite; a .gseq holds them as they are",
         ));
     }
@@ -173,24 +174,25 @@ pub(crate) fn check_met(quality_target: QualityTarget, asked: f64, found: f64) -
     match is_met {
         true => Ok(()),
         false => Err(Error::usage(format!(
-            "an archive cannot reach the requested PSNR against the result before quantization: expected {asked:.1} dB, found {}\n  \
+            "an archive cannot reach the requested PSNR against the result before quantization: expected {asked:.1} \
+             dB, found {}\n  \
              some values may be far larger than all others: drop their Gaussians (--drop-ids), or write a .gseq",
             decibels_text(found, 1)
         ))),
     }
 }
 
-/// Returns the result of `of` at the largest number of a range for which it returns one, found by bisection with
+/// Returns the result of `evaluate` at the largest number of a range for which it returns one, found by bisection with
 /// `halvings` steps. Returns `None` if no tried number has a result.
 pub(crate) fn bisect<T>(
     [mut low, mut high]: [f64; 2],
     halvings: usize,
-    of: impl Fn(f64) -> Result<Option<T>>,
+    evaluate: impl Fn(f64) -> Result<Option<T>>,
 ) -> Result<Option<T>> {
     let mut best = None;
     for _ in 0..halvings {
         let middle = 0.5 * (low + high);
-        match of(middle)? {
+        match evaluate(middle)? {
             Some(found) => (low, best) = (middle, Some(found)),
             None => high = middle,
         }

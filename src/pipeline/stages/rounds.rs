@@ -132,9 +132,9 @@ impl Rounds {
 
     /// Returns the rounds that leave `fewest` of `count` Gaussians, one line each for display.
     pub(crate) fn shardable_rounds(&self, count: usize, fewest: usize) -> Vec<String> {
-        let of = |round: usize| self.pictures.div_ceil(if round == 0 { 1 } else { self.turns.max(1) });
+        let view_count = |round: usize| self.pictures.div_ceil(if round == 0 { 1 } else { self.turns.max(1) });
         let rounds = 0..self.sizes(count, 0, fewest).len();
-        rounds.map(|round| format!("{}: {} views at most", entry_name(round), of(round))).collect()
+        rounds.map(|round| format!("{}: {} views at most", entry_name(round), view_count(round))).collect()
     }
 
     /// Divides the views into groups (turns), by frames if there are enough frames, otherwise one by one.
@@ -186,7 +186,7 @@ impl Rounds {
             }
         }
         let pictures =
-            (done..sizes.len()).map(|round| looking(&turns, round).map(|turn| turns[turn].len()).sum::<usize>());
+            (done..sizes.len()).map(|round| active_turns(&turns, round).map(|turn| turns[turn].len()).sum::<usize>());
         let progress = scene.events.task(NAME, "pictures", pictures.sum::<usize>() as u64);
         let RoundState { free, removed, .. } = journal.stage(NAME, first, scene.source(), |_| {
             for (round, &left) in sizes.iter().enumerate().skip(done) {
@@ -222,40 +222,41 @@ impl Rounds {
     ) -> Result<RoundState> {
         let mut ids: Vec<u32> = state.free.iter().chain(&scored.protected).copied().collect();
         ids.sort_unstable();
-        let looking: Vec<usize> = looking(turns, round).collect();
+        let active: Vec<usize> = active_turns(turns, round).collect();
         let (background, floor) = (scene.background, self.contrast_floor as f32);
-        let units = looking.iter().map(|&turn| turns[turn].len()).sum();
+        let units = active.iter().map(|&turn| turns[turn].len()).sum();
         // Removal errors of each active group, summed over the views of that group that are in `some`; empty if there
         // are none.
         let compute = |some: Range<usize>| -> Result<Vec<Vec<u64>>> {
             let mut start = 0;
-            let of_turn = |&turn: &usize| {
+            let turn_errors = |&turn: &usize| {
                 let pictures = &turns[turn];
                 let place = |unit: usize| unit.saturating_sub(start).min(pictures.len());
-                let of = place(some.start)..place(some.end);
+                let range = place(some.start)..place(some.end);
                 start += pictures.len();
-                if of.is_empty() {
+                if range.is_empty() {
                     return Ok(Vec::new());
                 }
-                let pictures = (&scene.schedule.cameras[..], &pictures[of]);
+                let pictures = (&scene.schedule.cameras[..], &pictures[range]);
                 let advance = || progress.advance(1);
                 Ok(removal_error(scene.source(), &ids, pictures, background, floor, scene.limits, advance)?.sum)
             };
-            looking.iter().map(of_turn).collect()
+            active.iter().map(turn_errors).collect()
         };
         scene.work.divided(&entry_name(round), key.and(&round), units, compute, |parts| {
-            for &turn in &looking {
+            for &turn in &active {
                 ids.iter().for_each(|&id| state.errors[turn][id as usize] = 0);
             }
             for part in parts {
-                for (&turn, found) in looking.iter().zip(part?) {
+                for (&turn, found) in active.iter().zip(part?) {
                     let errors = &mut state.errors[turn];
                     for (&id, error) in ids.iter().zip(found) {
                         errors[id as usize] = errors[id as usize].saturating_add(error);
                     }
                 }
             }
-            let error = |id: &u32| state.errors.iter().fold(0u64, |sum, of| sum.saturating_add(of[*id as usize]));
+            let error =
+                |id: &u32| state.errors.iter().fold(0u64, |sum, errors| sum.saturating_add(errors[*id as usize]));
             // The sort is stable: ties keep the earlier order.
             state.free.sort_by_cached_key(|id| std::cmp::Reverse(error(id)));
             let mut worst = state.free.split_off(left);
@@ -283,10 +284,10 @@ fn entry_name(round: usize) -> String {
 }
 
 /// Returns the groups of views that a round renders: all in the first round, then one after the other.
-fn looking(turns: &[Vec<Picture>], round: usize) -> impl Iterator<Item = usize> {
+fn active_turns(turns: &[Vec<Picture>], round: usize) -> impl Iterator<Item = usize> {
     let count = turns.len().max(1);
-    let looking = if round == 0 { turns.len() } else { 1.min(turns.len()) };
-    (0..looking).map(move |k| (round + k) % count)
+    let active = if round == 0 { turns.len() } else { 1.min(turns.len()) };
+    (0..active).map(move |k| (round + k) % count)
 }
 
 #[cfg(test)]
@@ -328,12 +329,12 @@ mod tests {
         let all: Vec<u32> = (0..1500).collect();
         for target in [150, 500] {
             let quality = |kept: &[u32]| -> f64 {
-                let of_picture = |picture: &Picture| {
+                let view_psnr = |picture: &Picture| {
                     let original = gather(scene.source(), &all, picture.frame, Columns::all()).unwrap();
                     let camera = &scene.schedule.cameras[picture.camera as usize];
                     psnr(&render(&original.pick(kept), camera, [0.0; 3]), &render(&original, camera, [0.0; 3]))
                 };
-                spread(&scene.schedule, 12, 1).iter().map(of_picture).sum::<f64>() / 12.0
+                spread(&scene.schedule, 12, 1).iter().map(view_psnr).sum::<f64>() / 12.0
             };
             let got = quality(&rounds.take(target));
             let at_once = quality(&once.take(target));

@@ -161,8 +161,8 @@ impl ByteLimit {
             let least = bytes(one)?;
             if least > most {
                 return Err(Error::usage(format!(
-                    "--target-size: expected at least {least} bytes, the size of an output with one Gaussian (nearly all of it \
-                     is not Gaussians), found {most}"
+                    "--target-size: expected at least {least} bytes, the size of an output with one Gaussian (nearly \
+                     all of it is not Gaussians), found {most}"
                 )));
             }
             // Numbers of Gaussians with their bytes: `fits` is the largest that fits, `over` the smallest that does
@@ -218,8 +218,8 @@ impl ByteLimit {
                 let protected = scored.protected.len();
                 if compressed.len() <= protected {
                     return Err(Error::usage(format!(
-                        "--target-size: expected at least {found} bytes, the size of an output with only the {protected} \
-                         Gaussians that are to be kept, found {}",
+                        "--target-size: expected at least {found} bytes, the size of an output with only the \
+                         {protected} Gaussians that are to be kept, found {}",
                         self.most
                     )));
                 }
