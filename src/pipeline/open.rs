@@ -127,11 +127,6 @@ fn receive_measured(
     };
     let measures = fit(Verbosity::Nothing, Some(visible.is_some())).is_ok();
     let memory = fit(options.memory.tell, measures.then_some(visible.is_some()))?;
-    if options.memory.tell == Verbosity::Time {
-        let text =
-            format!("memory: at most {}; the number of frames is unknown until the stream ends", size(memory.peak()));
-        options.events.send(Message::Plan(&text));
-    }
     let receive = |budget: u64, measuring: Option<bool>, frames: u64| {
         let limits = memory.limits;
         Plan::closest(work, budget, |work, _| vec![receiving(work, &limits, held, measuring, frames)]).peak()
@@ -142,12 +137,7 @@ fn receive_measured(
     });
     let to_measure =
         FrameQuota::new(options.memory, |budget, frames| receive(budget, Some(visible.is_some()), frames)).most;
-    if options.memory.tell == Verbosity::Plan {
-        let most = quota.most;
-        let text =
-            format!("frames: at most {most} fit the memory limit; up to {to_measure} are measured while they arrive");
-        options.events.send(Message::Plan(&text));
-    }
+    announce_limits(options, memory.peak(), quota.most, to_measure);
     // Without cameras the virtual rig is placed around the first frame; the plan of the scan follows from the rig.
     let (rig, plan_of_scan) = (OnceCell::new(), OnceCell::new());
     if let Some(loaded) = loaded {
@@ -193,6 +183,21 @@ fn receive_measured(
     let measured = arrived.as_ref().map(Measured::kinds).unwrap_or_default();
     send_forecast(&mut scene, &later, &stages, measured, options, journal)?;
     Ok((scene, stages, arrived))
+}
+
+/// Sends the limits of a stream as a message, if the user asked for the plan or the forecast: the maximum memory `peak`,
+/// bytes, or the numbers of frames that fit the memory limit (`most`) and that are measured on arrival (`to_measure`).
+fn announce_limits(options: &InputOptions, peak: u64, most: u64, to_measure: u64) {
+    let text = match options.memory.tell {
+        Verbosity::Time => {
+            format!("memory: at most {}; the number of frames is unknown until the stream ends", size(peak))
+        }
+        Verbosity::Plan => {
+            format!("frames: at most {most} fit the memory limit; up to {to_measure} are measured while they arrive")
+        }
+        Verbosity::Nothing => return,
+    };
+    options.events.send(Message::Plan(&text));
 }
 
 /// Returns the statistics that were taken while the frames arrived. Returns `None` and adds a note to the scene if an
