@@ -4,7 +4,7 @@
     python3 scripts/cut_lives.py FRAMES OUT [--lives 4-12] [--overlap 2] [--noise 0.02] [--jitter 0.02] [--away 0] [--seed 0]
     python3 scripts/cut_lives.py --score OUT LINKED.gseq
 
-FRAMES is a folder of PLY files with the same Gaussians in the same order, little-endian floats (`splatsieve unpack`). Of
+FRAMES is a folder of PLY files with the same Gaussians in the same order, little-endian floats (`splatsieve convert`). Of
 every frame the script writes a file of the same name into OUT in which
 - a Gaussian's time is cut into lives of --lives frames [default: one life]; for --overlap frames [0] the old life fades out
   while the new one fades in, both together as opaque as the Gaussian;

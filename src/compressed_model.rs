@@ -1,65 +1,65 @@
-//! What is left of an input: which Gaussians stay, which of them stand for several, and what was changed of them.
+//! The compressed model: Gaussians that stay, proxies that replace merged clusters, and parameter deltas.
 
 use serde::{Deserialize, Serialize};
 
 use crate::model::{ALL_HARMONICS, Column, Columns, Gaussians, Raw};
 use crate::recipe::{MergeParams, Precision};
 
-/// The frame at which Gaussians are compared, and the scale of the scene there.
+/// Frame at which Gaussians are compared, and the extent of the scene at this frame.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct Reference {
-    /// The frame with most Gaussians alive, ties to the first; 0 without frames.
+    /// Frame with the most Gaussians alive; the first one in a tie; 0 if there are no frames.
     pub frame: usize,
-    /// Robust extent of the positions there, scene units.
+    /// Robust extent of the positions at this frame, scene units.
     pub extent: f64,
 }
 
-/// Several Gaussians of the input that became one of the output, a proxy.
+/// Cluster of input Gaussians that are merged into one output Gaussian, the proxy.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Cluster {
-    /// Place in the output.
+    /// Index of the proxy in the output.
     pub output: u32,
-    /// Id of the leader.
+    /// Id of the cluster's leader.
     pub leader: u32,
-    /// Ids, increasing, the leader's among them, with weights that sum to 1.
+    /// Ids of all members in increasing order, including the leader, with weights that sum to 1.
     pub members: Vec<(u32, f64)>,
 }
 
-/// What proxies are made of, and what is known of them before anything is written.
+/// Parameters of the proxies and the result of solving for them, known before anything is written.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 pub struct Proxies {
-    /// Raw parameters, one row per cluster, of a family that has such; none where a proxy follows from its members
-    /// frame by frame.
+    /// Raw parameters, one row per cluster, for model formats that store proxies as rows. `None` where a proxy is
+    /// computed from its members frame by frame.
     pub raw: Option<Raw>,
-    /// Clusters, by number, increasing, that no proxy stands for well enough: their leaders stay as they are, alone.
+    /// Increasing indices of clusters that no proxy represents well enough. Their leaders stay unmerged.
     pub refused: Vec<usize>,
-    /// Furthest that a proxy strays from its place among its members over sampled frames, scene units; none where it
-    /// cannot stray.
+    /// Largest distance between a proxy and its position among its members over sampled frames, scene units. `None`
+    /// where a proxy cannot deviate.
     pub deviation: Option<f64>,
-    /// Things a person should know.
+    /// Notes for the user.
     pub notes: Vec<String>,
 }
 
-/// What is added to the parameters of the output's Gaussians as they are stored, the same at all times.
+/// Parameter delta, constant in time: values added to the stored parameters of the output's Gaussians.
 ///
-/// A row for every Gaussian of the output, in columns that change; columns that do not are empty. Harmonics may be of
-/// a lower degree than the output's: those above stay.
+/// An attribute that changes has one row per Gaussian of the output; an attribute that does not change is empty. SH
+/// coefficients may be of a lower degree than the output's; coefficients above that degree do not change.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct ParamDelta(pub Gaussians);
 
 impl ParamDelta {
-    /// The columns that change.
+    /// Returns the attributes that change.
     pub fn columns(&self) -> Columns {
         let changes = |&column: &Columns| !self.0.column(column).is_empty();
         Columns::all().iter().filter(changes).collect()
     }
 
-    /// Whether nothing changes.
+    /// Returns whether no attribute changes.
     pub fn is_empty(&self) -> bool {
         self.columns().is_empty()
     }
 
-    /// The change of the Gaussians at `places`, in that order.
+    /// Returns the delta of the Gaussians at the indices `places`, in that order.
     pub fn pick(&self, places: &[u32]) -> ParamDelta {
         let mut picked = ParamDelta::default();
         for column in self.columns().iter() {
@@ -68,34 +68,36 @@ impl ParamDelta {
         picked
     }
 
-    /// Makes it so many times as much.
+    /// Multiplies the delta by `by`.
     pub fn scale(&mut self, by: f32) {
         self.0.columns_mut(Columns::all()).flat_map(Column::planes_mut).for_each(|x| *x *= by);
     }
 
-    /// This change and then `more`, whose harmonics are of no lower degree where both have some.
+    /// Returns the sum of this delta and `more`. Where both have SH coefficients, the degree of `more` must not be
+    /// lower.
     pub fn and(self, mut more: ParamDelta) -> ParamDelta {
         for column in self.columns().iter() {
-            let (of, to) = (self.0.column(column), more.0.column_mut(column));
+            let (from, to) = (self.0.column(column), more.0.column_mut(column));
             if to.is_empty() {
-                *to = of.clone();
+                *to = from.clone();
             } else {
-                to.planes_mut().iter_mut().zip(of.planes()).for_each(|(to, of)| *to += of);
+                to.planes_mut().iter_mut().zip(from.planes()).for_each(|(to, from)| *to += from);
             }
         }
         more
     }
 
-    /// What leads from `before` here.
+    /// Returns the difference `self - before`.
     pub fn since(&self, before: &ParamDelta) -> ParamDelta {
         let mut back = before.clone();
         back.scale(-1.0);
         back.and(self.clone())
     }
 
-    /// Changes the columns `of` of `state`, row by row. A zero leaves the value its bits.
-    pub fn add_to(&self, state: &mut Gaussians, of: Columns) {
-        for column in (self.columns() & of).iter() {
+    /// Adds the attributes `attributes` of the delta to `state`, row by row. A delta of zero leaves the bits of a value
+    /// unchanged.
+    pub fn add_to(&self, state: &mut Gaussians, attributes: Columns) {
+        for column in (self.columns() & attributes).iter() {
             let (by, values) = (self.0.column(column), state.column_mut(column));
             for c in 0..by.width().min(values.width()) {
                 for (value, &by) in values.plane_mut(c).iter_mut().zip(by.plane(c)) {
@@ -106,13 +108,14 @@ impl ParamDelta {
     }
 }
 
-/// What is added beside a [`ParamDelta`], another amount at every time: these at times that lie evenly from the first frame to
-/// the last, and in between what lies on the straight line; none: nothing. All have the same columns.
+/// Trajectory delta: a delta beside [`ParamDelta`] that varies in time. Keyframes are evenly spaced from the first
+/// frame to the last; the delta is linear between them. All keyframes have the same attributes. No keyframes: no delta.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct TrajectoryDelta(pub Vec<ParamDelta>);
 
 impl TrajectoryDelta {
-    /// Which of `knots`, 2 or more, make up what is added at `frame` of `frames`, and with which weights.
+    /// Returns the two of `knots` keyframes (2 or more) that are interpolated at `frame` of `frames`, with their
+    /// weights.
     pub fn weights(knots: usize, frame: usize, frames: usize) -> [(usize, f32); 2] {
         let along = frame as f64 * (knots - 1) as f64 / (frames.max(2) - 1) as f64;
         let first = (along as usize).min(knots - 2);
@@ -120,17 +123,17 @@ impl TrajectoryDelta {
         [(first, 1.0 - part), (first + 1, part)]
     }
 
-    /// Whether nothing is added.
+    /// Returns whether there are no keyframes.
     pub fn is_empty(&self) -> bool {
         self.0.is_empty()
     }
 
-    /// The columns that change.
+    /// Returns the attributes that change.
     pub fn columns(&self) -> Columns {
         self.0.first().map_or(Columns::empty(), ParamDelta::columns)
     }
 
-    /// What is added at `frame` of `frames`.
+    /// Returns the interpolated delta at `frame` of `frames`.
     pub fn at(&self, frame: usize, frames: usize) -> ParamDelta {
         if self.is_empty() {
             return ParamDelta::default();
@@ -142,12 +145,12 @@ impl TrajectoryDelta {
         change.and(more)
     }
 
-    /// The course of the Gaussians at `places`, in that order.
+    /// Returns the trajectory delta of the Gaussians at the indices `places`, in that order.
     pub fn pick(&self, places: &[u32]) -> TrajectoryDelta {
         TrajectoryDelta(self.0.iter().map(|knot| knot.pick(places)).collect())
     }
 
-    /// This course and then `more`, of as many knots if both have any.
+    /// Returns the sum of this trajectory delta and `more`. If both have keyframes, their numbers must be equal.
     pub fn and(self, more: TrajectoryDelta) -> TrajectoryDelta {
         match (self.is_empty(), more.is_empty()) {
             (_, true) => self,
@@ -157,30 +160,30 @@ impl TrajectoryDelta {
     }
 }
 
-/// The Gaussians of the output in terms of those of the input.
+/// Compressed model: the Gaussians of the output in terms of the Gaussians of the input.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct CompressedModel {
-    /// For every Gaussian of the output the id of its original, or of its cluster's leader; increasing.
+    /// Id of the original, or of the cluster's leader, for every Gaussian of the output; increasing.
     pub kept: Vec<u32>,
-    /// The proxies among them, by place in the output.
+    /// Merged clusters, in increasing order of their index in the output.
     pub clusters: Vec<Cluster>,
-    /// How members make up a proxy.
+    /// Merge parameters by which members make up a proxy.
     pub rule: MergeParams,
-    /// The proxies, solved.
+    /// Solved parameters of the proxies.
     pub proxies: Proxies,
-    /// What is added to their parameters.
+    /// Delta of the stored parameters, constant in time.
     pub change: ParamDelta,
-    /// And beside that along time, where their state stands in every frame and there are no proxies.
+    /// Additional delta that varies in time. Used for formats with explicit frames, and only if there are no proxies.
     pub course: TrajectoryDelta,
-    /// How the field that deforms them is written, where there is one.
+    /// Precision in which the deformation field is written, if there is one.
     pub field: Precision,
-    /// Degree of the harmonics that stay of them; those above go, if there are any.
+    /// Highest SH degree of the output. Coefficients above it are dropped.
     pub sh_degree: usize,
 }
 
 impl CompressedModel {
-    /// The Gaussians `kept` (increasing) as they are, with their field and all of their harmonics. Nothing is merged, so
-    /// that nothing goes by `rule`.
+    /// Returns a model of the Gaussians `kept` (increasing), unchanged and unmerged, with the exact field and all SH
+    /// coefficients. `rule` is stored but unused, since nothing is merged.
     pub fn pruned(kept: Vec<u32>, rule: &MergeParams) -> Self {
         CompressedModel {
             kept,
@@ -194,12 +197,13 @@ impl CompressedModel {
         }
     }
 
-    /// The Gaussians `kept` (increasing) in the same manner.
+    /// Returns a copy of this model with the Gaussians `kept` (increasing) instead of its own.
     pub fn with(&self, kept: Vec<u32>) -> Self {
         CompressedModel { kept, ..self.clone() }
     }
 
-    /// Makes the clusters what `proxies` say that they are; those refused are their leaders, as these are.
+    /// Sets the solved `proxies`. A refused cluster is dissolved: its leader stays unchanged, its other members are
+    /// removed.
     pub fn make(&mut self, mut proxies: Proxies) {
         let refused = std::mem::take(&mut proxies.refused);
         if !refused.is_empty() {
@@ -212,20 +216,20 @@ impl CompressedModel {
         self.proxies = proxies;
     }
 
-    /// Number of Gaussians in the output.
+    /// Returns the number of Gaussians in the output.
     pub fn len(&self) -> usize {
         self.kept.len()
     }
 
-    /// Whether nothing is left.
+    /// Returns whether no Gaussian is left.
     pub fn is_empty(&self) -> bool {
         self.kept.is_empty()
     }
 
-    /// Those at `places` (increasing) alone, of a reduction without proxies.
+    /// Returns a model of only the Gaussians at the indices `places` (increasing). The model must have no proxies.
     ///
     /// # Panics
-    /// If there is a proxy.
+    /// Panics if there is a proxy.
     pub fn pick(&self, places: &[u32]) -> CompressedModel {
         assert!(self.clusters.is_empty(), "proxies have no place to pick them by");
         let kept = places.iter().map(|&place| self.kept[place as usize]).collect();
@@ -234,13 +238,13 @@ impl CompressedModel {
         CompressedModel { change, course, field, sh_degree, ..CompressedModel::pruned(kept, &self.rule) }
     }
 
-    /// All that is added at `frame` of `frames`.
+    /// Returns the total delta at `frame` of `frames`.
     pub fn change_at(&self, frame: usize, frames: usize) -> ParamDelta {
-        // The course has no higher bands.
+        // The trajectory delta never has a higher SH degree than the constant one.
         self.course.at(frame, frames).and(self.change.clone())
     }
 
-    /// For every Gaussian of an input of `count` its place in the output, if it has one.
+    /// Returns for each of the `count` input Gaussians its index in the output, or `None` if it was removed.
     pub fn index_map(&self, count: usize) -> Vec<Option<u32>> {
         let mut map = vec![None; count];
         for (place, &id) in self.kept.iter().enumerate() {
@@ -261,7 +265,7 @@ mod tests {
     use crate::recipe::Recipe;
 
     #[test]
-    fn a_change_adds_to_its_own_columns_and_zeros_keep_even_the_sign_of_zero() {
+    fn delta_adds_to_its_attributes_and_zero_keeps_bits() {
         let mut state = Gaussians::zeros(2, 1);
         state.opacity_logit.set_row(0, [-0.0]);
         let mut by = Gaussians::zeros(2, 0);
@@ -282,7 +286,7 @@ mod tests {
     }
 
     #[test]
-    fn a_course_goes_through_its_knots_and_straight_in_between() {
+    fn trajectory_delta_is_linear_between_keyframes() {
         let knot = |x: f32, logit: f32| {
             let mut by = Gaussians::zeros(0, 0);
             by.position = Column::from_planes(3, vec![x, 0.0, 2.0 * x, 0.0, 0.0, -x]);
@@ -310,7 +314,7 @@ mod tests {
     }
 
     #[test]
-    fn clusters_that_are_refused_are_their_leaders_and_the_others_keep_their_proxies() {
+    fn refused_clusters_keep_only_their_leaders() {
         let rule = Recipe::preset("default").unwrap().merge;
         let mut reduction = CompressedModel::pruned(vec![1, 4, 6], &rule);
         let cluster = |output: u32, leader: u32, other: u32| Cluster {
@@ -328,7 +332,7 @@ mod tests {
     }
 
     #[test]
-    fn members_of_a_cluster_share_its_place() {
+    fn members_of_a_cluster_share_its_index() {
         let rule = Recipe::preset("default").unwrap().merge;
         let mut reduction = CompressedModel::pruned(vec![1, 4], &rule);
         assert_eq!(reduction.index_map(6), [None, Some(0), None, None, Some(1), None]);

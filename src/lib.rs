@@ -1,29 +1,33 @@
 //! Shrinks trained dynamic (4D) Gaussian-splatting models after training.
 //!
-//! The program is one pipeline: a model is opened as a [`scene`], [`statistics`] and scores rank its Gaussians,
-//! [`pruning`] and [`merging`] choose which stay, [`refinement`] fits them to renders of the original, and [`outputs`]
-//! writes what is left. Each folder uses only folders above it in this table, which `tests/layers.rs` checks.
+//! A run is one pipeline. It opens a model as a [`scene`]; [`statistics`] and scores rank the Gaussians; [`pruning`]
+//! and [`merging`] choose which Gaussians stay; [`refinement`] fits them to renders of the original; [`outputs`] and
+//! [`models`] write the result. Each folder uses only folders above it in this table; `tests/layers.rs` checks this.
 //!
-//! | folders | what is in them |
+//! | folders | contents |
 //! |---|---|
-//! | crates `splat-platform`, [`gseq`], `splat-core`, `splat-render`, `splat-fields` | what differs between systems; the container; Gaussians, cameras and errors ([`model`], [`error`]); the rasterizer and image metrics ([`render`], [`metrics`]); deformation fields ([`deform`]) |
-//! | [`limits`], [`machine`], [`recipe`], [`compressed_model`], [`source`] | memory limits, parameters of a run, what is left of a model, and how frames are read |
+//! | crates `splat-platform`, [`gseq`], `splat-core`, `splat-render`, `splat-fields` | differences between operating
+//! systems; the container; Gaussians, cameras and errors ([`model`], [`error`]); the rasterizer and image metrics
+//! ([`render`], [`metrics`]); deformation fields ([`deform`]) |
+//! | [`limits`], [`machine`], [`recipe`], [`compressed_model`], [`source`] | memory limits, parameters of a run, the
+//! compressed model, and the traits by which frames are read |
 //! | [`archive`], [`fit`] | the codec of `.gsz` archives; curves fitted to the states of a Gaussian |
-//! | [`progress`] | the events by which the library tells what it is doing |
-//! | [`files`], [`cache`] | file formats, reader beside writer; atomic outputs; results that stages keep |
+//! | [`progress`] | events by which the library reports its work |
+//! | [`files`], [`cache`] | file formats, reader beside writer; atomic outputs; cached results of stages |
 //! | [`passes`] | driving a pass over frames on all threads |
 //! | [`outputs`] | sequences as containers, curves, streams, films and tables |
-//! | [`tracking`], [`merging`] | which Gaussian of one frame is which of the next; which Gaussians become one |
+//! | [`tracking`], [`merging`] | correspondence of Gaussians between frames; merging of similar Gaussians |
 //! | [`models`] | one folder per model format: recognize, open, evaluate, write back |
 //! | [`memory_plan`], [`statistics`], [`scene`], [`journal`] | the memory plan; statistics and scores; an input with its cameras; what stages record |
-//! | [`pruning`], [`refinement`], [`pipeline`] | stages, and the order they run in |
-//! | [`evaluation`], [`commands`], [`report`], [`diagnostics`], [`player`] | measuring a result, the other commands, pages for people, the self-check and experiments |
+//! | [`pruning`], [`refinement`], [`pipeline`] | stages, and the order in which they run |
+//! | [`evaluation`], [`commands`], [`report`], [`diagnostics`], [`player`] | quality of a result, the other commands,
+//! HTML pages, the self-check and experiments |
 //!
-//! [`method`] derives what is computed.
+//! [`method`] derives the formulas that are implemented.
 
 #![cfg_attr(not(test), deny(clippy::print_stderr, clippy::print_stdout, clippy::disallowed_methods))]
 
-/// Program and version, by which results name what made them.
+/// Name and version of the program, written into results.
 pub const TOOL: &str = concat!("splatsieve ", env!("CARGO_PKG_VERSION"));
 
 pub mod archive;
@@ -46,7 +50,7 @@ pub mod pruning;
 pub mod refinement;
 pub mod statistics;
 pub mod tracking;
-/// How what is computed follows from what is wanted; comments elsewhere cite its sections.
+/// Derivation of the implemented formulas. Comments in the code cite the sections of this text.
 #[doc = include_str!("method.md")]
 pub mod method {}
 pub mod limits;

@@ -1,30 +1,30 @@
-//! How much memory a run may take, and what follows from it.
+//! Memory limits of a run.
 
 use std::path::Path;
 
 use crate::error::{Error, Result};
 
-/// What stages keep in memory at a time. No result depends on it.
+/// Amounts that stages keep in memory at a time. No result depends on them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Limits {
-    /// Frames that a reader which goes frame by frame may hold of those it decodes together; at least 1.
+    /// Maximum number of frames that a reader of consecutive frames keeps of those it decodes together; at least 1.
     pub frames_held: usize,
-    /// Frames whose states lie ready to be looked at; at least 1.
+    /// Maximum number of frames whose states are in memory, ready to be rendered; at least 1.
     pub frames_together: usize,
-    /// Pictures worked on at once; at least 1.
+    /// Maximum number of views rendered at once; at least 1.
     pub pictures_together: usize,
-    /// Gaussians of a result whose frames wait together to be written.
+    /// Maximum number of Gaussians of a result whose frames are in memory until they are written.
     pub gaussians_together: usize,
-    /// Pairs of Gaussians whose motion is measured together; at least 1.
+    /// Maximum number of pairs of Gaussians whose motion is compared together; at least 1.
     pub pairs_together: usize,
-    /// Statistics wait in a scratch file once they have been scored.
+    /// Whether statistics are spilled to a scratch file once they have been scored.
     pub rows_aside: bool,
-    /// The tiles of a container stay in memory once they are decoded, all of them.
+    /// Whether all decoded tiles of a container stay in memory.
     pub tiles_held: bool,
 }
 
 impl Limits {
-    /// As much as it takes to be fast.
+    /// Limits that allow the fastest run.
     pub const NONE: Limits = Limits {
         frames_held: usize::MAX,
         frames_together: usize::MAX,
@@ -36,10 +36,10 @@ impl Limits {
     };
 }
 
-/// Memory that opening an input may take beside the program itself.
+/// Memory that opening an input may take, without the program itself.
 ///
-/// Readers ask it before they allocate for a length that a file announces, and while they read where the file does not
-/// announce one.
+/// Readers check the limit before they allocate for a length given in a file, and during reading if the file gives
+/// none.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ReadLimit {
     bytes: u64,
@@ -52,23 +52,23 @@ impl Default for ReadLimit {
 }
 
 impl ReadLimit {
-    /// No limit: for tests and for programs that trust their input.
+    /// No limit, for tests and for programs that trust their input.
     pub const NONE: ReadLimit = ReadLimit { bytes: u64::MAX };
 
-    /// Limit of so many bytes.
+    /// Creates a limit of `bytes` bytes.
     pub fn new(bytes: u64) -> ReadLimit {
         ReadLimit { bytes }
     }
 
-    /// Bytes that reading may take.
+    /// Returns the number of bytes that reading may take.
     pub fn bytes(self) -> u64 {
         self.bytes
     }
 
-    /// Confirms that `bytes` fit within the limit. `what` names what they are for, as in "the rows of the header".
+    /// Checks that `bytes` fit within the limit. `what` names their purpose, as in "the rows of the header".
     ///
     /// # Errors
-    /// More bytes than the limit, as an input error at `place` of `path` that says what to do.
+    /// More bytes than the limit: an input error at `place` of `path` that says what to do.
     pub fn check(self, path: &Path, place: &str, what: &str, bytes: u64) -> Result<()> {
         if bytes <= self.bytes {
             return Ok(());

@@ -1,29 +1,30 @@
-//! How much memory this process may take, and who says so: the machine, a control group that it or one around it is
-//! in, a batch job, or the process's own limits.
+//! Memory that this process may take, and where that limit comes from: the machine, a control group that contains the
+//! process, a batch job, or limits of the process itself.
 //!
-//! In: what the system states and variables of the environment. Out: the least of the limits.
+//! Input: the limits that the system reports, and environment variables. Output: the smallest of them.
 
 use splat_platform::{LimitSource, MemoryLimit, MemoryLimits, UNLIMITED_BYTES, memory_limits};
 pub use splat_platform::{peak_memory_bytes, reset_peak_memory};
 
 use crate::error::ShowPath;
 
-/// Bytes of memory that this process may take, and where that number comes from. As many as there are where the
-/// system tells nothing.
+/// Returns the number of bytes that this process may take, and a description of where that number comes from. Returns
+/// [`u64::MAX`] if the system reports no limit.
 pub fn memory_limit() -> (u64, String) {
     least_limit(memory_limits(), |name| std::env::var(name).ok())
 }
 
-/// Returns the least of the system's limits and of those that the variables of a batch job state.
+/// Returns the smallest of the system's limits and of those that the variables of a batch job state.
 fn least_limit(system: MemoryLimits, variable: impl Fn(&str) -> Option<String>) -> (u64, String) {
     let mut limits: Vec<(u64, String)> = system.around.into_iter().map(described).collect();
-    add_job(&variable, &mut limits);
+    add_job_limits(&variable, &mut limits);
     limits.extend(system.own.into_iter().map(described));
-    // Of equals the first: the machine's own rather than a job's that has all of it.
+    // The first of equal limits: the machine's own rather than that of a job that may use all of it.
     let stated = limits.into_iter().filter(|&(bytes, _)| (1..UNLIMITED_BYTES).contains(&bytes));
     stated.min_by_key(|&(bytes, _)| bytes).unwrap_or((u64::MAX, "this system tells of no limit".to_owned()))
 }
 
+/// Returns the bytes of a limit and a description of its source.
 fn described(limit: MemoryLimit) -> (u64, String) {
     let origin = match limit.source {
         LimitSource::Machine => "the machine's memory".to_owned(),
@@ -37,21 +38,21 @@ fn described(limit: MemoryLimit) -> (u64, String) {
     (limit.bytes, origin)
 }
 
-/// Adds the memory that a Slurm job asked for on this node. A node may enforce less than that, or nothing.
-fn add_job(variable: &impl Fn(&str) -> Option<String>, limits: &mut Vec<(u64, String)>) {
-    let size = |name: &str| slurm_size(&variable(name)?);
+/// Adds the memory that a Slurm job requested on this node. The node may enforce a lower limit, or none.
+fn add_job_limits(variable: &impl Fn(&str) -> Option<String>, limits: &mut Vec<(u64, String)>) {
+    let size = |name: &str| parse_slurm_size(&variable(name)?);
     if let Some(bytes) = size("SLURM_MEM_PER_NODE") {
         limits.push((bytes, "the job's SLURM_MEM_PER_NODE".to_owned()));
     }
-    let of_cpus = |name: &str| variable(name)?.trim().parse::<u64>().ok();
-    let cpus = of_cpus("SLURM_CPUS_ON_NODE").or_else(|| of_cpus("SLURM_CPUS_PER_TASK"));
+    let count = |name: &str| variable(name)?.trim().parse::<u64>().ok();
+    let cpus = count("SLURM_CPUS_ON_NODE").or_else(|| count("SLURM_CPUS_PER_TASK"));
     if let Some((bytes, cpus)) = size("SLURM_MEM_PER_CPU").zip(cpus) {
         limits.push((bytes.saturating_mul(cpus), format!("the job's SLURM_MEM_PER_CPU for {cpus} CPUs")));
     }
 }
 
 /// Parses a memory size as Slurm writes it and returns bytes: a number of mebibytes, or a number followed by K, M, G or T.
-fn slurm_size(text: &str) -> Option<u64> {
+fn parse_slurm_size(text: &str) -> Option<u64> {
     let text = text.trim();
     let digits = text.trim_end_matches(|unit: char| unit.is_ascii_alphabetic());
     let shift = match text[digits.len()..].to_ascii_uppercase().trim_end_matches('B') {
@@ -73,26 +74,26 @@ mod tests {
     const GIB: u64 = 1 << 30;
     const MACHINE: MemoryLimit = MemoryLimit { bytes: 64 * GIB, source: LimitSource::Machine };
 
-    /// Limit of a job with these variables on a machine of 64 GiB.
+    /// Returns the limit of a job with these variables on a machine of 64 GiB.
     fn job(variables: &[(&str, &str)]) -> u64 {
         let variables: BTreeMap<_, _> = variables.iter().copied().collect();
         let system = MemoryLimits { around: vec![MACHINE], own: Vec::new() };
         least_limit(system, |name| variables.get(name).map(|&value| value.to_owned())).0
     }
 
-    /// Limit of a process of no job.
+    /// Returns the limit of a process outside any job.
     fn limit(around: &[MemoryLimit], own: &[MemoryLimit]) -> (u64, String) {
         least_limit(MemoryLimits { around: around.to_vec(), own: own.to_vec() }, |_| None)
     }
 
     #[test]
-    fn without_anything_else_the_machine_is_the_limit_and_without_that_nothing() {
+    fn machine_memory_is_the_default_limit() {
         assert_eq!(limit(&[MACHINE], &[]), (64 * GIB, "the machine's memory".to_owned()));
         assert_eq!(limit(&[], &[]), (u64::MAX, "this system tells of no limit".to_owned()));
     }
 
     #[test]
-    fn the_tightest_limit_is_named_and_zero_or_a_huge_number_is_none() {
+    fn smallest_limit_is_named_and_zero_or_huge_is_no_limit() {
         let group =
             |bytes| MemoryLimit { bytes, source: LimitSource::ControlGroup("/sys/fs/cgroup/memory.max".into()) };
         let found = limit(&[MACHINE, group(4 * GIB)], &[]);
@@ -112,7 +113,7 @@ mod tests {
             4 * GIB
         );
         assert_eq!(job(&[("SLURM_MEM_PER_CPU", "1G"), ("SLURM_CPUS_PER_TASK", "2")]), 2 * GIB);
-        // All of the node; unknown; a product beyond all numbers.
+        // All memory of the node, unknown values, and a product that overflows.
         for all in ["0", "lots", "", "9T9", "18446744073709551615T"] {
             assert_eq!(job(&[("SLURM_MEM_PER_NODE", all)]), 64 * GIB, "{all}");
         }
@@ -120,7 +121,7 @@ mod tests {
     }
 
     #[test]
-    fn a_limit_of_the_process_itself_holds() {
+    fn limit_of_the_process_itself_counts() {
         let own = [MemoryLimit { bytes: GIB, source: LimitSource::AddressSpace }];
         let (bytes, origin) = limit(&[MACHINE], &own);
         assert_eq!(bytes, GIB);

@@ -1,39 +1,39 @@
-//! Events by which the library tells what it is doing. The library itself prints nothing: a program that shows events
-//! implements [`EventSink`] and passes it on in [`crate::scene::InputOptions::events`]; `examples/compress.rs` is such a
-//! program.
+//! Events by which the library reports its work. The library itself prints nothing. A program that shows events
+//! implements [`EventSink`] and passes it on in [`crate::scene::InputOptions::events`]; `examples/compress.rs` is such
+//! a program.
 
 use std::fmt::{self, Debug};
 use std::sync::Arc;
 
-/// Receives the events of runs, from any thread. Default implementations ignore an event.
+/// Receiver of the events of runs. Methods are called from any thread; default implementations ignore the event.
 pub trait EventSink: Send + Sync {
-    /// A run begins that consists of `stages`, in order. Each stage begins with the task of its name.
+    /// Announces a run that consists of `stages`, in order. Each stage begins with the task of its name.
     fn run_begun(&self, stages: &[ExpectedStage]) {
         let _ = stages;
     }
 
-    /// The run of the last [`EventSink::run_begun`] has ended, with a result or an error.
+    /// Announces that the run of the last [`EventSink::run_begun`] has ended, with a result or an error.
     fn run_ended(&self) {}
 
-    /// A task begins. Its progress goes to the returned sink, which is dropped when the task ends; `None` if nobody is
-    /// interested in it. Tasks may begin while others go on.
+    /// Announces a task. Its progress goes to the returned sink, which is dropped when the task ends. Returns `None` if
+    /// progress is not wanted. A task may begin while others run.
     fn task_begun(&self, task: Task<'_>) -> Option<Box<dyn TaskSink>> {
         let _ = task;
         None
     }
 
-    /// There is something to say.
+    /// Receives a message about a run.
     fn message(&self, message: Message<'_>) {
         let _ = message;
     }
 }
 
-/// Receives the progress of one task, from any thread. It is dropped when the task ends.
+/// Receiver of the progress of one task. Methods are called from any thread; the sink is dropped when the task ends.
 pub trait TaskSink: Debug + Send + Sync {
-    /// So many more units are done.
+    /// Adds `units` to the number of finished units.
     fn advanced(&self, units: u64);
 
-    /// The task begins again, with `total` units.
+    /// Restarts the task from zero with `total` units.
     fn restarted(&mut self, total: u64);
 }
 
@@ -43,32 +43,32 @@ pub type ExpectedStage = (&'static str, f64);
 /// A task that begins.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Task<'a> {
-    /// Name: that of the stage if it is one.
+    /// Name of the task; equal to the stage name if the task is a stage.
     pub name: &'static str,
-    /// Unit of its work, in the plural ("states").
+    /// Unit of the work, in the plural ("states").
     pub unit: &'a str,
-    /// Number of units; `None` if it is not known in advance.
+    /// Number of units; `None` if unknown in advance.
     pub total: Option<u64>,
 }
 
 /// A message about a run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Message<'a> {
-    /// Part of the memory plan or the forecast of a run: lines of text. Sent if [`crate::memory_plan::Budget::tell`] asks
-    /// for it.
+    /// Part of the memory plan or of the time forecast of a run, as lines of text. Sent if
+    /// [`crate::memory_plan::Budget::tell`] asks for it.
     Plan(&'a str),
     /// Something that the user should change before the run goes on, such as missing cameras.
     Warning(&'a str),
-    /// The result of a stage is discarded.
+    /// Notice that the result of a stage is discarded.
     Discarded {
-        /// Name of the stage.
+        /// Name of the discarded stage.
         stage: &'a str,
         /// Reason.
         why: &'a str,
     },
 }
 
-/// Where the events of a run go: to an [`EventSink`], or nowhere.
+/// Handle through which a run sends its events: to an [`EventSink`], or nowhere.
 #[derive(Clone, Default)]
 pub struct Events(Option<Arc<dyn EventSink>>);
 
@@ -79,15 +79,15 @@ impl Debug for Events {
 }
 
 impl Events {
-    /// Ignores every event.
+    /// Handle that ignores every event.
     pub const IGNORED: Events = Events(None);
 
-    /// Passes every event on to `sink`.
+    /// Returns a handle that passes every event on to `sink`.
     pub fn new(sink: impl EventSink + 'static) -> Self {
         Events(Some(Arc::new(sink)))
     }
 
-    /// Announces a run of `stages`. It lasts as long as the returned value lives.
+    /// Announces a run of `stages`. The run lasts as long as the returned value lives.
     pub fn begin_run(&self, stages: &[ExpectedStage]) -> RunOfStages {
         if let Some(sink) = &self.0 {
             sink.run_begun(stages);
@@ -100,7 +100,7 @@ impl Events {
         self.begin(Task { name, unit, total: Some(total) })
     }
 
-    /// Begins the task `name`, whose number of units is not known in advance.
+    /// Begins the task `name`, whose number of units is unknown in advance.
     pub fn counting_task(&self, name: &'static str, unit: &str) -> Progress {
         self.begin(Task { name, unit, total: None })
     }
@@ -117,7 +117,7 @@ impl Events {
     }
 }
 
-/// A run whose stages were announced; it ends when this is dropped.
+/// Guard of an announced run; the run ends when it is dropped.
 #[must_use = "the run ends when this is dropped"]
 #[derive(Debug)]
 pub struct RunOfStages(Events);
@@ -130,13 +130,13 @@ impl Drop for RunOfStages {
     }
 }
 
-/// Progress of a task, e.g. through Gaussians × frames. Cheap to advance from any thread; the task ends when this is
-/// dropped.
+/// Progress of a task, for example over Gaussians × frames. Advancing is cheap and possible from any thread. The task
+/// ends when the value is dropped.
 #[derive(Debug)]
 pub struct Progress(Option<Box<dyn TaskSink>>);
 
 impl Progress {
-    /// Progress that nobody is told of.
+    /// Progress that is reported to nobody.
     pub const IGNORED: Progress = Progress(None);
 
     /// Marks `units` more units as done.
@@ -146,7 +146,7 @@ impl Progress {
         }
     }
 
-    /// Begins the task again, with `total` units.
+    /// Restarts the task from zero with `total` units.
     pub fn restart(&mut self, total: u64) {
         if let Some(sink) = &mut self.0 {
             sink.restarted(total);
@@ -154,7 +154,7 @@ impl Progress {
     }
 }
 
-/// Formats a duration in seconds for a person.
+/// Formats a duration in seconds for display: "59.4 s", "1 min 00 s", "2 h 01 min".
 pub fn duration(seconds: f64) -> String {
     let whole = seconds.round() as u64;
     match whole {
@@ -170,7 +170,7 @@ mod tests {
 
     use super::*;
 
-    /// Writes down every event.
+    /// Sink that records every event as text.
     #[derive(Debug, Clone, Default)]
     struct Recorder(Arc<Mutex<Vec<String>>>);
 
@@ -233,7 +233,7 @@ mod tests {
     }
 
     #[test]
-    fn durations_are_rounded_for_a_person() {
+    fn durations_are_rounded_for_display() {
         for (seconds, text) in [(0.04, "0.0 s"), (59.4, "59.4 s"), (60.0, "1 min 00 s"), (7261.0, "2 h 01 min")] {
             assert_eq!(duration(seconds), text);
         }

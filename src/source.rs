@@ -1,5 +1,5 @@
-//! How frames reach a pass: a source hands out readers over blocks of Gaussians, is told which frames they will be asked
-//! for, and counts what it reads.
+//! Traits by which frames are read: a source opens readers over blocks of Gaussians, is told which frames they will be
+//! asked for, and counts what it reads.
 
 use std::ops::{Add, Range, Sub};
 use std::sync::Arc;
@@ -10,17 +10,17 @@ use serde::{Deserialize, Serialize};
 use crate::error::Result;
 use crate::model::{Column, Columns, Gaussians, Jacobian, Raw, SequenceInfo};
 
-/// Which Gaussians of a sequence a reader covers.
+/// Gaussians of a sequence that a reader covers.
 #[derive(Debug, Clone)]
 pub enum Ids<'a> {
-    /// Consecutive ones.
+    /// Consecutive ids.
     Range(Range<usize>),
-    /// Any, in any order.
+    /// Any ids, in any order.
     List(&'a [u32]),
 }
 
 impl Ids<'_> {
-    /// How many there are.
+    /// Returns the number of ids.
     pub fn len(&self) -> usize {
         match self {
             Ids::Range(range) => range.len(),
@@ -28,12 +28,12 @@ impl Ids<'_> {
         }
     }
 
-    /// Whether there are none.
+    /// Returns whether there are no ids.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
-    /// The ids one by one.
+    /// Returns an iterator over the ids.
     pub fn iter(&self) -> impl Iterator<Item = usize> {
         let (range, list) = match self {
             Ids::Range(range) => (range.clone(), &[][..]),
@@ -43,23 +43,24 @@ impl Ids<'_> {
     }
 }
 
-/// Which frames a reader will be asked for, so that what is decoded together is decoded once and only those are kept.
+/// Frames that a reader will be asked for. With this plan, frames that share a tile are decoded once, and only those
+/// that are needed are kept.
 ///
-/// Advice: other frames, or these in another order, read the same and cost more.
+/// The plan is advice: reading other frames, or these in another order, gives the same values but costs more.
 #[derive(Debug, Clone)]
 pub struct ReadPlan {
-    /// Increasing; none: every frame.
+    /// Frames in increasing order; `None`: every frame.
     frames: Option<Arc<[usize]>>,
     held: usize,
 }
 
 impl ReadPlan {
-    /// Every frame, in order: what a reader expects unless it is told.
+    /// Creates the plan to read every frame in order, which is the default of readers.
     pub fn every() -> ReadPlan {
         ReadPlan { frames: None, held: usize::MAX }
     }
 
-    /// These frames, in increasing order.
+    /// Creates the plan to read `frames` in increasing order. Order and duplicates of the argument do not matter.
     pub fn new(frames: impl IntoIterator<Item = usize>) -> ReadPlan {
         let mut frames: Vec<usize> = frames.into_iter().collect();
         frames.sort_unstable();
@@ -67,18 +68,19 @@ impl ReadPlan {
         ReadPlan { frames: Some(frames.into()), held: usize::MAX }
     }
 
-    /// Keeping at most `frames` (at least 1) of those that have to be decoded together anyway: less memory, at the
-    /// price of decoding again.
+    /// Limits the number of frames kept, of those that are decoded together, to `frames` (at least 1). This takes less
+    /// memory but decodes tiles repeatedly.
     pub fn holding(self, frames: usize) -> ReadPlan {
         ReadPlan { held: frames.max(1), ..self }
     }
 
-    /// Most frames to keep.
+    /// Returns the maximum number of frames to keep.
     pub fn held(&self) -> usize {
         self.held
     }
 
-    /// The frames from `frame` on, it included, before `end`. A frame that nobody spoke of stands for itself alone.
+    /// Returns the planned frames from `frame` (inclusive) to `end` (exclusive). A frame that is not in the plan is
+    /// returned alone.
     pub fn between(&self, frame: usize, end: usize) -> Vec<usize> {
         match &self.frames {
             None => (frame..end).collect(),
@@ -89,7 +91,7 @@ impl ReadPlan {
         }
     }
 
-    /// The first frame from `frame` on.
+    /// Returns the first planned frame at or after `frame`.
     pub fn next(&self, frame: usize) -> Option<usize> {
         match &self.frames {
             None => Some(frame),
@@ -98,14 +100,14 @@ impl ReadPlan {
     }
 }
 
-/// What was read of a source, counted where it happens.
+/// Amounts read from a source, counted where reading happens.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Reads {
-    /// Stored bytes of values that were read from files.
+    /// Stored bytes of attribute values read from files.
     pub bytes: u64,
-    /// Tiles that were decoded, of sources that have some.
+    /// Number of tiles decoded; 0 for sources without tiles.
     pub tiles: u64,
-    /// States (one Gaussian at one frame) that were evaluated or handed out, whatever their columns.
+    /// Number of states (one Gaussian at one frame) evaluated or returned, regardless of the columns read.
     pub states: u64,
 }
 
@@ -120,7 +122,7 @@ impl Add for Reads {
 impl Sub for Reads {
     type Output = Reads;
 
-    /// What was read since `before`.
+    /// Returns the amounts read since `before`.
     fn sub(self, before: Reads) -> Reads {
         Reads {
             bytes: self.bytes - before.bytes,
@@ -130,18 +132,18 @@ impl Sub for Reads {
     }
 }
 
-/// A count that many threads add to. A copy starts from zero: it belongs to another source.
+/// Counter that many threads add to. A clone starts from zero, because it belongs to another source.
 #[derive(Debug, Default)]
 pub struct Count(AtomicU64);
 
 impl Count {
-    /// Adds `more`.
+    /// Adds `more` to the count.
     pub fn add(&self, more: u64) {
-        // Relaxed: a sum that is looked at when the reading is done.
+        // Relaxed ordering suffices: the sum is read after reading has finished.
         self.0.fetch_add(more, Ordering::Relaxed);
     }
 
-    /// The sum so far.
+    /// Returns the sum so far.
     pub fn get(&self) -> u64 {
         self.0.load(Ordering::Relaxed)
     }
@@ -153,101 +155,96 @@ impl Clone for Count {
     }
 }
 
-/// A sequence of Gaussians that can be read block by block, frame by frame, in any order, from
-/// several threads. The same (Gaussian, frame) always gives the same bits, whatever the block.
+/// Sequence of Gaussians that can be read block by block and frame by frame, in any order, from several threads. The
+/// same Gaussian at the same frame always has the same bits, whatever the block.
 pub trait FrameSource: Send + Sync {
-    /// Size, time stamps and varying columns.
+    /// Returns the number of Gaussians, the time stamps and the varying columns.
     fn info(&self) -> &SequenceInfo;
 
-    /// A reader over the Gaussians `ids`, in that order. What does not change with time is prepared
-    /// here once.
+    /// Opens a reader over the Gaussians `ids`, in that order. Work that does not depend on time is done here once.
     fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>>;
 
-    /// A reader over all Gaussians, for the frames `wanted`, if it costs less than readers of blocks. Memory: its own,
-    /// per Gaussian, may be more than theirs.
+    /// Opens a reader over all Gaussians for the frames `wanted`, if it costs less than readers of blocks; else returns
+    /// `None`. It may take more memory per Gaussian than readers of blocks.
     fn open_all(&self, _wanted: &ReadPlan) -> Option<Result<Box<dyn BlockReader + '_>>> {
         None
     }
 
-    /// How states follow from what is stored, where that is more than a sum; none of explicit trajectories, of which a
-    /// change of what is stored is that change at every frame.
+    /// Returns the deformation that maps stored parameters to states, if it is more than a sum. `None` for explicit
+    /// trajectories, where a change of the stored parameters is the same change of every frame's state.
     fn deformation(&self) -> Option<&dyn Deformation> {
         None
     }
 
-    /// How its pictures get their colors, where Gaussians have features in the place of colors; the colors of its states
-    /// are then near to what they look like.
+    /// Returns the decoder of pixel colors, if the Gaussians have features in place of colors. The colors of the states
+    /// then only approximate the renders.
     fn decoder(&self) -> Option<&dyn FeatureDecoder> {
         None
     }
 
-    /// What was read so far, by all readers; nothing where nobody counts.
+    /// Returns the amounts read so far by all readers; zeros if the source does not count.
     fn reads(&self) -> Reads {
         Reads::default()
     }
 
-    /// How to have its bytes in memory before they are read, where waiting for them would cost more than asking.
+    /// Returns how to fetch bytes before they are read, if waiting for them costs more than asking for them early.
     fn ahead(&self) -> Option<&dyn Prefetch> {
         None
     }
 }
 
-/// States that follow from what is stored, once for all frames, by a function that can be differentiated.
+/// States computed from stored parameters, which are the same for all frames, by a differentiable function.
 pub trait Deformation: Sync {
-    /// What is stored.
+    /// Returns the stored parameters.
     fn stored(&self) -> &Raw;
 
-    /// Columns of what is stored that a derivative leads to.
+    /// Returns the columns of the stored parameters that have derivatives.
     fn movable(&self) -> Columns;
 
-    /// Writes the columns `want` of the state at `frame` of Gaussians stored as `stored` into `out`, which is resized in
-    /// them.
-    ///
-    /// # Errors
-    /// A frame that the sequence does not have.
+    /// Writes the columns `want` of the state at `frame` to `out`, for Gaussians with the parameters `stored`. Resizes
+    /// these columns of `out`.
     fn state(&self, frame: usize, stored: &Raw, want: Columns, out: &mut Gaussians) -> Result<()>;
 
-    /// How the columns `want` of that state change with what is stored in them.
-    ///
-    /// # Errors
-    /// A frame that the sequence does not have.
+    /// Returns the derivatives of the columns `want` of that state with respect to the same columns of `stored`.
     fn jacobian(&self, frame: usize, stored: &Raw, want: Columns) -> Result<Jacobian>;
 }
 
-/// Features in the place of colors: they are blended without a background, and what comes of that decides, pixel by pixel.
+/// Decoder of features that take the place of colors. Features are blended without a background, and the decoder
+/// computes the color of each pixel from the blended features.
 pub trait FeatureDecoder: Sync {
-    /// Writes the features of all Gaussians at `frame` into `out`: as many planes as there are features.
-    ///
-    /// # Errors
-    /// A frame that the sequence does not have.
+    /// Writes the features of all Gaussians at `frame` to `out`, one plane per feature.
     fn features(&self, frame: usize, out: &mut Column) -> Result<()>;
 
-    /// Red, green and blue of a pixel that has blended `features`, seen from `center` along the unit `ray`.
+    /// Returns red, green and blue of a pixel with the blended `features`, seen from `center` along the unit vector
+    /// `ray`.
     fn color(&self, features: &[f32], center: [f32; 3], ray: [f32; 3]) -> [f32; 3];
 }
 
-/// A source on a disk, whose bytes can be brought ahead of their use, from a thread that does nothing else.
+/// Source on a disk whose bytes can be fetched before they are used, by a thread that does nothing else.
 pub trait Prefetch: Sync {
-    /// Frames that are brought and decoded together: those from a multiple of it to the next.
+    /// Returns the number of frames that are fetched and decoded together. Frame blocks start at its multiples.
     fn frame_block(&self) -> usize;
 
-    /// Brings what the columns `want` of `gaussians` take at `frames`, and waits for it. That it cannot be had shows when it is
-    /// read.
+    /// Fetches the bytes of the columns `want` of `gaussians` at `frames`, and waits for them. Failures are reported
+    /// when the bytes are read.
     fn fetch(&self, gaussians: Range<usize>, frames: Range<usize>, want: Columns);
 }
 
-/// Reads one block of Gaussians at any frame.
+/// Reader of one block of Gaussians at any frame.
 pub trait BlockReader: Send {
-    /// Writes the columns `want` of the block at `frame` into `out`, which is resized to the block.
-    /// Columns outside `want` are left alone.
+    /// Writes the columns `want` of the block at `frame` to `out`, and resizes these columns to the block. Leaves other
+    /// columns unchanged.
+    ///
+    /// # Errors
+    /// A frame that cannot be read.
     fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()>;
 
-    /// Tells it which frames it will be asked for from now on, and how many it may keep. Readers that keep no frames
-    /// have nothing to do.
+    /// Announces the frames that the reader will be asked for from now on, and how many it may keep. Readers that keep
+    /// no frames ignore it.
     fn expect(&mut self, _wanted: &ReadPlan) {}
 
-    /// Does now what reading `want` at `frame` and at those decoded with it takes beside copying, as far as it may
-    /// keep the outcome.
+    /// Does the work of reading `want` at `frame`, and at the frames decoded with it, except for copying, as far as the
+    /// reader may keep the result.
     fn prepare(&mut self, _frame: usize, _want: Columns) -> Result<()> {
         Ok(())
     }
@@ -258,7 +255,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn wanted_frames_are_found_from_any_of_them_and_a_stranger_stands_alone() {
+    fn unplanned_frames_are_read_alone() {
         let wanted = ReadPlan::new([40, 3, 9, 3, 31]).holding(0);
         assert_eq!(wanted.held(), 1);
         assert_eq!(wanted.between(3, 32), [3, 9, 31]);

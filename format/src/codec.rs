@@ -1,13 +1,14 @@
-//! Tiles to stored bytes and back: slices in, values out, no files.
+//! Encodes tiles to stored bytes and decodes them, in memory.
 //!
-//! The filter replaces every value by the zigzagged difference between its bits, mapped to integers
-//! in numeric order, and what the one or two frames before predict; then it gathers the bytes of equal
-//! weight, and zstd takes the result. All arithmetic wraps, so every bit pattern survives.
+//! The filter maps the bits of every value to an integer in numeric order, predicts it from one or two earlier frames,
+//! and replaces the value by the zigzagged difference. The bytes of equal weight are then stored together (shuffle) and
+//! compressed by zstd. All arithmetic wraps, so every bit pattern is restored exactly.
 //!
-//! Stored bytes in percent of the raw ones, tiles of 32 frames of three trained models, zstd level 1, by what stands
-//! before it (`cargo bench --bench filters` of the program prints them by model, and times encoding and decoding):
+//! Stored size in percent of the raw size for tiles of 32 frames of three trained models, zstd level 1, by the filter
+//! before zstd (`cargo bench --bench filters` of the program prints the table by model, with the times of encoding and
+//! decoding):
 //!
-//! | column | nothing | shuffle | order 1 + shuffle | order 2 + shuffle | order 2 |
+//! | column | no filter | shuffle | order 1 + shuffle | order 2 + shuffle | order 2 |
 //! |---|---|---|---|---|---|
 //! | position | 92–93 | 63–74 | 52–57 | 48–52 | 58–62 |
 //! | rotation | 93 | 67–71 | 56–61 | 52–57 | 63–67 |
@@ -15,49 +16,50 @@
 //! | opacity_logit (one model) | 92 | 60 | 50 | 47 | 55 |
 //! | sh (one model) | 93 | 73 | 61 | 59 | 69 |
 //!
-//! Level 3 changes order 2 + shuffle by 0.2 at most. Of positions over 60 frames, order 2 with all this left 1.93–2.14 times
-//! less than raw; XOR with the frame before 1.65–1.87, order 3 1.86–2.02, order 2 without the zigzag 1.69–1.86.
-//! Transposing to [component][gaussian][frame] gained 1%.
+//! zstd level 3 changes "order 2 + shuffle" by 0.2 at most. Compression factors of positions over 60 frames: order 2
+//! with zigzag and shuffle 1.93–2.14; XOR with the previous frame 1.65–1.87; order 3 1.86–2.02; order 2 without zigzag
+//! 1.69–1.86. Transposing to [component][gaussian][frame] gained 1%.
 
 use std::fmt;
 
 use xxhash_rust::xxh3::xxh3_64;
 use zstd::bulk::Decompressor;
 
-use crate::bounded::{self, Tracks};
+use crate::bounded::{self, BoundedTracks};
 use crate::error::{Error, Result};
 use crate::layout::MAX_TILE_BYTES;
 
-/// How [`encode_tile`] stores values that are not better left raw.
+/// Method by which [`encode_tile`] stores the values of a tile.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Compression {
-    /// As they are: read in place from the map.
+    /// Raw f32 values, which readers use in place from the map.
     Raw,
-    /// Filtered and compressed by zstd at this level; a tile that does not shrink is stored raw.
+    /// Lossless filter and zstd at this level. A tile that does not shrink is stored raw.
     Zstd(i32),
-    /// At most `max_error` off what they were, and compressed by zstd at this level; a tile that does not shrink by that,
-    /// or whose values hold too few of those that can be, is filtered.
+    /// Values that differ from the original by at most `max_error`, compressed by zstd at `level`. A tile that does not
+    /// shrink this way, or has too many values that cannot be stored within the bound, is stored like
+    /// [`Compression::Zstd`].
     Bounded {
-        /// See [`crate::ColumnSpec::max_error`]; above 0.
+        /// Error bound, above 0; see [`crate::ColumnSpec::max_error`].
         max_error: f64,
-        /// Of zstd.
+        /// zstd level.
         level: i32,
     },
 }
 
-/// How the stored bytes of a tile are to be read.
+/// Encoding of the stored bytes of a tile.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Encoding {
     /// Little-endian f32.
     Raw,
-    /// Predicted from `order` frames before, shuffled, zstd.
+    /// Residuals of a prediction from `order` earlier frames, shuffled and compressed by zstd.
     Filtered {
-        /// 0, 1 or 2 frames.
+        /// Number of earlier frames used by the prediction: 0, 1 or 2.
         order: u8,
     },
-    /// Multiples of a step, predicted from `order` frames before, shuffled track by track, zstd.
+    /// Multiples of a step, predicted from `order` earlier frames, shuffled track by track and compressed by zstd.
     Bounded {
-        /// 1 or 2 frames.
+        /// Number of earlier frames used by the prediction: 1 or 2.
         order: u8,
     },
 }
@@ -72,12 +74,12 @@ impl fmt::Display for Encoding {
     }
 }
 
-/// What a tile's stored values are like (of a constant tile: its one frame).
+/// Statistics of the stored values of a tile; for a constant tile those of its one frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Stats {
-    /// Least finite value, zero as +0; +∞ if no value is finite.
+    /// Minimum of the finite values, with −0 counted as +0; +∞ if no value is finite.
     pub min: f32,
-    /// Greatest finite value, zero as +0; −∞ if no value is finite.
+    /// Maximum of the finite values, with −0 counted as +0; −∞ if no value is finite.
     pub max: f32,
     /// Number of NaN and infinite values.
     pub non_finite: u32,
@@ -90,7 +92,7 @@ impl fmt::Display for Stats {
     }
 }
 
-/// A tile ready to be written.
+/// Encoded tile, to be passed to [`crate::Writer::write_tile`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct EncodedTile {
     pub(crate) frames: u32,
@@ -98,7 +100,7 @@ pub struct EncodedTile {
     pub(crate) len: u32,
     pub(crate) constant: bool,
     pub(crate) encoding: Encoding,
-    /// How far values are off, at most.
+    /// Maximum absolute error of the values; 0 if exact.
     pub(crate) max_error: f64,
     pub(crate) stats: Stats,
     pub(crate) checksum: u64,
@@ -106,31 +108,31 @@ pub struct EncodedTile {
 }
 
 impl EncodedTile {
-    /// Bytes it takes in the file, without its 64-byte record header.
+    /// Returns the number of bytes the tile takes in the file, without its 64-byte record header.
     pub fn stored_bytes(&self) -> usize {
         self.bytes.len()
     }
 
-    /// Whether every frame has the same bits. Only one frame is stored then, and the tile may be
-    /// written to frame blocks of any length.
+    /// Returns whether every frame has the same bits. Only one frame is stored then, and the tile may be written to
+    /// frame blocks of any length.
     pub fn is_constant(&self) -> bool {
         self.constant
     }
 
-    /// Minimum, maximum and count of non-finite values.
+    /// Returns the minimum, maximum and number of non-finite values.
     pub fn stats(&self) -> Stats {
         self.stats
     }
 }
 
-/// Encodes `values`, laid out `[frames][width][len]`: `width` components of `len` Gaussians.
+/// Encodes `values`, laid out as `[frames][width][len]`: `width` components of `len` Gaussians.
 ///
-/// Pure and deterministic; call it from as many threads as you like. Needs about twice the size of
-/// `values` while it runs, three times with a bound. A tile with the same bits in every frame keeps one; to encode a column that
-/// never changes, pass its one frame with `frames` 1 and write the result to every frame block.
+/// Deterministic and callable from any number of threads. Takes about twice the size of `values` as memory while it
+/// runs, three times with a bound. A tile with the same bits in every frame stores one frame. To encode a column that
+/// never changes, pass its one frame with `frames` = 1 and write the result to every frame block.
 ///
-/// Errors: `values` is not of this shape or empty, or larger than [`MAX_TILE_BYTES`]; zstd does not
-/// know the level; no column may have that bound.
+/// Fails if `values` is empty, has another shape or is larger than [`MAX_TILE_BYTES`], if zstd does not have this
+/// level, or if the bound is not legal.
 pub fn encode_tile(values: &[f32], frames: u32, width: u32, len: u32, compression: Compression) -> Result<EncodedTile> {
     let count = [frames, width, len].into_iter().try_fold(1u64, |product, n| product.checked_mul(n.into()));
     if values.is_empty() || count != Some(values.len() as u64) || 4 * values.len() as u64 > MAX_TILE_BYTES {
@@ -156,7 +158,7 @@ pub fn encode_tile(values: &[f32], frames: u32, width: u32, len: u32, compressio
                 return Err(Error::usage(format!("a bound is a normal f32 above 0, not {max_error}")));
             }
             let found = bounded::encode(values, plane, max_error, level).map_err(|error| failed(level, error))?;
-            if let Some(bounded::Bounded { order, constant, stats, bytes }) = found {
+            if let Some(bounded::BoundedTile { order, constant, stats, bytes }) = found {
                 let (encoding, checksum) = (Encoding::Bounded { order }, xxh3_64(&bytes));
                 return Ok(EncodedTile { frames, width, len, constant, encoding, max_error, stats, checksum, bytes });
             }
@@ -184,47 +186,54 @@ pub fn encode_tile(values: &[f32], frames: u32, width: u32, len: u32, compressio
     Ok(EncodedTile { frames, width, len, constant, encoding, max_error: 0.0, stats: stats(bits), checksum, bytes })
 }
 
-/// The frames of one stored tile, decoded one after the other.
+/// Decoder of one filtered or bounded tile, frame by frame.
 ///
-/// Memory: of a filtered tile its values shuffled, as large as the values themselves, and two frames; of a bounded one an
-/// eighth of a byte per value of a frame more, and half a byte per value where every sixteenth is an exception; of a raw one
-/// nothing.
+/// Memory: a filtered tile takes its decompressed bytes, as many as its values, and two frames. A bounded tile takes
+/// 1/8 byte per value of one frame more, and up to 1/2 byte per value of the tile for exceptions (if every 16th value
+/// is one). A raw tile takes nothing.
 #[derive(Debug, Default)]
-pub(crate) struct Unfilter {
+pub(crate) struct TileDecoder {
     order: u8,
-    /// Four planes of bytes, each with one byte of every value; of a bounded tile what SPEC.md says.
+    /// Decompressed bytes: of a filtered tile four planes, each with one byte of every value; of a bounded tile as in
+    /// SPEC.md.
     shuffled: Vec<u8>,
-    /// The frame before `next` and the one before that, as [`ordered`] integers, or as multiples.
+    /// Frame before `next`, and the frame before that; of filtered tiles as [`ordered`] integers, of bounded ones as
+    /// multiples.
     recent: [Vec<u32>; 2],
     next: usize,
     bounded: bool,
-    tracks: Tracks,
+    tracks: BoundedTracks,
 }
 
-/// What a tile's stored bytes are to be decoded as.
+/// Stored bytes of a tile with the parameters needed to decode them.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Stored<'a> {
+pub(crate) struct StoredTile<'a> {
     pub(crate) bytes: &'a [u8],
     pub(crate) encoding: Encoding,
     pub(crate) frames: usize,
-    /// Values of a frame.
+    /// Number of values per frame.
     pub(crate) plane: usize,
-    /// Bound of the column.
+    /// Error bound of the column.
     pub(crate) max_error: f64,
 }
 
-impl Unfilter {
-    /// Takes over a tile that is not raw. The error says what was found instead of its values.
-    pub(crate) fn load(&mut self, stored: Stored<'_>, zstd: &mut Decompressor<'_>) -> std::result::Result<(), String> {
-        let Stored { bytes, encoding, frames, plane, max_error } = stored;
+impl TileDecoder {
+    /// Decompresses a tile that is not raw, to be decoded by [`TileDecoder::frame`]. The error text says what was found
+    /// instead of the values.
+    pub(crate) fn load(
+        &mut self,
+        stored: StoredTile<'_>,
+        zstd: &mut Decompressor<'_>,
+    ) -> std::result::Result<(), String> {
+        let StoredTile { bytes, encoding, frames, plane, max_error } = stored;
         self.next = 0;
         self.recent.iter_mut().for_each(|frame| frame.resize(plane, 0));
         self.bounded = matches!(encoding, Encoding::Bounded { .. });
-        let (packed, most) = match encoding {
+        let (packed, max_bytes) = match encoding {
             Encoding::Bounded { order } => {
                 self.order = order;
                 let packed = self.tracks.read_head(bytes, frames, plane, max_error)?;
-                (packed, self.tracks.most_bytes())
+                (packed, self.tracks.max_decompressed_bytes())
             }
             Encoding::Filtered { order } => {
                 self.order = order;
@@ -232,18 +241,18 @@ impl Unfilter {
             }
             Encoding::Raw => return Err("raw values".to_owned()),
         };
-        self.shuffled.resize(most, 0);
-        // The target has a fixed size: a frame that wants more is refused, whatever it claims.
+        self.shuffled.resize(max_bytes, 0);
+        // The target has a fixed size, so a zstd frame that decompresses to more is refused, whatever size it declares.
         match zstd.decompress_to_buffer(packed, self.shuffled.as_mut_slice()) {
             Ok(len) if self.bounded => self.tracks.read_mask(&self.shuffled[..len]),
-            Ok(len) if len == most => Ok(()),
+            Ok(len) if len == max_bytes => Ok(()),
             Ok(len) => Err(format!("{len} bytes after decompression")),
             Err(error) => Err(format!("a zstd frame that does not decompress to them ({error})")),
         }
     }
 
-    /// Decodes frame `frame` into `out`, which has one value for each of a plane. A frame after the last one decoded
-    /// costs those between; any other, those from the first.
+    /// Decodes frame `frame` into `out`, which has the length of a plane. Decoding a later frame than the last one
+    /// decodes the frames in between; decoding any other frame starts at the first frame.
     pub(crate) fn frame(&mut self, frame: usize, out: &mut [u32]) {
         if self.order == 0 || frame < self.next {
             self.next = if self.order == 0 { frame } else { 0 };
@@ -261,7 +270,7 @@ impl Unfilter {
         }
     }
 
-    /// Bytes it holds.
+    /// Returns the memory held, in bytes.
     pub(crate) fn memory(&self) -> usize {
         let [a, b] = &self.recent;
         self.shuffled.capacity() + 4 * (a.capacity() + b.capacity()) + self.tracks.memory()
@@ -274,8 +283,8 @@ impl Unfilter {
             &self.shuffled[weight * (self.shuffled.len() / 4) + self.next * plane..][..plane]
         });
         let stored = |i: usize| u32::from_le_bytes([b0[i], b1[i], b2[i], b3[i]]);
-        let [before, before_that] = &mut self.recent;
-        let (before, before_that) = (&mut before[..plane], &mut before_that[..plane]);
+        let [before, second_before] = &mut self.recent;
+        let (before, second_before) = (&mut before[..plane], &mut second_before[..plane]);
         match order_at(self.order, self.next) {
             0 => {
                 for i in 0..plane {
@@ -286,16 +295,16 @@ impl Unfilter {
             1 => {
                 for i in 0..plane {
                     let rank = unzigzag(stored(i)).wrapping_add(before[i]);
-                    before_that[i] = before[i];
+                    second_before[i] = before[i];
                     before[i] = rank;
                     out[i] = unordered(rank);
                 }
             }
             _ => {
                 for i in 0..plane {
-                    let rank = unzigzag(stored(i)).wrapping_add(predict(2, before[i], before_that[i]));
-                    // It becomes the frame before below.
-                    before_that[i] = rank;
+                    let rank = unzigzag(stored(i)).wrapping_add(predict(2, before[i], second_before[i]));
+                    // Becomes the previous frame in the swap below.
+                    second_before[i] = rank;
                     out[i] = unordered(rank);
                 }
                 self.recent.swap(0, 1);
@@ -303,68 +312,76 @@ impl Unfilter {
         }
     }
 
-    /// Decodes the multiples of frame `next` of a bounded tile; those of tracks that stand still stay as they are.
+    /// Decodes the multiples of frame `next` of a bounded tile. Those of static tracks do not change after the first
+    /// frame.
     fn step_multiples(&mut self) {
-        let [before, before_that] = &mut self.recent;
+        let [before, second_before] = &mut self.recent;
         if self.next == 0 {
-            self.tracks.first(&self.shuffled).zip(&mut *before).for_each(|(first, before)| *before = unzigzag(first));
+            self.tracks
+                .first_frame(&self.shuffled)
+                .zip(&mut *before)
+                .for_each(|(first, before)| *before = unzigzag(first));
             return;
         }
         let order = order_at(self.order, self.next);
         for (track, residual) in self.tracks.residuals(&self.shuffled, self.next) {
-            let multiple = unzigzag(residual).wrapping_add(predict(order, before[track], before_that[track]));
-            before_that[track] = std::mem::replace(&mut before[track], multiple);
+            let multiple = unzigzag(residual).wrapping_add(predict(order, before[track], second_before[track]));
+            second_before[track] = std::mem::replace(&mut before[track], multiple);
         }
     }
 }
 
+/// Returns the little-endian bytes of `bits`.
 fn raw_bytes(bits: &[u32]) -> Vec<u8> {
     bits.iter().flat_map(|bits| bits.to_le_bytes()).collect()
 }
 
-/// Appends four planes of bytes, each with one byte of every value, lowest first.
+/// Appends four planes of bytes to `out`, each with one byte of every value; the plane of the lowest bytes comes first.
 pub(crate) fn shuffle_into(values: &[u32], out: &mut Vec<u8>) {
     for weight in 0..4 {
         out.extend(values.iter().map(|value| (value >> (8 * weight)) as u8));
     }
 }
 
-/// Bits of an f32 as an integer that grows with the value. A bijection on all bit patterns.
+/// Maps the bits of an f32 to an integer that grows with its value. Bijective on all bit patterns.
 fn ordered(bits: u32) -> u32 {
     bits ^ (((bits as i32) >> 31) as u32 | 0x8000_0000)
 }
 
-/// The inverse of [`ordered`].
+/// Maps an integer back to the bits of an f32. Inverse of [`ordered`].
 fn unordered(rank: u32) -> u32 {
     rank ^ (!((rank as i32) >> 31) as u32 | 0x8000_0000)
 }
 
-/// Small differences of either sign become small numbers, so that their high bytes are all zero.
+/// Maps a signed difference to an unsigned integer, so that the high bytes of small differences of either sign are
+/// zero.
 pub(crate) fn zigzag(difference: u32) -> u32 {
     (difference << 1) ^ ((difference as i32) >> 31) as u32
 }
 
-/// The inverse of [`zigzag`].
+/// Maps an unsigned integer back to a signed difference. Inverse of [`zigzag`].
 fn unzigzag(code: u32) -> u32 {
     (code >> 1) ^ (code & 1).wrapping_neg()
 }
 
-/// What the frames before say a value will be: the last one, or the straight line through two. All are
-/// [`ordered`] integers.
-pub(crate) fn predict(order: u8, before: u32, before_that: u32) -> u32 {
+/// Predicts a value from the two frames before it: order 1 repeats the last one, order 2 extends the line through both.
+/// Values are [`ordered`] integers or multiples of a step.
+pub(crate) fn predict(order: u8, before: u32, second_before: u32) -> u32 {
     match order {
         1 => before,
-        _ => before.wrapping_mul(2).wrapping_sub(before_that),
+        _ => before.wrapping_mul(2).wrapping_sub(second_before),
     }
 }
 
-/// How many frames before `frame` predict it.
+/// Returns the number of earlier frames that predict `frame`: `order`, but fewer for the first frames.
 pub(crate) fn order_at(order: u8, frame: usize) -> u8 {
     order.min(frame.min(2) as u8)
 }
 
-/// The order with the shorter residuals. They are compared on every fourth value: all of them would
-/// cost as much as the filter, and tiles close enough to be judged wrongly gain nothing either way.
+/// Returns the order of prediction with the shorter residuals.
+///
+/// Compares every fourth value only: comparing all would cost as much as the filter itself, and tiles with close
+/// results gain nothing from either choice.
 fn best_order(bits: &[u32], plane: usize) -> u8 {
     let frames = bits.len() / plane;
     if frames < 3 {
@@ -385,7 +402,7 @@ fn best_order(bits: &[u32], plane: usize) -> u8 {
     if cost(1) < cost(2) { 1 } else { 2 }
 }
 
-/// Residuals of every value, lowest bytes of all first.
+/// Returns the shuffled residuals of all values: first the lowest bytes of all, last the highest bytes.
 fn filter(bits: &[u32], plane: usize, order: u8) -> Vec<u8> {
     let mut out = vec![0; 4 * bits.len()];
     let (low, high) = out.split_at_mut(2 * bits.len());
@@ -397,9 +414,9 @@ fn filter(bits: &[u32], plane: usize, order: u8) -> Vec<u8> {
         match order_at(order, frame) {
             0 => residuals.copy_from_slice(at(0)),
             order => {
-                let (now, before, before_that) = (at(0), at(1), at(order.into()));
+                let (now, before, second_before) = (at(0), at(1), at(order.into()));
                 for (i, residual) in residuals.iter_mut().enumerate() {
-                    let predicted = predict(order, ordered(before[i]), ordered(before_that[i]));
+                    let predicted = predict(order, ordered(before[i]), ordered(second_before[i]));
                     *residual = zigzag(ordered(now[i]).wrapping_sub(predicted));
                 }
             }
@@ -413,8 +430,8 @@ fn filter(bits: &[u32], plane: usize, order: u8) -> Vec<u8> {
     out
 }
 
-/// [`Stats`] of values given as bits. Compared as ordered integers, which is associative: the
-/// compiler may take many at once, and the order of the values does not matter.
+/// Computes [`Stats`] of values given as bits. Minimum and maximum are taken over [`ordered`] integers, which is
+/// associative, so the compiler can vectorize it and the order of the values does not matter.
 pub(crate) fn stats(bits: &[u32]) -> Stats {
     const EXPONENT: u32 = 0x7f80_0000;
     let (mut min, mut max, mut non_finite) = (u32::MAX, 0, 0u32);
@@ -428,154 +445,9 @@ pub(crate) fn stats(bits: &[u32]) -> Stats {
     if non_finite as usize == bits.len() {
         return Stats { min: f32::INFINITY, max: f32::NEG_INFINITY, non_finite };
     }
-    // Adding +0 turns −0 into +0 and leaves everything else alone.
+    // Adding +0 turns −0 into +0 and keeps every other value.
     Stats { min: f32::from_bits(unordered(min)) + 0.0, max: f32::from_bits(unordered(max)) + 0.0, non_finite }
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use proptest::prelude::*;
-
-    fn bits() -> impl Strategy<Value = u32> {
-        prop_oneof![
-            any::<u32>(),
-            (-2.0f32..2.0).prop_map(f32::to_bits),
-            Just((-0.0f32).to_bits()),
-            Just(0xffc0_1234),
-            Just(0x7f80_0001),
-            Just(f32::INFINITY.to_bits()),
-        ]
-    }
-
-    fn decode(tile: &EncodedTile) -> Vec<u32> {
-        let frames = if tile.constant { 1 } else { tile.frames as usize };
-        let plane = tile.width as usize * tile.len as usize;
-        let once: Vec<u32> = match tile.encoding {
-            Encoding::Raw => tile.bytes.as_chunks().0.iter().map(|bytes| u32::from_le_bytes(*bytes)).collect(),
-            encoding => {
-                let mut unfilter = Unfilter::default();
-                let stored = Stored { bytes: &tile.bytes, encoding, frames, plane, max_error: tile.max_error };
-                unfilter.load(stored, &mut Decompressor::new().unwrap()).unwrap();
-                decode_frames(&mut unfilter, plane, 0..frames)
-            }
-        };
-        if tile.constant { once.repeat(tile.frames as usize) } else { once }
-    }
-
-    fn decode_frames(unfilter: &mut Unfilter, plane: usize, frames: impl Iterator<Item = usize>) -> Vec<u32> {
-        let mut one = vec![0; plane];
-        frames
-            .flat_map(|frame| {
-                unfilter.frame(frame, &mut one);
-                one.clone()
-            })
-            .collect()
-    }
-
-    fn loaded(values: &[u32], plane: usize, order: u8) -> Unfilter {
-        let shuffled = filter(values, plane, order);
-        Unfilter { order, shuffled, recent: [vec![0; plane], vec![0; plane]], ..Unfilter::default() }
-    }
-
-    proptest! {
-        #[test]
-        fn maps_to_integers_are_bijections_in_numeric_order(a: u32, b: u32) {
-            prop_assert_eq!(unordered(ordered(a)), a);
-            prop_assert_eq!(unzigzag(zigzag(a)), a);
-            let (x, y) = (f32::from_bits(a), f32::from_bits(b));
-            if x < y { prop_assert!(ordered(a) < ordered(b), "{x} < {y}"); }
-        }
-
-        #[test]
-        fn every_bit_pattern_survives_every_filter(
-            (frames, plane, values) in (1usize..6, 1usize..9)
-                .prop_flat_map(|(t, p)| (Just(t), Just(p), prop::collection::vec(bits(), t * p))),
-        ) {
-            for order in 0..=2 {
-                let out = decode_frames(&mut loaded(&values, plane, order), plane, 0..frames);
-                prop_assert_eq!(&out, &values, "order {}, {} frames", order, frames);
-            }
-        }
-
-        #[test]
-        fn frames_come_back_in_whatever_order_they_are_asked_for(
-            (plane, values, asked) in (1usize..9, 1usize..9).prop_flat_map(|(t, p)| {
-                (Just(p), prop::collection::vec(bits(), t * p), prop::collection::vec(0..t, 1..12))
-            }),
-        ) {
-            for order in 0..=2 {
-                let got = decode_frames(&mut loaded(&values, plane, order), plane, asked.iter().copied());
-                let expected: Vec<u32> =
-                    asked.iter().flat_map(|frame| values[frame * plane..][..plane].to_vec()).collect();
-                prop_assert_eq!(got, expected, "order {}, frames {:?}", order, &asked);
-            }
-        }
-
-        #[test]
-        fn every_bit_pattern_survives_every_compression(
-            (frames, len, values) in (1u32..6, 1u32..40)
-                .prop_flat_map(|(t, n)| (Just(t), Just(n), prop::collection::vec(bits(), (t * n * 2) as usize))),
-            level in prop_oneof![Just(Compression::Raw), Just(Compression::Zstd(1)), Just(Compression::Zstd(-3))],
-        ) {
-            let floats: Vec<f32> = values.iter().map(|&b| f32::from_bits(b)).collect();
-            let tile = encode_tile(&floats, frames, 2, len, level).unwrap();
-            prop_assert_eq!(decode(&tile), values);
-        }
-    }
-
-    #[test]
-    fn a_straight_line_is_predicted_from_two_frames() {
-        let values: Vec<f32> =
-            (0..16 * 500).map(|i| 1.0 + (i / 500) as f32 * 0.0078125 + (i % 500) as f32 * 1e-4).collect();
-        let tile = encode_tile(&values, 16, 1, 500, Compression::Zstd(1)).unwrap();
-        assert_eq!(tile.encoding, Encoding::Filtered { order: 2 });
-        assert!(tile.stored_bytes() < 3 * 500, "{} bytes for 16 frames of 500", tile.stored_bytes());
-    }
-
-    #[test]
-    fn constant_tiles_store_one_frame_and_differ_by_a_single_sign_of_zero() {
-        let still = encode_tile(&[0.0, 2.0, 0.0, 2.0], 2, 1, 2, Compression::Raw).unwrap();
-        assert!(still.is_constant());
-        assert_eq!(still.stored_bytes(), 8);
-        let moved = encode_tile(&[0.0, 2.0, -0.0, 2.0], 2, 1, 2, Compression::Raw).unwrap();
-        assert!(!moved.is_constant());
-    }
-
-    #[test]
-    fn stats_cover_finite_values_only() {
-        let got = stats(&[f32::NAN, -3.5, f32::INFINITY, 7.0, f32::NEG_INFINITY].map(f32::to_bits));
-        assert_eq!(got, Stats { min: -3.5, max: 7.0, non_finite: 3 });
-        let none = stats(&[f32::NAN.to_bits()]);
-        assert_eq!(none, Stats { min: f32::INFINITY, max: f32::NEG_INFINITY, non_finite: 1 });
-        let zero = stats(&[(-0.0f32).to_bits()]);
-        assert_eq!((zero.min.to_bits(), zero.max.to_bits()), (0, 0));
-    }
-
-    #[test]
-    fn decompressed_size_must_be_exact() {
-        let mut unfilter = Unfilter::default();
-        for len in [0usize, 39, 41, 1 << 24] {
-            let bomb = zstd::bulk::compress(&vec![0; len], 1).unwrap();
-            let stored = Stored {
-                bytes: &bomb,
-                encoding: Encoding::Filtered { order: 0 },
-                frames: 1,
-                plane: 10,
-                max_error: 0.0,
-            };
-            let got = unfilter.load(stored, &mut Decompressor::new().unwrap());
-            assert!(got.is_err(), "{len} bytes passed for 40");
-        }
-        assert!(unfilter.shuffled.capacity() <= 40);
-    }
-
-    #[test]
-    fn wrong_shapes_and_levels_are_refused() {
-        for (frames, width, len) in [(0, 1, 0), (1, 1, 3), (u32::MAX, u32::MAX, u32::MAX)] {
-            assert!(encode_tile(&[1.0, 2.0], frames, width, len, Compression::Raw).is_err());
-        }
-        assert!(encode_tile(&[], 1, 1, 0, Compression::Raw).is_err());
-        assert!(encode_tile(&[1.0], 1, 1, 1, Compression::Zstd(99)).is_err());
-    }
-}
+mod tests;

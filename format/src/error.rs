@@ -1,4 +1,4 @@
-//! What can go wrong with a container, sorted by what the caller can do about it.
+//! Errors of this crate, grouped by what the caller can do about them.
 
 use std::fmt;
 use std::io;
@@ -7,40 +7,42 @@ use std::path::{Path, PathBuf};
 use crate::text::ShowPath;
 pub(crate) use crate::text::quoted;
 
-/// Result of anything that can fail here.
+/// Result of every fallible function of this crate.
 pub type Result<T> = std::result::Result<T, Error>;
 
-/// Every failure of this crate.
+/// Error of every operation of this crate.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// The file is not what SPEC.md describes: fetch it again, or save what is left with [`crate::recover`].
+    /// The file violates SPEC.md: fetch it again, or save its intact part with [`crate::recover`].
     #[error("{path}, byte {offset}: expected {expected}, found {found}{advice}", path = path.shown(), advice = Advice(hint))]
     Malformed {
-        /// The file that was read.
+        /// Path of the file that was read.
         path: PathBuf,
-        /// Where in it, from its first byte.
+        /// Byte at which the file is wrong, counted from its start.
         offset: u64,
-        /// What a valid file holds there.
+        /// Content that a valid file has at this byte.
         expected: String,
-        /// What this one holds.
+        /// Content of this file.
         found: String,
-        /// What to do next; may be empty.
+        /// Advice on what to do next; may be empty.
         hint: &'static str,
     },
-    /// The operating system refused: check the path, the permissions, the space left.
+    /// The operating system refused an operation: check the path, the permissions and the free space.
     #[error("cannot {action} {path}: {source}", path = path.shown())]
     Io {
-        /// What was being done, as a verb: "open", "create", "rename".
+        /// Operation that failed, as a verb: "open", "create", "rename".
         action: &'static str,
-        /// The file it was done to.
+        /// File or folder of the operation.
         path: PathBuf,
-        /// The system's reason.
+        /// Error of the operating system.
         source: io::Error,
     },
-    /// The call itself makes no sense: a layout outside its limits, a tile written twice, a tile that does not exist.
+    /// The caller passed invalid arguments: a layout outside its limits, a tile written twice, a tile that does not
+    /// exist.
     #[error("{0}")]
     Usage(String),
 }
+/// Advice of an error message, shown on a line of its own; an empty text is left out.
 
 struct Advice<'a>(&'a str);
 
@@ -51,17 +53,19 @@ impl fmt::Display for Advice<'_> {
 }
 
 impl Error {
+    /// Returns a closure that turns an operating-system error of doing `action` to `path` into an [`Error::Io`].
     pub(crate) fn io(action: &'static str, path: &Path) -> impl FnOnce(io::Error) -> Self {
         let path = path.to_owned();
         move |source| Error::Io { action, path, source }
     }
 
+    /// Builds an [`Error::Usage`].
     pub(crate) fn usage(message: impl Into<String>) -> Self {
         Error::Usage(message.into())
     }
 }
 
-/// A malformed place in a file whose name is not known here; see [`Error::Malformed`].
+/// Malformed place in a file whose path is added later by [`Fault::at`]; see [`Error::Malformed`].
 #[derive(Debug)]
 pub(crate) struct Fault {
     offset: u64,
@@ -71,15 +75,18 @@ pub(crate) struct Fault {
 }
 
 impl Fault {
+    /// Builds a fault at byte `offset` of the file, without a hint.
     pub(crate) fn new(offset: u64, expected: impl Into<String>, found: impl fmt::Display) -> Self {
         Fault { offset, expected: expected.into(), found: found.to_string(), hint: "" }
     }
 
+    /// Sets the advice on what to do next.
     pub(crate) fn hint(mut self, hint: &'static str) -> Self {
         self.hint = hint;
         self
     }
 
+    /// Turns the fault into an error of the file at `path`.
     pub(crate) fn at(self, path: &Path) -> Error {
         let Fault { offset, expected, found, hint } = self;
         Error::Malformed { path: path.to_owned(), offset, expected, found, hint }

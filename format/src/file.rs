@@ -1,14 +1,13 @@
-//! The one place that maps a file: what a reader needs of it, and what is promised when it changes.
+//! Memory-mapped files: reading them by system calls and in place, and the behavior when a file changes meanwhile.
 //!
-//! Positioned reads ([`MappedFile::read_at`]) of a file that was cut short end in an error. Access in
-//! place ([`MappedFile::in_place`]) compares the file's length with the place first, so it ends in an
-//! error too, unless the file shrinks after that, while the slice is in use: then the system may end
-//! the process (SIGBUS). What is left of that race is the time from the comparison to the end of one
-//! tile's decoding or one frame's copy. Writers of this crate never shrink or rewrite a container; they
-//! replace it by renaming, which leaves maps of the old one intact.
+//! [`MappedFile::read_at`] reads by a system call; if the file was cut short, it returns an error.
+//! [`MappedFile::in_place`] returns a slice of the map. It compares the range with the current length of the file first
+//! and returns an error if the file is too short. If the file shrinks after this check, while the slice is in use, the
+//! system may end the process (SIGBUS). The race lasts from the check to the end of decoding one tile or copying one
+//! frame. The writers of this crate never shrink or rewrite a container; they replace it by renaming, which leaves maps
+//! of the old file intact.
 //!
-//! Pages that were touched in place count as this process's memory until they are released
-//! ([`MappedFile::release`]).
+//! Pages that were read in place count as memory of this process until [`MappedFile::release`].
 
 use std::fs::{self, File};
 use std::io;
@@ -18,11 +17,12 @@ use memmap2::Mmap;
 
 use crate::error::{Error, Fault, Result};
 
-/// Bytes read at a time where all of a long stretch is gone through: whole records.
-pub(crate) const PIECE: usize = 1 << 16;
+/// Bytes read at a time where a long range is read in chunks; a multiple of the record length.
+pub(crate) const CHUNK_BYTES: usize = 1 << 16;
 
-/// Bytes about a page that is touched which the system may map with it, as Linux does.
-const AROUND: u64 = 1 << 16;
+/// Bytes around a touched page that the system may map together with it (Linux: fault-around of 64 KiB).
+const FAULT_AROUND_BYTES: u64 = 1 << 16;
+/// Open file with a memory map of its whole length at opening.
 
 pub(crate) struct MappedFile {
     path: PathBuf,
@@ -31,32 +31,34 @@ pub(crate) struct MappedFile {
 }
 
 impl MappedFile {
+    /// Opens and maps the regular file at `path`. Fails for folders, pipes and devices.
     pub(crate) fn open(path: &Path) -> Result<Self> {
-        // Asked before opening: opening a pipe would wait for its writer.
+        // Check before opening: opening a pipe would wait for its writer.
         let metadata = fs::metadata(path).map_err(Error::io("open", path))?;
         if !metadata.is_file() {
             return Err(Fault::new(0, "a regular file", "a folder, pipe or device").at(path));
         }
         let file = File::open(path).map_err(Error::io("open", path))?;
-        // SAFETY: a map is sound while nobody changes the file's bytes. Whoever holds the file keeps
-        // that promise; this crate's writers do, they only ever rename finished files into place.
-        // The map is private to this module, is reached only after a check of the file's current
-        // length, and no bit pattern of its bytes is invalid for the types read from it (u8, f32).
+        // SAFETY: the map is sound as long as nobody changes the bytes of the file. Whoever has write access to the
+        // file must uphold this; the writers of this crate do, as they only rename finished files into place. The map
+        // is private to this module, is reached only after a check of the current length of the file, and every bit
+        // pattern is valid for the types read from it (u8, f32).
         let map = unsafe { Mmap::map(&file) }.map_err(Error::io("map", path))?;
         Ok(MappedFile { path: path.to_owned(), file, map })
     }
 
+    /// Returns the path the file was opened by.
     pub(crate) fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Length in bytes when it was opened.
+    /// Returns the length of the file in bytes at opening.
     pub(crate) fn len(&self) -> u64 {
         self.map.len() as u64
     }
 
-    /// Reads `out.len()` bytes at byte `offset` with a system call. Does not use the memory map: if another process shortens
-    /// the file, this returns an error, whereas touching a mapped page would end the process.
+    /// Reads `out.len()` bytes at byte `offset` with a system call. Does not use the memory map: if another process
+    /// shortens the file, this returns an error, whereas touching a mapped page would end the process.
     pub(crate) fn read_at(&self, offset: u64, out: &mut [u8]) -> Result<()> {
         splat_platform::read_exact_at(&self.file, out, offset).map_err(|error| match error.kind() {
             io::ErrorKind::UnexpectedEof => self.too_short(offset, out.len() as u64),
@@ -64,23 +66,23 @@ impl MappedFile {
         })
     }
 
-    /// Calls `each` with the bytes of `range` in pieces of [`PIECE`] bytes, the last of what is left, and the place of
-    /// each.
-    pub(crate) fn read_pieces(
+    /// Calls `each` with the offset and the bytes of successive chunks of `range`. Every chunk has [`CHUNK_BYTES`]
+    /// bytes except the last one, which may be shorter.
+    pub(crate) fn read_chunks(
         &self,
         range: std::ops::Range<u64>,
-        piece: &mut Vec<u8>,
+        chunk: &mut Vec<u8>,
         mut each: impl FnMut(u64, &[u8]) -> Result<()>,
     ) -> Result<()> {
-        for offset in range.clone().step_by(PIECE) {
-            piece.resize((range.end - offset).min(PIECE as u64) as usize, 0);
-            self.read_at(offset, piece)?;
-            each(offset, piece)?;
+        for offset in range.clone().step_by(CHUNK_BYTES) {
+            chunk.resize((range.end - offset).min(CHUNK_BYTES as u64) as usize, 0);
+            self.read_at(offset, chunk)?;
+            each(offset, chunk)?;
         }
         Ok(())
     }
 
-    /// `len` bytes at `offset`, where they lie in the map.
+    /// Returns `len` bytes at `offset` as a slice of the map. Fails if the file is now too short.
     pub(crate) fn in_place(&self, offset: u64, len: u64) -> Result<&[u8]> {
         let now = self.file.metadata().map_err(Error::io("examine", &self.path))?.len();
         match offset.checked_add(len) {
@@ -89,34 +91,41 @@ impl MappedFile {
         }
     }
 
-    /// Tells the system that the bytes of `range` will be read soon. Where the system does not listen, reading just waits
+    /// Tells the system that the bytes of `range` will be read soon. If the system ignores the advice, later reads wait
     /// for the disk.
-    pub(crate) fn expect(&self, range: std::ops::Range<u64>) {
+    pub(crate) fn will_need(&self, range: std::ops::Range<u64>) {
         if !range.is_empty() {
             splat_platform::expect_pages(&self.map, range.start as usize..range.end as usize);
         }
     }
 
-    /// Brings the bytes of `range` from the disk, and waits for them. Nothing of them stays in this process.
-    pub(crate) fn fetch(&self, range: std::ops::Range<u64>, piece: &mut Vec<u8>) -> Result<()> {
-        self.read_pieces(range, piece, |_, _| Ok(()))
+    /// Reads the bytes of `range` from the disk into the page cache of the system and waits for them. Keeps none of
+    /// them in this process.
+    pub(crate) fn fetch(&self, range: std::ops::Range<u64>, chunk: &mut Vec<u8>) -> Result<()> {
+        self.read_chunks(range, chunk, |_, _| Ok(()))
     }
 
-    /// Whether reading the byte at `offset` would not wait for the disk; none where the system does not tell.
+    /// Returns whether the byte at `offset` can be read without waiting for the disk; `None` if the system does not
+    /// tell.
     pub(crate) fn is_cached(&self, offset: u64) -> Option<bool> {
         splat_platform::is_cached(&self.file, offset)
     }
 
-    /// Gives the pages of `range`, and those that came with them, back to the system: they no longer count as this
-    /// process's memory. Whoever still reads them in place reads them from the file again.
+    /// Gives the pages of `range`, and the neighboring pages mapped with them, back to the system. They no longer count
+    /// as memory of this process. Slices of these pages stay valid: their bytes are read from the file again.
     pub(crate) fn release(&self, range: std::ops::Range<u64>) {
-        let (start, end) = (range.start.saturating_sub(AROUND), range.end.saturating_add(AROUND).min(self.len()));
+        let (start, end) = (
+            range.start.saturating_sub(FAULT_AROUND_BYTES),
+            range.end.saturating_add(FAULT_AROUND_BYTES).min(self.len()),
+        );
         if !range.is_empty() && start < end {
-            // SAFETY: the map is that of a file, and the range lies within it.
+            // SAFETY: the map is that of a file, so released pages are read again, and the range lies within the map
+            // (clamped to its length above).
             unsafe { splat_platform::release_pages(&self.map, start as usize..end as usize) };
         }
     }
 
+    /// Builds the error for `len` bytes at `offset` that reach past the end of the file.
     fn too_short(&self, offset: u64, len: u64) -> Error {
         let now = self.file.metadata().map_or(0, |metadata| metadata.len());
         Fault::new(offset, format!("{len} bytes"), format!("the end of the file at byte {now}")).at(&self.path)

@@ -1,42 +1,43 @@
-//! The index of a finished container: an entry for every tile, left in the file and read when it is asked for.
+//! Index of a finished container: one entry per tile. It stays in the file; entries are read when they are needed.
 
 use std::ops::Range;
 
 use crate::error::{Fault, Result};
 use crate::file::MappedFile;
 use crate::layout::Layout;
-use crate::record::{Digest, RECORD, Record, TileRecord};
+use crate::record::{Digest, RECORD_BYTES, Record, TileRecord};
 
-/// Where the entries lie and what they may say.
+/// Location of the index in the file, and the limits its entries must respect.
 pub(crate) struct Index {
     pub(crate) offset: u64,
     pub(crate) tiles: u64,
-    /// T, frames of the sequence.
+    /// T, number of frames of the sequence.
     pub(crate) frames: u64,
-    /// Where payloads may lie.
+    /// Byte range of the file in which payloads may lie.
     pub(crate) payloads: Range<u64>,
 }
 
 impl Index {
-    /// Place of an entry in the file.
-    pub(crate) fn place(&self, index: u64) -> u64 {
-        self.offset + RECORD * index
+    /// Returns the offset in the file of entry `index`.
+    pub(crate) fn entry_offset(&self, index: u64) -> u64 {
+        self.offset + RECORD_BYTES * index
     }
 
-    /// Reads and checks an entry.
+    /// Reads and checks entry `index`. Fails if it is damaged or describes another tile.
     pub(crate) fn record(&self, file: &MappedFile, layout: &Layout, index: u64) -> Result<TileRecord> {
-        let mut bytes = [0; RECORD as usize];
-        file.read_at(self.place(index), &mut bytes)?;
+        let mut bytes = [0; RECORD_BYTES as usize];
+        file.read_at(self.entry_offset(index), &mut bytes)?;
         self.parse(layout, index, &bytes).map_err(|fault| fault.at(file.path()))
     }
 
+    /// Decodes entry `index` from its bytes and checks it against the layout.
     fn parse(
         &self,
         layout: &Layout,
         index: u64,
-        bytes: &[u8; RECORD as usize],
+        bytes: &[u8; RECORD_BYTES as usize],
     ) -> std::result::Result<TileRecord, Fault> {
-        let place = self.place(index);
+        let place = self.entry_offset(index);
         let id = layout.tile_at(index);
         let range = layout.frame_range(id.frame_block, self.frames);
         match Record::from_bytes(bytes, place)? {
@@ -51,18 +52,20 @@ impl Index {
         }
     }
 
-    /// Checks every entry, that no two tiles overlap but for constant ones that share all of their bytes, and adds
-    /// them to `digest`. Gives per column whether its values differ between frames. Tiles out of the order of the index
-    /// take more memory, at most `memory` bytes.
+    /// Checks all entries, adds them to `digest`, and returns for every column whether its values differ between
+    /// frames.
+    ///
+    /// Also checks that no two tiles overlap in the file; constant tiles may share all of their bytes. Takes more
+    /// memory, at most `memory` bytes, if the tiles do not lie in the order of the index.
     pub(crate) fn check(
         &self,
         file: &MappedFile,
         layout: &Layout,
-        piece: &mut Vec<u8>,
+        chunk: &mut Vec<u8>,
         digest: &mut Digest,
         memory: u64,
     ) -> Result<Vec<bool>> {
-        let (varies, in_order) = self.go_through(file, layout, piece, digest)?;
+        let (varies, in_order) = self.check_entries(file, layout, chunk, digest)?;
         if !in_order {
             let needed = self.tiles * (size_of::<TileRecord>() + size_of::<usize>()) as u64;
             check_memory(self.offset, needed, memory).map_err(|fault| fault.at(file.path()))?;
@@ -72,31 +75,32 @@ impl Index {
         Ok(varies)
     }
 
-    /// The part of [`Index::check`] that needs no more than the last constant tiles. Also gives whether it saw that no
-    /// two tiles overlap, as it does where they lie in the order of the index.
-    fn go_through(
+    /// Checks and hashes all entries in one pass, keeping only the last constant tile of each column and Gaussian
+    /// block. Returns for every column whether its values vary, and whether the pass proved that no two tiles overlap.
+    /// It does so if the tiles lie in the order of the index.
+    fn check_entries(
         &self,
         file: &MappedFile,
         layout: &Layout,
-        piece: &mut Vec<u8>,
+        chunk: &mut Vec<u8>,
         digest: &mut Digest,
     ) -> Result<(Vec<bool>, bool)> {
         let mut varies = vec![false; layout.columns.len()];
-        // By column and Gaussian block. A file without frames has no tile, whatever its header says.
+        // One slot per column and Gaussian block. A file without frames has no tile, whatever its header says.
         let mut constants: Vec<Option<TileRecord>> =
             vec![None; layout.tiles_per_frame_block().min(self.tiles) as usize];
         let mut end = 0;
         let mut in_order = true;
-        let entries = self.offset..self.place(self.tiles);
-        file.read_pieces(entries, piece, |offset, bytes| {
+        let entries = self.offset..self.entry_offset(self.tiles);
+        file.read_chunks(entries, chunk, |offset, bytes| {
             for (i, bytes) in bytes.as_chunks().0.iter().enumerate() {
-                let index = (offset - self.offset) / RECORD + i as u64;
+                let index = (offset - self.offset) / RECORD_BYTES + i as u64;
                 let tile = self.parse(layout, index, bytes).map_err(|fault| fault.at(file.path()))?;
                 digest.tile(&tile);
                 let before = &mut constants[(index % layout.tiles_per_frame_block()) as usize];
                 varies[tile.id.column as usize] |=
                     !tile.constant || before.is_some_and(|before| before.offset != tile.offset);
-                if tile.offset - RECORD >= end {
+                if tile.offset - RECORD_BYTES >= end {
                     end = tile.offset + u64::from(tile.stored_bytes);
                 } else {
                     in_order &= before.is_some_and(|before| tile.may_share(&before));
@@ -110,17 +114,17 @@ impl Index {
         Ok((varies, in_order))
     }
 
-    /// No two tiles may use the same bytes of the file, but for constant ones that share all of them.
+    /// Checks that no two tiles use the same bytes of the file, except constant tiles that share all of them.
     fn check_overlap(&self, tiles: &[TileRecord]) -> std::result::Result<(), Fault> {
         let mut order: Vec<usize> = (0..tiles.len()).collect();
         order.sort_unstable_by_key(|&i| (tiles[i].offset, i));
         for pair in order.windows(2) {
             let (tile, next) = (&tiles[pair[0]], &tiles[pair[1]]);
-            let apart = next.offset - RECORD >= tile.offset + u64::from(tile.stored_bytes);
+            let apart = next.offset - RECORD_BYTES >= tile.offset + u64::from(tile.stored_bytes);
             if !apart && !next.may_share(tile) {
                 let expected = format!("{} stored apart from {}", next.id, tile.id);
                 return Err(Fault::new(
-                    self.place(pair[1] as u64) + 24,
+                    self.entry_offset(pair[1] as u64) + 24,
                     expected,
                     format!("both at bytes {} to {}", next.offset, tile.offset + u64::from(tile.stored_bytes)),
                 ));
@@ -130,7 +134,7 @@ impl Index {
     }
 }
 
-/// Confirms that `needed` bytes for the index at `offset` are at most `memory`.
+/// Checks that `needed` bytes of memory for the index at `offset` are at most `memory`.
 pub(crate) fn check_memory(offset: u64, needed: u64, memory: u64) -> std::result::Result<(), Fault> {
     if needed <= memory {
         return Ok(());
@@ -145,8 +149,9 @@ mod tests {
     use super::*;
     use crate::{ColumnSpec, Compression, Reader, TileId, Writer, encode_tile};
 
-    /// Writes 2 blocks of 2 Gaussians over 3 frame blocks, the frame blocks of `order` one after the other; column 0
-    /// always moves, column 1 stands still, moves and stands where it stood.
+    /// Writes a container of 2 blocks of 2 Gaussians and 3 frame blocks, the frame blocks in the order `order`, and
+    /// opens it. Column 0 moves in every frame block. Column 1 is constant in the first and last frame block, with the
+    /// same values, and moves in the middle one.
     fn open(path: &std::path::Path, order: [u32; 3]) -> Reader {
         let columns =
             ["moving", "pausing"].map(|name| ColumnSpec { name: name.into(), width: 1, max_error: 0.0 }).into();
@@ -169,13 +174,13 @@ mod tests {
     }
 
     #[test]
-    fn tiles_in_the_order_of_the_index_are_checked_in_one_go_also_where_constant_ones_return() {
+    fn tiles_in_index_order_are_checked_in_one_pass() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a");
         for (order, expected) in [([0, 1, 2], true), ([2, 0, 1], false)] {
             let reader = open(&path, order);
             let mut digest = Digest::new(&[], &[]);
-            let found = reader.index.go_through(&reader.file, &reader.layout, &mut Vec::new(), &mut digest).unwrap();
+            let found = reader.index.check_entries(&reader.file, &reader.layout, &mut Vec::new(), &mut digest).unwrap();
             assert_eq!(found, (vec![true, true], expected), "{order:?}");
             let tile = |frame_block| reader.tile_info(TileId { column: 1, gaussian_block: 0, frame_block }).unwrap();
             assert_eq!(tile(0).offset, tile(2).offset, "{order:?}: stored twice");

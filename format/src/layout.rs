@@ -1,5 +1,5 @@
-//! The shape of a container: how many Gaussians, which columns, how they are cut into tiles, and the
-//! file header that says so (SPEC.md, "Header").
+//! Shape of a container (Gaussians, columns, division into tiles) and its encoding in the file header (SPEC.md,
+//! "Header").
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
@@ -10,17 +10,18 @@ use xxhash_rust::xxh3::xxh3_64;
 use crate::bounded::BOUNDS;
 use crate::error::{Error, Fault, Result, quoted};
 
-/// First bytes of every container. A high bit, a line ending and a control byte, so that transfers
-/// which rewrite text are noticed at once.
+/// First bytes of every container. They include a byte above 127, a line ending and a control byte, so that transfers
+/// that rewrite text damage them visibly.
 pub const MAGIC: [u8; 8] = *b"\x89GSEQ\r\n\x1a";
-/// The version of the format this crate writes where every value keeps its bits, and the one where a column has a bound.
+/// Format versions that this crate writes: version 1 if no column has a bound, version 2 if one has.
 pub(crate) const VERSIONS: [u32; 2] = [1, 2];
-/// Bytes before the first column: magic, version, header length, the four sizes and two counts.
-pub(crate) const FIXED_HEADER: usize = 40;
+/// Bytes before the first column: magic, version, header length, Gaussians, the two block lengths and the counts of
+/// columns and attributes.
+pub(crate) const FIXED_HEADER_BYTES: usize = 40;
 
 /// Largest decoded size of one tile, in bytes (256 MiB). A reader never allocates more for a tile.
 pub const MAX_TILE_BYTES: u64 = 1 << 28;
-/// Largest header; keeps a hostile length from being allocated.
+/// Maximum length of a header in bytes; bounds the allocation for a forged length.
 pub(crate) const MAX_HEADER_BYTES: usize = 1 << 22;
 const MAX_GAUSSIANS: u64 = 1 << 32;
 const MAX_FRAME_BLOCK: u32 = 1 << 24;
@@ -29,43 +30,44 @@ const MAX_NAME_BYTES: usize = 64;
 const MAX_ATTRIBUTES: usize = 1024;
 const MAX_KEY_BYTES: usize = 256;
 const MAX_VALUE_BYTES: usize = 1 << 20;
-/// Most tiles of one frame block: bounds what a reader that opens and a writer know of the last constant ones.
+/// Maximum number of tiles per frame block. Bounds the table of last constant tiles in readers and writers.
 const MAX_TILES_PER_FRAME_BLOCK: u64 = 1 << 24;
 
-/// One attribute of every Gaussian.
+/// Name, width and error bound of one column (an attribute of all Gaussians).
 #[derive(Debug, Clone, PartialEq)]
 pub struct ColumnSpec {
-    /// `[a-z][a-z0-9_]*`, at most 64 bytes, unique in its container. SPEC.md lists well-known names.
+    /// Name: `[a-z][a-z0-9_]*`, at most 64 bytes, unique in its container. SPEC.md lists well-known names.
     pub name: String,
-    /// f32 components per Gaussian, at least 1.
+    /// Number of f32 components per Gaussian, at least 1.
     pub width: u32,
-    /// How far a value may be off the one that was packed, in the column's unit; 0: not one bit.
+    /// Maximum absolute difference between a stored and an original value, in the unit of the column; 0: values are
+    /// stored exactly.
     pub max_error: f64,
 }
 
-/// The shape of a container; everything but the number of frames, which may not be known ahead.
+/// Shape of a container without the number of frames, which may not be known when writing begins.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Layout {
-    /// N, Gaussians in every frame; 0 to 2³².
+    /// N, number of Gaussians in every frame; 0 to 2³².
     pub gaussians: u64,
-    /// Gaussians per tile, at least 1; the last block holds what is left.
+    /// Gaussians per tile, at least 1; the last block may be shorter.
     pub gaussian_block: u32,
-    /// Frames per tile, 1 to 2²⁴; the last block holds what is left.
+    /// Frames per tile, 1 to 2²⁴; the last block may be shorter.
     pub frame_block: u32,
-    /// The columns, 1 to 256. A whole tile of the widest must fit [`MAX_TILE_BYTES`].
+    /// Columns, 1 to 256. A full tile of the widest column must fit [`MAX_TILE_BYTES`].
     pub columns: Vec<ColumnSpec>,
-    /// Free text by key: at most 1024 keys of at most 256 bytes, values of at most 1 MiB, 4 MiB in all.
+    /// Free text by key: at most 1024 keys of at most 256 bytes, values of at most 1 MiB, 4 MiB in total.
     pub attributes: BTreeMap<String, String>,
 }
 
-/// Which tile: the position of a column in [`Layout::columns`], a block of Gaussians, a block of frames.
+/// Address of a tile: a column, a block of Gaussians and a block of frames.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct TileId {
     /// Index into [`Layout::columns`].
     pub column: u32,
-    /// Gaussians from `gaussian_block · Layout::gaussian_block`.
+    /// Number of the Gaussian block; its first Gaussian is `gaussian_block · Layout::gaussian_block`.
     pub gaussian_block: u32,
-    /// Frames from `frame_block · Layout::frame_block`.
+    /// Number of the frame block; its first frame is `frame_block · Layout::frame_block`.
     pub frame_block: u32,
 }
 
@@ -77,51 +79,52 @@ impl fmt::Display for TileId {
 }
 
 impl Layout {
-    /// The column called `name`, as [`TileId::column`] counts them.
+    /// Returns the index of the column called `name` in [`Layout::columns`], or `None`.
     pub fn column(&self, name: &str) -> Option<u32> {
         self.columns.iter().position(|column| column.name == name).map(|at| at as u32)
     }
 
-    /// Number of Gaussian blocks; 0 without Gaussians.
+    /// Returns the number of Gaussian blocks; 0 without Gaussians.
     ///
     /// # Panics
-    /// If `gaussian_block` is 0, which no container has.
+    /// Panics if `gaussian_block` is 0, which no container has.
     pub fn gaussian_blocks(&self) -> u32 {
         // Legal layouts have at most 2²⁴ tiles per frame block, so the cast keeps the value.
         self.gaussians.div_ceil(u64::from(self.gaussian_block)) as u32
     }
 
-    /// The Gaussians of a block; empty beyond the last.
+    /// Returns the range of Gaussians of a block; empty for blocks beyond the last.
     pub fn gaussian_range(&self, block: u32) -> Range<u64> {
         let start = u64::from(block) * u64::from(self.gaussian_block);
         start.min(self.gaussians)..(start + u64::from(self.gaussian_block)).min(self.gaussians)
     }
 
-    /// The frames of a block in a sequence of `frames` frames; empty beyond the last.
+    /// Returns the range of frames of a block in a sequence of `frames` frames; empty for blocks beyond the last.
     pub fn frame_range(&self, block: u32, frames: u64) -> Range<u64> {
         let start = u64::from(block) * u64::from(self.frame_block);
         start.min(frames)..(start + u64::from(self.frame_block)).min(frames)
     }
 
-    /// Gaussians in a block.
+    /// Returns the number of Gaussians in a block.
     pub(crate) fn block_len(&self, block: u32) -> u32 {
         let range = self.gaussian_range(block);
         (range.end - range.start) as u32
     }
 
-    /// Decoded bytes of the largest tile of a sequence of `frames` frames.
+    /// Returns the decoded size in bytes of the largest tile of a sequence of `frames` frames.
     pub(crate) fn largest_tile(&self, frames: u64) -> u64 {
         let widest = self.columns.iter().map(|column| column.width).max().unwrap_or(0);
         let gaussians = self.gaussians.min(self.gaussian_block.into());
         4 * u64::from(widest) * gaussians * frames.min(self.frame_block.into())
     }
 
-    /// Tiles of one frame block.
+    /// Returns the number of tiles per frame block.
     pub(crate) fn tiles_per_frame_block(&self) -> u64 {
         self.columns.len() as u64 * u64::from(self.gaussian_blocks())
     }
 
-    /// Place of a tile in the index: by frame block, then Gaussian block, then column.
+    /// Returns the position of a tile in the index, or `None` if there is no such column or Gaussian block. The index
+    /// is ordered by frame block, then Gaussian block, then column.
     pub(crate) fn index_of(&self, id: TileId) -> Option<u64> {
         if id.column as usize >= self.columns.len() || id.gaussian_block >= self.gaussian_blocks() {
             return None;
@@ -130,7 +133,7 @@ impl Layout {
         Some(u64::from(id.frame_block) * self.tiles_per_frame_block() + within)
     }
 
-    /// The tile at a place in the index; the inverse of [`Layout::index_of`].
+    /// Returns the tile at a position of the index. Inverse of [`Layout::index_of`].
     pub(crate) fn tile_at(&self, index: u64) -> TileId {
         let columns = self.columns.len() as u64;
         TileId {
@@ -140,7 +143,7 @@ impl Layout {
         }
     }
 
-    /// Checks every limit; the message names the first one broken.
+    /// Checks every limit. The error message names the first one that is broken.
     pub(crate) fn check(&self) -> std::result::Result<(), String> {
         let within = |what: &str, value: u64, range: std::ops::RangeInclusive<u64>| {
             if range.contains(&value) {
@@ -185,19 +188,21 @@ impl Layout {
         within("bytes in the header", self.header_len() as u64, 0..=MAX_HEADER_BYTES as u64)
     }
 
-    /// Of the format that a file of this layout has.
+    /// Returns the format version of a file with this layout.
     fn version(&self) -> u32 {
         VERSIONS[usize::from(self.columns.iter().any(|column| column.max_error != 0.0))]
     }
 
+    /// Returns the length in bytes of the header, checksum included.
     fn header_len(&self) -> usize {
         let fields = if self.version() == VERSIONS[0] { 6 } else { 14 };
         let columns: usize = self.columns.iter().map(|column| fields + column.name.len()).sum();
         let attributes: usize = self.attributes.iter().map(|(key, value)| 6 + key.len() + value.len()).sum();
-        FIXED_HEADER + columns + attributes + 8
+        FIXED_HEADER_BYTES + columns + attributes + 8
     }
 
-    /// The header of a file of this layout, without the zeros that pad it to 64 bytes.
+    /// Encodes the header of a file with this layout, without the zeros that pad it to 64 bytes. Fails if a limit is
+    /// broken.
     pub(crate) fn to_header(&self) -> Result<Vec<u8>> {
         self.check().map_err(|limit| Error::usage(format!("a container's layout must have {limit}")))?;
         let mut out = Vec::with_capacity(self.header_len());
@@ -229,8 +234,9 @@ impl Layout {
         Ok(out)
     }
 
-    /// Length in bytes of the header that starts with `fixed`.
-    pub(crate) fn header_len_from(fixed: &[u8; FIXED_HEADER]) -> std::result::Result<usize, Fault> {
+    /// Reads the length in bytes of the header that begins with `fixed`. Fails for another magic, version or an illegal
+    /// length.
+    pub(crate) fn header_len_from(fixed: &[u8; FIXED_HEADER_BYTES]) -> std::result::Result<usize, Fault> {
         let mut fields = Fields { bytes: fixed, at: 0 };
         let magic = fields.take(8)?;
         if magic != MAGIC {
@@ -243,17 +249,17 @@ impl Layout {
             return Err(fault.hint("a newer release of this program may read it"));
         }
         let len = fields.u32()? as usize;
-        if !(FIXED_HEADER + 8..=MAX_HEADER_BYTES).contains(&len) {
+        if !(FIXED_HEADER_BYTES + 8..=MAX_HEADER_BYTES).contains(&len) {
             return Err(Fault::new(
                 12,
-                format!("a header of {} to {MAX_HEADER_BYTES} bytes", FIXED_HEADER + 8),
+                format!("a header of {} to {MAX_HEADER_BYTES} bytes", FIXED_HEADER_BYTES + 8),
                 format!("{len} bytes"),
             ));
         }
         Ok(len)
     }
 
-    /// Reads a whole header, checksum included.
+    /// Decodes a whole header and checks its checksum and every limit.
     pub(crate) fn from_header(bytes: &[u8]) -> std::result::Result<Layout, Fault> {
         let body = bytes.len().saturating_sub(8);
         let mut fields = Fields { bytes, at: body };
@@ -310,19 +316,21 @@ impl Layout {
     }
 }
 
+/// Returns whether `name` is 1 to 64 bytes of the form `[a-z][a-z0-9_]*`.
 fn is_column_name(name: &str) -> bool {
     name.len() <= MAX_NAME_BYTES
         && name.starts_with(|c: char| c.is_ascii_lowercase())
         && name.bytes().all(|b| b.is_ascii_lowercase() || b.is_ascii_digit() || b == b'_')
 }
 
-/// Takes little-endian fields off a slice whose first byte is byte 0 of the file.
+/// Cursor over the little-endian fields of a slice whose first byte is byte 0 of the file.
 struct Fields<'a> {
     bytes: &'a [u8],
     at: usize,
 }
 
 impl<'a> Fields<'a> {
+    /// Returns the next `len` bytes. Fails if fewer are left.
     fn take(&mut self, len: usize) -> std::result::Result<&'a [u8], Fault> {
         let left = self.bytes.len() - self.at;
         if len > left {
@@ -351,6 +359,7 @@ impl<'a> Fields<'a> {
         self.array().map(u64::from_le_bytes)
     }
 
+    /// Returns the next `len` bytes as text. Fails if they are not UTF-8.
     fn text(&mut self, len: usize) -> std::result::Result<String, Fault> {
         let start = self.at as u64;
         let bytes = self.take(len)?;
@@ -378,14 +387,14 @@ mod tests {
     }
 
     #[test]
-    fn headers_come_back_as_they_were_written() {
+    fn header_round_trips() {
         let header = layout().to_header().unwrap();
         assert_eq!(header.len(), layout().header_len());
         assert_eq!(Layout::from_header(&header).unwrap(), layout());
     }
 
     #[test]
-    fn places_in_the_index_and_tiles_correspond() {
+    fn index_position_and_tile_id_are_inverse() {
         let layout = layout();
         let ids: Vec<TileId> = (0..40).map(|index| layout.tile_at(index)).collect();
         assert!(ids.iter().enumerate().all(|(index, &id)| layout.index_of(id) == Some(index as u64)));
@@ -396,7 +405,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn hostile_headers_with_valid_checksums_are_legal_or_refused(
+        fn forged_header_is_legal_or_refused(
             at in 16usize..120, bytes in prop::collection::vec(any::<u8>(), 1..12), cut in 0usize..60,
         ) {
             let mut header = layout().to_header().unwrap();

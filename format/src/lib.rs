@@ -1,11 +1,10 @@
 //! `gseq`: a chunked, memory-mapped container for sequences of Gaussians.
 //!
-//! A container holds N Gaussians × T frames in *columns* of f32 (a name and a number of components
-//! per Gaussian), a time stamp per frame, and string attributes. It is cut into *tiles*, one per
-//! (column, Gaussian block, frame block); inside a tile the values lie as
-//! `[frame][component][gaussian]`, so that every (frame, component) plane is one contiguous slice.
-//! Every value comes back with the bits it went in with, NaN payloads and −0 included; or, in columns that have a bound
-//! ([`ColumnSpec::max_error`]), at most so far off.
+//! A container holds N Gaussians × T frames in *columns* of f32 (a name and a number of components per Gaussian), a
+//! time stamp per frame, and string attributes. It is cut into *tiles*, one per (column, Gaussian block, frame block).
+//! Inside a tile the values lie as `[frame][component][gaussian]`, so that every (frame, component) plane is one
+//! contiguous slice. Values are read back with exactly the bits that were written, NaN payloads and −0 included. In
+//! columns with a bound ([`ColumnSpec::max_error`]) a value may differ by at most that bound.
 //!
 //! ```
 //! # fn main() -> Result<(), gseq::Error> {
@@ -34,7 +33,7 @@
 //! # }
 //! ```
 //!
-//! The bytes are specified in `SPEC.md`; [`recover`] saves what a killed writer left behind.
+//! The bytes are specified in `SPEC.md`. [`recover`] saves the complete frame blocks of a file whose writer was killed.
 
 #![cfg_attr(not(test), deny(clippy::print_stderr, clippy::print_stdout, clippy::disallowed_methods))]
 
@@ -48,8 +47,8 @@ mod reader;
 mod record;
 mod recover;
 mod text;
+mod tile_bytes;
 mod verify;
-mod waiting;
 mod writer;
 
 pub use codec::{Compression, EncodedTile, Encoding, Stats, encode_tile};

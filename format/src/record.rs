@@ -1,5 +1,5 @@
-//! The three kinds of record and the trailer (SPEC.md, "Records"). A record is a header of 64 bytes
-//! with its own checksum and, after it, a payload with another.
+//! Records and trailer of a container (SPEC.md, "Records"). A record has a header of 64 bytes with a checksum of its
+//! own; a payload with another checksum may follow.
 
 use std::fmt;
 
@@ -9,33 +9,34 @@ use crate::codec::{Encoding, Stats};
 use crate::error::Fault;
 use crate::layout::{Layout, TileId};
 
-/// Length of a record header, and the alignment of records: their payloads are 64-byte aligned in
-/// the file and hence in its map.
-pub(crate) const RECORD: u64 = 64;
-/// Length of the trailer.
-pub(crate) const TRAILER: u64 = 32;
+/// Length in bytes of a record header, and alignment of records. Payloads are therefore 64-byte aligned in the file and
+/// in its map.
+pub(crate) const RECORD_BYTES: u64 = 64;
+/// Length of the trailer in bytes.
+pub(crate) const TRAILER_BYTES: u64 = 32;
+/// Last bytes of every finished container.
 const END_MAGIC: [u8; 8] = *b"\x1aGSEQEND";
 
-/// `offset` rounded up to where a record may start.
+/// Rounds `offset` up to the next offset where a record may start.
 pub(crate) fn align(offset: u64) -> u64 {
-    offset.next_multiple_of(RECORD)
+    offset.next_multiple_of(RECORD_BYTES)
 }
 
-/// One tile: the same 64 bytes stand before the payload and in the index.
+/// Record of one tile. The same 64 bytes lie before the payload and in the index.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct TileRecord {
     pub(crate) id: TileId,
     pub(crate) frames: u32,
     pub(crate) encoding: Encoding,
     pub(crate) constant: bool,
-    /// Where the payload starts. A constant tile may share the payload of an earlier one.
+    /// Offset of the payload. A constant tile may share the payload of an earlier one.
     pub(crate) offset: u64,
     pub(crate) stored_bytes: u32,
     pub(crate) checksum: u64,
     pub(crate) stats: Stats,
 }
 
-/// The time stamps of one frame block.
+/// Record of the time stamps of one frame block.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct TimesRecord {
     pub(crate) frame_block: u32,
@@ -43,13 +44,13 @@ pub(crate) struct TimesRecord {
     pub(crate) checksum: u64,
 }
 
-/// All time stamps and the index of all tiles.
+/// Record of all time stamps and the index of all tiles.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct FooterRecord {
     pub(crate) frames: u64,
     pub(crate) tiles: u64,
     pub(crate) checksum: u64,
-    /// Checksum of the header, so that a footer cannot serve another header.
+    /// Checksum of the file header, so that a footer cannot be combined with another header.
     pub(crate) header_checksum: u64,
 }
 
@@ -71,15 +72,16 @@ impl fmt::Display for Record {
 }
 
 impl FooterRecord {
-    /// Length of the payload, unless it overflows: 8 bytes per frame, 64 per tile.
-    pub(crate) fn payload(&self) -> Option<u64> {
-        self.frames.checked_mul(8)?.checked_add(self.tiles.checked_mul(RECORD)?)
+    /// Returns the length of the payload in bytes (8 per frame and 64 per tile), or `None` if it overflows.
+    pub(crate) fn payload_bytes(&self) -> Option<u64> {
+        self.frames.checked_mul(8)?.checked_add(self.tiles.checked_mul(RECORD_BYTES)?)
     }
 }
 
 impl Record {
-    pub(crate) fn to_bytes(self) -> [u8; RECORD as usize] {
-        let mut out = [0; RECORD as usize];
+    /// Encodes the record header with its checksum.
+    pub(crate) fn to_bytes(self) -> [u8; RECORD_BYTES as usize] {
+        let mut out = [0; RECORD_BYTES as usize];
         match self {
             Record::Tile(tile) => {
                 let (encoding, order) = match tile.encoding {
@@ -119,9 +121,9 @@ impl Record {
         out
     }
 
-    /// Reads the record header at `offset`. Its own fields are legal afterwards; whether they fit
-    /// the layout is for the caller, see [`TileRecord::check`].
-    pub(crate) fn from_bytes(bytes: &[u8; RECORD as usize], offset: u64) -> Result<Record, Fault> {
+    /// Decodes the record header at `offset` and checks each field by itself. [`TileRecord::check`] checks a tile
+    /// against the layout.
+    pub(crate) fn from_bytes(bytes: &[u8; RECORD_BYTES as usize], offset: u64) -> Result<Record, Fault> {
         let u32_at = |at: usize| u32::from_le_bytes(std::array::from_fn(|i| bytes[at + i]));
         let u64_at = |at: usize| u64::from_le_bytes(std::array::from_fn(|i| bytes[at + i]));
         let (stored, computed) = (u64_at(56), xxh3_64(&bytes[..56]));
@@ -166,7 +168,7 @@ impl Record {
             }),
             other => return Err(Fault::new(offset, "a record TILE, TIME or FOOT", format!("{other:02x?}"))),
         };
-        // Reserved bytes are zero and flags are 0 or 1: writing the record again must give the same bytes.
+        // Reserved bytes must be zero and flags 0 or 1: encoding the record again must give the same bytes.
         if record.to_bytes() != *bytes {
             return Err(Fault::new(offset, "zero in every reserved byte and flags of 0 or 1", "something else"));
         }
@@ -175,16 +177,16 @@ impl Record {
 }
 
 impl TileRecord {
-    /// f32 values in the payload: one frame for a constant tile.
-    pub(crate) fn values(&self, layout: &Layout) -> usize {
+    /// Returns the number of f32 values in the payload; one frame for a constant tile.
+    pub(crate) fn value_count(&self, layout: &Layout) -> usize {
         let frames = if self.constant { 1 } else { self.frames as usize };
         frames
             * layout.columns[self.id.column as usize].width as usize
             * layout.block_len(self.id.gaussian_block) as usize
     }
 
-    /// Checks a record found at `place` against the layout: it is a tile of the container, of a
-    /// legal size, and its payload lies within `payloads`.
+    /// Checks the record at offset `place` against the layout: the tile exists, has a legal size, and its payload lies
+    /// within `payloads`.
     pub(crate) fn check(&self, layout: &Layout, payloads: std::ops::Range<u64>, place: u64) -> Result<(), Fault> {
         if layout.index_of(self.id).is_none() {
             return Err(Fault::new(place + 4, "a column and a Gaussian block of this container", self.id));
@@ -192,7 +194,7 @@ impl TileRecord {
         if !(1..=layout.frame_block).contains(&self.frames) {
             return Err(Fault::new(place + 20, format!("1 to {} frames", layout.frame_block), self.frames));
         }
-        let raw = 4 * self.values(layout) as u64;
+        let raw = 4 * self.value_count(layout) as u64;
         let stored = u64::from(self.stored_bytes);
         let legal = match self.encoding {
             Encoding::Raw => stored == raw,
@@ -209,28 +211,32 @@ impl TileRecord {
         }
         let inside =
             self.offset >= payloads.start && self.offset.checked_add(stored).is_some_and(|end| end <= payloads.end);
-        if !inside || !self.offset.is_multiple_of(RECORD) {
-            let expected =
-                format!("a payload within bytes {} to {}, at a multiple of {RECORD}", payloads.start, payloads.end);
+        if !inside || !self.offset.is_multiple_of(RECORD_BYTES) {
+            let expected = format!(
+                "a payload within bytes {} to {}, at a multiple of {RECORD_BYTES}",
+                payloads.start, payloads.end
+            );
             return Err(Fault::new(place + 24, expected, format!("{stored} bytes from {}", self.offset)));
         }
         Ok(())
     }
 
-    /// Whether two tiles may name the same stored bytes: constant ones of the same Gaussians and column.
+    /// Returns whether two tiles may share their stored bytes: constant tiles of the same column and Gaussian block
+    /// with equal fields, except frame block and number of frames.
     pub(crate) fn may_share(&self, other: &TileRecord) -> bool {
         let shared = |tile: &TileRecord| TileRecord { id: TileId { frame_block: 0, ..tile.id }, frames: 0, ..*tile };
         self.constant && shared(self).same_bits(&shared(other))
     }
 
+    /// Compares records by their encoded bytes, so that NaN and −0 compare as bits.
     fn same_bits(&self, other: &TileRecord) -> bool {
         Record::Tile(*self).to_bytes() == Record::Tile(*other).to_bytes()
     }
 }
 
-/// The last bytes of a finished file: where the footer is, how long the file is.
-pub(crate) fn trailer_to_bytes(footer: u64) -> [u8; TRAILER as usize] {
-    let mut out = [0; TRAILER as usize];
+/// Encodes the last bytes of a finished file: the offset of the footer, a checksum and the end magic.
+pub(crate) fn trailer_to_bytes(footer: u64) -> [u8; TRAILER_BYTES as usize] {
+    let mut out = [0; TRAILER_BYTES as usize];
     out[..8].copy_from_slice(&footer.to_le_bytes());
     let checksum = xxh3_64(&out[..16]);
     out[16..24].copy_from_slice(&checksum.to_le_bytes());
@@ -238,8 +244,8 @@ pub(crate) fn trailer_to_bytes(footer: u64) -> [u8; TRAILER as usize] {
     out
 }
 
-/// Reads the trailer at `offset`: the place of the footer.
-pub(crate) fn trailer_from_bytes(bytes: &[u8; TRAILER as usize], offset: u64) -> Result<u64, Fault> {
+/// Decodes the trailer at `offset` and returns the offset of the footer.
+pub(crate) fn trailer_from_bytes(bytes: &[u8; TRAILER_BYTES as usize], offset: u64) -> Result<u64, Fault> {
     let footer = u64::from_le_bytes(std::array::from_fn(|i| bytes[i]));
     if trailer_to_bytes(footer) != *bytes {
         let fault = Fault::new(
@@ -252,11 +258,12 @@ pub(crate) fn trailer_from_bytes(bytes: &[u8; TRAILER as usize], offset: u64) ->
     Ok(footer)
 }
 
-/// What identifies a container's content: a hash of header, time stamps and every tile's record in the order of the
-/// index, without the place it is stored at, so that the order of writing does not matter.
+/// Hash that identifies the content of a container: header, time stamps, and every tile record in the order of the
+/// index, with offset 0, so that the order of writing does not matter.
 pub(crate) struct Digest(Xxh3);
 
 impl Digest {
+    /// Starts the hash with the header and the time stamps.
     pub(crate) fn new(header: &[u8], times: &[f64]) -> Self {
         let mut hash = Xxh3::new();
         hash.update(header);
@@ -264,10 +271,12 @@ impl Digest {
         Digest(hash)
     }
 
+    /// Adds the next tile in the order of the index.
     pub(crate) fn tile(&mut self, tile: &TileRecord) {
         self.0.update(&Record::Tile(TileRecord { offset: 0, ..*tile }).to_bytes());
     }
 
+    /// Returns the hash of everything added so far.
     pub(crate) fn value(&self) -> u64 {
         self.0.digest()
     }

@@ -1,4 +1,4 @@
-//! Saves the complete frame blocks of a container that was cut short or damaged after its header.
+//! Recovery of the complete frame blocks of a container that was cut short, or damaged after its header.
 
 use std::collections::HashMap;
 use std::path::Path;
@@ -11,37 +11,36 @@ use crate::file::MappedFile;
 use crate::index::check_memory;
 use crate::layout::Layout;
 use crate::reader::{TileBuffer, read_header, read_tile};
-use crate::record::{RECORD, Record, TileRecord, TimesRecord, align};
+use crate::record::{RECORD_BYTES, Record, TileRecord, TimesRecord, align};
 use crate::verify::check_stats;
 use crate::writer::{Writer, check_times};
 
-/// What [`recover`] found and saved.
+/// Counts of what [`recover`] found and saved.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct RecoverReport {
-    /// Frames in the new container.
+    /// Number of frames in the new container.
     pub frames: u64,
-    /// Frames whose time stamps were found.
+    /// Number of frames whose time stamps were found.
     pub frames_seen: u64,
-    /// Intact tiles that were found.
+    /// Number of intact tiles found.
     pub tiles_seen: u64,
-    /// Tiles in the new container; the others belong to frame blocks that are not complete or come after one
-    /// that is not.
+    /// Number of tiles in the new container. The other tiles belong to an incomplete frame block or to one after it.
     pub tiles_saved: u64,
-    /// Bytes that belong to no intact record.
+    /// Number of bytes that belong to no intact record.
     pub bytes_skipped: u64,
 }
 
-/// Writes a valid container `dst` with the frame blocks of `src` up to the first that lacks its time stamps or
-/// a tile; every value has the bits it had. Tiles whose place in the file is damaged are searched for
-/// record by record. Memory: some 150 bytes per tile, the time stamps, one tile buffer.
+/// Writes a valid container `dst` with the frame blocks of `src` up to the first one that lacks its time stamps or a
+/// tile. Every value keeps its bits. After a damaged record the search continues at every multiple of 64 bytes. Memory:
+/// about 150 bytes per tile, the time stamps and one tile buffer.
 ///
-/// Errors: the header of `src` is damaged, or `dst` cannot be written. No frames left is not an error:
-/// `dst` has none then, and the report says so.
+/// Fails if the header of `src` is damaged or `dst` cannot be written. If no frame can be saved, `dst` has no frames
+/// and the report says so; that is not an error.
 pub fn recover(src: impl AsRef<Path>, dst: impl AsRef<Path>) -> Result<RecoverReport> {
     recover_within(src, dst, u64::MAX)
 }
 
-/// [`recover`] with at most `memory` bytes. Errors: those of [`recover`]; the container needs more.
+/// Recovers a container like [`recover`] with at most `memory` bytes. Fails also if the container needs more.
 pub fn recover_within(src: impl AsRef<Path>, dst: impl AsRef<Path>, memory: u64) -> Result<RecoverReport> {
     let file = MappedFile::open(src.as_ref())?;
     let (layout, header) = read_header(&file)?;
@@ -81,7 +80,7 @@ pub fn recover_within(src: impl AsRef<Path>, dst: impl AsRef<Path>, memory: u64)
     Ok(report)
 }
 
-/// A stored tile as the writer takes it, without encoding it again.
+/// Wraps the stored bytes of a tile for the writer, without encoding it again.
 fn encoded(tile: &TileRecord, layout: &Layout, stored: &[u8]) -> EncodedTile {
     let column = &layout.columns[tile.id.column as usize];
     EncodedTile {
@@ -97,66 +96,74 @@ fn encoded(tile: &TileRecord, layout: &Layout, stored: &[u8]) -> EncodedTile {
     }
 }
 
-/// Every intact record of a file: time stamps by frame block, tiles by their place in the index.
-struct Found {
+/// Intact records of a file: time stamps by frame block, tiles by their position in the index.
+struct FoundRecords {
     times: HashMap<u32, Vec<f64>>,
     tiles: HashMap<u64, TileRecord>,
-    /// Constant tiles that have their own payload, by its place.
+    /// Constant tiles with a payload of their own, by the offset of the payload.
     constants: HashMap<u64, TileRecord>,
     skipped: u64,
     /// Bytes of all time stamps.
     time_bytes: u64,
 }
 
-/// Goes from record to record. Where one is damaged, tries every multiple of 64 after it: a record knows
-/// its place, so bytes inside a payload are not taken for one.
-fn scan(file: &MappedFile, layout: &Layout, start: u64, memory: u64) -> Result<Found> {
-    let mut found =
-        Found { times: HashMap::new(), tiles: HashMap::new(), constants: HashMap::new(), skipped: 0, time_bytes: 0 };
+/// Reads record after record. After a damaged one it tries every multiple of 64. A record holds its own offset, so
+/// bytes inside a payload are not mistaken for a record.
+fn scan(file: &MappedFile, layout: &Layout, start: u64, memory: u64) -> Result<FoundRecords> {
+    let mut found = FoundRecords {
+        times: HashMap::new(),
+        tiles: HashMap::new(),
+        constants: HashMap::new(),
+        skipped: 0,
+        time_bytes: 0,
+    };
     let mut buffer = TileBuffer::default();
     let mut position = start;
-    while position + RECORD <= file.len() {
-        let mut bytes = [0; RECORD as usize];
+    while position + RECORD_BYTES <= file.len() {
+        let mut bytes = [0; RECORD_BYTES as usize];
         file.read_at(position, &mut bytes)?;
-        let payload = position + RECORD;
+        let payload = position + RECORD_BYTES;
         check_memory(position, found.bytes(layout), memory).map_err(|fault| fault.at(file.path()))?;
         let len = match Record::from_bytes(&bytes, position) {
-            Ok(Record::Tile(tile)) => found.take_tile(file, layout, &tile, position, start, &mut buffer),
+            Ok(Record::Tile(tile)) => found.add_tile(file, layout, &tile, position, start, &mut buffer),
             Ok(Record::Times(times)) => read_times(file, layout, &times, position).ok().map(|stamps| {
                 let len = 8 * stamps.len() as u64;
                 found.time_bytes += len;
                 found.times.entry(times.frame_block).or_insert(stamps);
                 len
             }),
-            // Behind the footer comes nothing but the trailer.
-            Ok(Record::Footer(footer)) if footer.payload().is_some_and(|len| len <= file.len() - payload) => break,
+            // Only the trailer follows the footer.
+            Ok(Record::Footer(footer)) if footer.payload_bytes().is_some_and(|len| len <= file.len() - payload) => {
+                break;
+            }
             Ok(Record::Footer(_)) | Err(_) => None,
         };
         match len {
             Some(len) => position = align(payload + len),
             None => {
-                found.skipped += RECORD;
-                position += RECORD;
+                found.skipped += RECORD_BYTES;
+                position += RECORD_BYTES;
             }
         }
     }
-    if position < file.len() && position + RECORD > file.len() {
+    if position < file.len() && position + RECORD_BYTES > file.len() {
         found.skipped += file.len() - position;
     }
     Ok(found)
 }
 
-impl Found {
-    /// Bytes of what was found so far, of its tables while they grow, and of the largest tile, decoded.
+impl FoundRecords {
+    /// Returns the memory in bytes of the records found so far, of their tables while they grow, and of decoding the
+    /// largest tile.
     fn bytes(&self, layout: &Layout) -> u64 {
         let tiles = (self.tiles.capacity() + self.constants.capacity()) * 3 / 2 * (size_of::<TileRecord>() + 16);
         let times = 2 * self.time_bytes + 64 * self.times.len() as u64;
         tiles as u64 + times + 3 * layout.largest_tile(u64::MAX)
     }
 
-    /// Takes the tile of the record at `position` if it is intact. Gives the length of what follows the record: its payload,
-    /// or nothing if it shares one.
-    fn take_tile(
+    /// Stores the tile of the record at `position` if it is intact. Returns the length of the payload after the record:
+    /// 0 if the tile shares an earlier payload; `None` if it is damaged.
+    fn add_tile(
         &mut self,
         file: &MappedFile,
         layout: &Layout,
@@ -165,8 +172,8 @@ impl Found {
         start: u64,
         buffer: &mut TileBuffer,
     ) -> Option<u64> {
-        tile.check(layout, start + RECORD..file.len(), position).ok()?;
-        let own = tile.offset == position + RECORD;
+        tile.check(layout, start + RECORD_BYTES..file.len(), position).ok()?;
+        let own = tile.offset == position + RECORD_BYTES;
         if own {
             read_tile(file, layout, tile, buffer).ok()?;
             check_stats(tile, position, buffer.values()).ok()?;
@@ -174,8 +181,8 @@ impl Found {
                 self.constants.insert(tile.offset, *tile);
             }
         } else {
-            // Decoded when its owner was met: a file of nothing but records that share one large payload
-            // costs no more than its length.
+            // The shared payload was decoded with its own record. A forged file of many records that share one large
+            // payload thus costs no more than its length.
             self.constants.get(&tile.offset).filter(|owner| tile.may_share(owner))?;
         }
         self.tiles.entry(layout.index_of(tile.id)?).or_insert(*tile);
@@ -183,22 +190,22 @@ impl Found {
     }
 }
 
-/// The time stamps of the record at `position`, checked against its checksum and the layout.
+/// Reads the time stamps of the record at `position` and checks them against its checksum and the layout.
 pub(crate) fn read_times(file: &MappedFile, layout: &Layout, times: &TimesRecord, position: u64) -> Result<Vec<f64>> {
     let fault = |fault: Fault| fault.at(file.path());
     if !(1..=layout.frame_block).contains(&times.frames) {
         return Err(fault(Fault::new(position + 20, format!("1 to {} frames", layout.frame_block), times.frames)));
     }
     let len = 8 * u64::from(times.frames);
-    if len > file.len().saturating_sub(position + RECORD) {
-        return Err(fault(Fault::new(position + RECORD, format!("{len} bytes"), "the end of the file")));
+    if len > file.len().saturating_sub(position + RECORD_BYTES) {
+        return Err(fault(Fault::new(position + RECORD_BYTES, format!("{len} bytes"), "the end of the file")));
     }
     let mut bytes = vec![0; len as usize];
-    file.read_at(position + RECORD, &mut bytes)?;
+    file.read_at(position + RECORD_BYTES, &mut bytes)?;
     let computed = xxh3_64(&bytes);
     if computed != times.checksum {
         let expected = format!("time stamps with checksum {:016x}", times.checksum);
-        return Err(fault(Fault::new(position + RECORD, expected, format!("{computed:016x}"))));
+        return Err(fault(Fault::new(position + RECORD_BYTES, expected, format!("{computed:016x}"))));
     }
     Ok(bytes.as_chunks().0.iter().map(|bytes| f64::from_le_bytes(*bytes)).collect())
 }

@@ -1,12 +1,12 @@
-//! Texts and paths from outside, shown without letting them control a terminal.
+//! Escapes text and paths from files and arguments, so that they cannot control a terminal when printed.
 
 use std::borrow::Cow;
 use std::ffi::OsStr;
 use std::fmt;
 use std::path::Path;
 
-/// Whether `c` moves the cursor, changes the direction of text or cannot be seen: control characters of both sets (C0
-/// and C1), marks of direction, zero-width characters, separators of lines, tags.
+/// Returns whether `c` moves the cursor, changes the direction of text or is invisible: control characters of both sets
+/// (C0 and C1), direction marks, zero-width characters, line separators, tags.
 fn is_unprintable(c: char) -> bool {
     c.is_control()
         || matches!(c,
@@ -14,7 +14,7 @@ fn is_unprintable(c: char) -> bool {
             | '\u{feff}' | '\u{fff9}'..='\u{fffb}' | '\u{e0000}'..='\u{e007f}')
 }
 
-/// Returns `text` with every unprintable character but line feeds and tabs replaced by its code, as in `<U+001B>`.
+/// Returns `text` with every unprintable character except line feeds and tabs replaced by its code, as in `<U+001B>`.
 pub fn printable(text: &str) -> Cow<'_, str> {
     let is_kept = |c: char| matches!(c, '\n' | '\t') || !is_unprintable(c);
     if text.chars().all(is_kept) {
@@ -27,7 +27,8 @@ pub fn printable(text: &str) -> Cow<'_, str> {
     Cow::Owned(out)
 }
 
-/// Returns `text` in quotation marks, unprintable characters by their codes, as in `<U+FEFF>`; at most 120 characters.
+/// Returns `text` in quotation marks with unprintable characters replaced by their codes, as in `<U+FEFF>`. Text beyond
+/// 120 characters is replaced by "…".
 pub fn quoted(text: &str) -> String {
     const LONGEST: usize = 120;
     let mut out = String::from("\"");
@@ -45,14 +46,15 @@ pub fn quoted(text: &str) -> String {
     out
 }
 
+/// Returns the code of `c` as messages show it, for example `<U+001B>`.
 fn code(c: char) -> String {
     format!("<U+{:04X}>", c as u32)
 }
 
-/// Paths and file names as messages show them.
+/// Display of paths and file names in messages.
 pub trait ShowPath {
-    /// Returns the path for display, unprintable characters (line feeds too) by their codes, as in `<U+000A>`, bytes that
-    /// are not Unicode as U+FFFD.
+    /// Returns the path for display: unprintable characters (line feeds too) are replaced by their codes, as in
+    /// `<U+000A>`, and bytes that are not Unicode by U+FFFD.
     fn shown(&self) -> ShownPath<'_>;
 }
 
@@ -68,7 +70,7 @@ impl ShowPath for OsStr {
     }
 }
 
-/// A path or file name for display; see [`ShowPath`].
+/// Wrapper of a path or file name that displays it escaped; see [`ShowPath`].
 #[derive(Debug)]
 pub struct ShownPath<'a>(&'a OsStr);
 

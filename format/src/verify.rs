@@ -1,4 +1,4 @@
-//! Checks every byte of a container, in the order they lie in the file.
+//! Verification of every byte of a container, in the order of the file.
 
 use std::collections::HashSet;
 
@@ -6,59 +6,61 @@ use crate::codec::{Stats, stats};
 use crate::error::{Fault, Result};
 use crate::index::check_memory;
 use crate::reader::{Reader, TileBuffer};
-use crate::record::{RECORD, Record, TileRecord, TimesRecord, align};
+use crate::record::{RECORD_BYTES, Record, TileRecord, TimesRecord, align};
 use crate::recover::read_times;
 
-/// What [`Reader::verify`] went through.
+/// Counts of what [`Reader::verify`] checked.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct VerifyReport {
-    /// Frames of the sequence.
+    /// Number of frames of the sequence.
     pub frames: u64,
-    /// Tiles of the container.
+    /// Number of tiles of the container.
     pub tiles: u64,
-    /// Bytes of payloads as stored; shared ones once.
+    /// Bytes of stored payloads; a shared payload counts once.
     pub stored_bytes: u64,
-    /// Bytes of values after decoding: of constant tiles one frame, of shared payloads once.
+    /// Bytes of decoded values: one frame per constant tile; a shared payload counts once.
     pub decoded_bytes: u64,
 }
 
 impl Reader {
-    /// Reads the whole file and checks what opening it left unchecked: every record is where the index says and says
-    /// the same, every tile decodes to values with its checksum and statistics, all bytes between are zero. A file
-    /// that passes has no byte that could be changed unnoticed. Memory: one [`TileBuffer`], 1 byte per
-    /// tile, some 20 per constant tile.
+    /// Reads the whole file and checks everything that opening did not: every record equals its index entry, every tile
+    /// decodes to values with its checksum and statistics, and all bytes in between are zero. A file that passes has no
+    /// byte that could be changed unnoticed. Memory: one [`TileBuffer`], 1 byte per tile, about 20 bytes per constant
+    /// tile.
     pub fn verify(&self) -> Result<VerifyReport> {
         self.verify_within(u64::MAX)
     }
 
-    /// [`Reader::verify`] with at most `memory` bytes. Errors: the container needs more.
+    /// Verifies the container like [`Reader::verify`], with at most `memory` bytes. Fails also if the container needs
+    /// more.
     pub fn verify_within(&self, memory: u64) -> Result<VerifyReport> {
         let fault = |fault: Fault| fault.at(self.file.path());
         let tile = self.layout.largest_tile(self.times.len() as u64);
         check_memory(0, 3 * tile + 32 * self.index.tiles, memory).map_err(fault)?;
         let mut report = VerifyReport { frames: self.times.len() as u64, tiles: 0, stored_bytes: 0, decoded_bytes: 0 };
         let mut buffer = TileBuffer::default();
-        let mut met = vec![false; self.index.tiles as usize];
-        let mut blocks_met = 0;
-        // Opening made sure that tiles with the same payload agree on everything about it.
-        let mut owned = HashSet::new();
+        let mut seen = vec![false; self.index.tiles as usize];
+        let mut blocks_seen = 0;
+        // Payloads of constant tiles that were met. Opening has checked that tiles with the same payload agree in all
+        // other fields.
+        let mut own_payloads = HashSet::new();
         let (_, header) = crate::reader::read_header(&self.file)?;
-        let mut position = self.padded(header.len() as u64)?;
+        let mut position = self.skip_padding(header.len() as u64)?;
         while position < self.footer_offset {
-            let mut bytes = [0; RECORD as usize];
+            let mut bytes = [0; RECORD_BYTES as usize];
             self.file.read_at(position, &mut bytes)?;
-            let payload = position + RECORD;
+            let payload = position + RECORD_BYTES;
             match Record::from_bytes(&bytes, position).map_err(fault)? {
                 Record::Tile(tile) => {
-                    let index = self.layout.index_of(tile.id).filter(|&i| i < self.index.tiles && !met[i as usize]);
-                    let mut indexed = [0; RECORD as usize];
+                    let index = self.layout.index_of(tile.id).filter(|&i| i < self.index.tiles && !seen[i as usize]);
+                    let mut indexed = [0; RECORD_BYTES as usize];
                     if let Some(index) = index {
-                        self.file.read_at(self.index.place(index), &mut indexed)?;
+                        self.file.read_at(self.index.entry_offset(index), &mut indexed)?;
                     }
                     let Some(index) = index.filter(|_| indexed == bytes) else {
                         return Err(fault(Fault::new(position, "the tile the index describes, once", tile.id)));
                     };
-                    met[index as usize] = true;
+                    seen[index as usize] = true;
                     report.tiles += 1;
                     let mut stored = 0;
                     if tile.offset == payload {
@@ -66,21 +68,21 @@ impl Reader {
                         check_stats(&tile, position, values).map_err(fault)?;
                         stored = u64::from(tile.stored_bytes);
                         report.stored_bytes += stored;
-                        report.decoded_bytes += 4 * tile.values(&self.layout) as u64;
+                        report.decoded_bytes += 4 * tile.value_count(&self.layout) as u64;
                         if tile.constant {
-                            owned.insert(tile.offset);
+                            own_payloads.insert(tile.offset);
                         }
-                    } else if !owned.contains(&tile.offset) {
+                    } else if !own_payloads.contains(&tile.offset) {
                         let fault =
                             Fault::new(position + 24, "a payload after this record or of an earlier tile", tile.offset);
                         return Err(fault.at(self.file.path()));
                     }
-                    position = self.padded(payload + stored)?;
+                    position = self.skip_padding(payload + stored)?;
                 }
                 Record::Times(times) => {
-                    self.check_times(&times, blocks_met, position)?;
-                    blocks_met += 1;
-                    position = self.padded(payload + 8 * u64::from(times.frames))?;
+                    self.check_times(&times, blocks_seen, position)?;
+                    blocks_seen += 1;
+                    position = self.skip_padding(payload + 8 * u64::from(times.frames))?;
                 }
                 Record::Footer(_) => {
                     let expected = format!("the footer at byte {}", self.footer_offset);
@@ -88,15 +90,15 @@ impl Reader {
                 }
             }
         }
-        if blocks_met != self.frame_blocks() || report.tiles != self.index.tiles {
+        if blocks_seen != self.frame_blocks() || report.tiles != self.index.tiles {
             let expected =
                 format!("{} time records and {} tiles before the footer", self.frame_blocks(), self.index.tiles);
-            return Err(fault(Fault::new(self.footer_offset, expected, format!("{blocks_met} and {}", report.tiles))));
+            return Err(fault(Fault::new(self.footer_offset, expected, format!("{blocks_seen} and {}", report.tiles))));
         }
         Ok(report)
     }
 
-    /// Checks that the record at `position` holds the time stamps of frame block `block`, as the footer has them.
+    /// Checks that the record at `position` holds the time stamps of frame block `block` as given in the footer.
     fn check_times(&self, record: &TimesRecord, block: u32, position: u64) -> Result<()> {
         let stamps = read_times(&self.file, &self.layout, record, position)?;
         let range = self.layout.frame_range(block, self.times.len() as u64);
@@ -110,9 +112,9 @@ impl Reader {
         Ok(())
     }
 
-    /// Checks that zeros fill the file from `end` to the next multiple of 64, which is returned.
-    fn padded(&self, end: u64) -> Result<u64> {
-        let mut zeros = [0; RECORD as usize];
+    /// Checks that zeros fill the file from `end` to the next multiple of 64, and returns that multiple.
+    fn skip_padding(&self, end: u64) -> Result<u64> {
+        let mut zeros = [0; RECORD_BYTES as usize];
         let zeros = &mut zeros[..(align(end) - end) as usize];
         self.file.read_at(end, zeros)?;
         if let Some(at) = zeros.iter().position(|&byte| byte != 0) {
@@ -126,7 +128,7 @@ impl Reader {
 /// Checks the statistics of the record at `position` against the values of its tile.
 pub(crate) fn check_stats(tile: &TileRecord, position: u64, values: &[f32]) -> std::result::Result<(), Fault> {
     let found = stats(bytemuck::cast_slice(values));
-    // As bits: a forged NaN must not compare as equal to nothing, nor −0 to the +0 it has to be.
+    // Compare bits: a forged NaN must not pass, and −0 must not pass for +0.
     let bits = |stats: Stats| (stats.min.to_bits(), stats.max.to_bits(), stats.non_finite);
     if bits(found) != bits(tile.stats) {
         return Err(Fault::new(position + 44, format!("{found}, as the values are"), tile.stats));

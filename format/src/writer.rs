@@ -1,4 +1,4 @@
-//! Writes a container under a temporary name and renames it when it is complete.
+//! Writer of containers. The file has a temporary name until it is complete.
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Read, Seek, SeekFrom, Write};
@@ -9,54 +9,55 @@ use xxhash_rust::xxh3::{Xxh3, xxh3_64};
 
 use crate::codec::EncodedTile;
 use crate::error::{Error, Result};
-use crate::file::PIECE;
+use crate::file::CHUNK_BYTES;
 use crate::layout::{ColumnSpec, Layout, TileId};
-use crate::record::{Digest, FooterRecord, RECORD, Record, TileRecord, TimesRecord, align, trailer_to_bytes};
+use crate::record::{Digest, FooterRecord, RECORD_BYTES, Record, TileRecord, TimesRecord, align, trailer_to_bytes};
 use crate::text::ShowPath;
 
-/// Writes a container: time stamps of a frame block, then its tiles, and so on, then [`Writer::finish`].
+/// Writes a container: the time stamps of a frame block, then its tiles, and so on, then [`Writer::finish`].
 ///
-/// Tiles may come in any order once the time stamps of their frame block are there. Writing all tiles of
-/// a block before the next lets [`crate::recover`] save most after a crash. The bytes of the file depend on that order;
-/// its digest and content do not.
+/// Tiles may be written in any order once the time stamps of their frame block were appended. Writing all tiles of a
+/// block before the next block lets [`crate::recover`] save the most after a crash. The bytes of the file depend on the
+/// order of writing; its digest and content do not.
 ///
-/// A constant tile whose stored bytes equal those of the last constant tile written for its column and Gaussian
-/// block is not stored again: a column that never changes costs 64 bytes per further tile and its index entry.
+/// A constant tile whose stored bytes equal those of the last constant tile written for its column and Gaussian block
+/// is not stored again. A column that never changes therefore costs 64 bytes per further tile and its index entry.
 ///
 /// Memory: 8 bytes per frame, twice that in [`Writer::finish`]; 80 bytes per column and Gaussian block; the stored
-/// bytes of the largest constant tile. The index, 64 bytes per tile, waits in a nameless file in the same folder.
+/// bytes of the largest constant tile. The index, 64 bytes per tile, is kept in an unnamed temporary file in the same
+/// folder until the end.
 ///
-/// The file grows under a hidden name ending in `.tmp` in the folder of its final name. Dropping an unfinished
-/// writer removes it; a killed process leaves it behind, readable by [`crate::recover`].
+/// The file grows under a hidden name ending in `.tmp` in the folder of its final name. Dropping an unfinished writer
+/// removes it. A killed process leaves it behind; [`crate::recover`] can read it.
 pub struct Writer {
     path: PathBuf,
     temporary: PathBuf,
     file: File,
     layout: Layout,
     header: Vec<u8>,
-    /// Where the next record goes: a multiple of 64.
+    /// Offset of the next record; a multiple of 64.
     position: u64,
     times: Vec<f64>,
-    /// Nameless: the record of tile i at byte 64·i, zeros where it is missing.
+    /// Unnamed temporary file with the record of tile i at byte 64·i, or zeros if the tile is not written yet.
     index: File,
-    /// Tiles that are to be written, and that are.
+    /// Number of tiles of the frame blocks appended so far, and number of tiles written.
     tiles: u64,
     written: u64,
-    /// Per column and Gaussian block the last constant tile that was written; none before there are frames.
+    /// Last constant tile written for each column and Gaussian block; empty before the first frame block.
     constants: Vec<Option<TileRecord>>,
     stored: Vec<u8>,
     finished: bool,
 }
 
 impl Writer {
-    /// Starts a container that will be called `path`. Errors: the layout breaks a limit, or the folder
-    /// does not take a new file.
+    /// Starts a container that will get the name `path`. Fails if the layout breaks a limit or the folder does not
+    /// accept a new file.
     pub fn create(path: impl AsRef<Path>, layout: Layout) -> Result<Writer> {
         let path = path.as_ref();
         let mut header = layout.to_header()?;
         let (temporary, file) = create_beside(path)?;
         let index = tempfile::tempfile_in(folder_of(path)).map_err(|error| {
-            // Nothing was begun, and nobody is left to tell of a second failure.
+            // The error below is reported; a failure to remove the empty file is not.
             let _ = fs::remove_file(&temporary);
             Error::io("create the index of", path)(error)
         })?;
@@ -75,21 +76,21 @@ impl Writer {
             stored: Vec::new(),
             finished: false,
         };
-        writer.put(&[&header])?;
+        writer.append_padded(&[&header])?;
         header.shrink_to_fit();
         writer.header = header;
         Ok(writer)
     }
 
-    /// The shape the container was created with.
+    /// Returns the shape the container was created with.
     pub fn layout(&self) -> &Layout {
         &self.layout
     }
 
-    /// Adds the next frame block and returns its number. `times` holds the stamps of its frames, as many
-    /// as [`Layout::frame_block`]; fewer (but not none) end the sequence.
+    /// Appends the next frame block and returns its number. `times` holds the time stamps of its frames:
+    /// [`Layout::frame_block`] of them, or fewer (at least one) in the last block, after which no other may follow.
     ///
-    /// Errors: a stamp is not finite or not above the one before; the sequence has ended.
+    /// Fails if a time stamp is not finite or not above the previous one, or if the last block was appended before.
     pub fn append_times(&mut self, times: &[f64]) -> Result<u32> {
         let most = self.layout.frame_block as usize;
         let first = self.times.len();
@@ -115,17 +116,17 @@ impl Writer {
         let block = block.ok_or_else(|| Error::usage("a container has fewer than 2³² frame blocks"))?;
         let payload: Vec<u8> = times.iter().flat_map(|time| time.to_le_bytes()).collect();
         let record = TimesRecord { frame_block: block, frames: times.len() as u32, checksum: xxh3_64(&payload) };
-        self.put(&[&Record::Times(record).to_bytes(), &payload])?;
+        self.append_padded(&[&Record::Times(record).to_bytes(), &payload])?;
         self.times.extend(times);
         self.tiles += self.layout.tiles_per_frame_block();
         self.constants.resize(self.layout.tiles_per_frame_block() as usize, None);
         Ok(block)
     }
 
-    /// Writes one tile. Errors: there is no such tile, its time stamps have not been appended, it was written
-    /// already, or `tile` has another shape or may be further off than its column.
+    /// Writes one tile. Fails if there is no such tile, its time stamps have not been appended, it was written before,
+    /// or `tile` has another shape or a larger error bound than its column.
     pub fn write_tile(&mut self, at: TileId, tile: &EncodedTile) -> Result<()> {
-        let (index, frames) = self.free_slot(at)?;
+        let (index, frames) = self.unwritten_entry(at)?;
         let &ColumnSpec { width, max_error, .. } = &self.layout.columns[at.column as usize];
         let len = self.layout.block_len(at.gaussian_block);
         let shape = |frames, width, len| format!("{frames} frames × {width} components × {len} Gaussians");
@@ -145,7 +146,7 @@ impl Writer {
             frames,
             encoding: tile.encoding,
             constant: tile.constant,
-            offset: self.position + RECORD,
+            offset: self.position + RECORD_BYTES,
             stored_bytes: tile.bytes.len() as u32,
             checksum: tile.checksum,
             stats: tile.stats,
@@ -155,57 +156,59 @@ impl Writer {
         match self.shared_payload(slot, &record, &tile.bytes)? {
             Some(offset) => {
                 record.offset = offset;
-                self.put(&[&Record::Tile(record).to_bytes()])?;
+                self.append_padded(&[&Record::Tile(record).to_bytes()])?;
             }
-            None => self.put(&[&Record::Tile(record).to_bytes(), &tile.bytes])?,
+            None => self.append_padded(&[&Record::Tile(record).to_bytes(), &tile.bytes])?,
         }
-        self.enter(index, record, start)?;
+        self.add_entry(index, record, start)?;
         if record.constant {
             self.constants[slot] = Some(record);
         }
         Ok(())
     }
 
-    /// Writes a tile once more as the last constant tile of its column and Gaussian block: the same file as if
-    /// [`Writer::write_tile`] were given that tile again, without encoding it again. Errors: there is no such tile,
-    /// its time stamps have not been appended, it was written already, or no constant tile came before it.
+    /// Writes a tile equal to the last constant tile of its column and Gaussian block. Produces the same file as
+    /// [`Writer::write_tile`] with that tile, without encoding it again. Fails if there is no such tile, its time
+    /// stamps have not been appended, it was written before, or no constant tile came before it.
     pub fn repeat_tile(&mut self, at: TileId) -> Result<()> {
-        let (index, frames) = self.free_slot(at)?;
+        let (index, frames) = self.unwritten_entry(at)?;
         let slot = index as usize % self.constants.len();
         let Some(earlier) = self.constants[slot] else {
             return Err(Error::usage(format!("{at} has no constant tile before it to repeat")));
         };
         let record = TileRecord { id: at, frames, ..earlier };
         let start = self.position;
-        self.put(&[&Record::Tile(record).to_bytes()])?;
-        self.enter(index, record, start)?;
+        self.append_padded(&[&Record::Tile(record).to_bytes()])?;
+        self.add_entry(index, record, start)?;
         self.constants[slot] = Some(record);
         Ok(())
     }
 
-    /// Place in the index of a tile that is still to be written, and the frames it covers.
-    fn free_slot(&mut self, at: TileId) -> Result<(u64, u32)> {
+    /// Returns the position in the index of a tile that is not written yet, and the number of frames it covers.
+    fn unwritten_entry(&mut self, at: TileId) -> Result<(u64, u32)> {
         let Some(index) = self.layout.index_of(at).filter(|&index| index < self.tiles) else {
-            return Err(Error::usage(format!("there is nothing such as {at} after {} frames", self.times.len())));
+            return Err(Error::usage(format!("{at} does not exist after {} frames", self.times.len())));
         };
-        if self.is_entered(index)? {
+        if self.has_entry(index)? {
             return Err(Error::usage(format!("{at} was written already")));
         }
         let frames = self.layout.frame_range(at.frame_block, self.times.len() as u64);
         Ok((index, (frames.end - frames.start) as u32))
     }
 
-    fn is_entered(&mut self, index: u64) -> Result<bool> {
+    /// Returns whether entry `index` of the index file is filled.
+    fn has_entry(&mut self, index: u64) -> Result<bool> {
         let mut bytes = Vec::new();
-        let read = self.index.seek(SeekFrom::Start(RECORD * index));
-        let read = read.and_then(|_| (&self.index).take(RECORD).read_to_end(&mut bytes));
+        let read = self.index.seek(SeekFrom::Start(RECORD_BYTES * index));
+        let read = read.and_then(|_| (&self.index).take(RECORD_BYTES).read_to_end(&mut bytes));
         read.map_err(Error::io("read back the index of", &self.temporary))?;
         Ok(bytes.iter().any(|&byte| byte != 0))
     }
 
-    /// Enters a tile whose record was put at `start`, to which an error goes back.
-    fn enter(&mut self, index: u64, record: TileRecord, start: u64) -> Result<()> {
-        let written = self.index.seek(SeekFrom::Start(RECORD * index));
+    /// Adds the index entry of a tile whose record was appended at `start`. After an error the position is `start`
+    /// again.
+    fn add_entry(&mut self, index: u64, record: TileRecord, start: u64) -> Result<()> {
+        let written = self.index.seek(SeekFrom::Start(RECORD_BYTES * index));
         let written = written.and_then(|_| self.index.write_all(&Record::Tile(record).to_bytes()));
         written.map_err(|error| {
             self.position = start;
@@ -215,27 +218,27 @@ impl Writer {
         Ok(())
     }
 
-    /// Calls `each` with the index, some whole entries at a time.
-    fn index_pieces(&mut self, mut each: impl FnMut(&mut Writer, &[u8]) -> Result<()>) -> Result<()> {
-        let end = RECORD * self.tiles;
-        let mut piece = Vec::new();
-        for offset in (0..end).step_by(PIECE) {
-            piece.resize((end - offset).min(PIECE as u64) as usize, 0);
-            let read = self.index.seek(SeekFrom::Start(offset)).and_then(|_| self.index.read_exact(&mut piece));
+    /// Calls `each` with successive chunks of whole index entries.
+    fn for_each_index_chunk(&mut self, mut each: impl FnMut(&mut Writer, &[u8]) -> Result<()>) -> Result<()> {
+        let end = RECORD_BYTES * self.tiles;
+        let mut chunk = Vec::new();
+        for offset in (0..end).step_by(CHUNK_BYTES) {
+            chunk.resize((end - offset).min(CHUNK_BYTES as u64) as usize, 0);
+            let read = self.index.seek(SeekFrom::Start(offset)).and_then(|_| self.index.read_exact(&mut chunk));
             read.map_err(Error::io("read back the index of", &self.temporary))?;
-            each(self, &piece)?;
+            each(self, &chunk)?;
         }
         Ok(())
     }
 
-    /// Writes the footer, syncs, renames the file to its final name (replacing what was there) and syncs the
-    /// folder. Returns the digest of the content, see [`crate::Reader::digest`].
+    /// Writes the footer, syncs the file, renames it to its final name (replacing an existing file) and syncs the
+    /// folder. Returns the digest of the content; see [`crate::Reader::digest`].
     ///
-    /// Errors: a tile is missing. Nothing appears under the final name then.
+    /// Fails if a tile is missing; no file appears under the final name then.
     pub fn finish(mut self) -> Result<u64> {
         if self.written != self.tiles {
             let mut first = 0;
-            while self.is_entered(first)? {
+            while self.has_entry(first)? {
                 first += 1;
             }
             return Err(Error::usage(format!(
@@ -249,9 +252,9 @@ impl Writer {
         let mut checksum = Xxh3::new();
         checksum.update(&times);
         let mut digest = Digest::new(&self.header, &self.times);
-        self.index_pieces(|writer, piece| {
-            checksum.update(piece);
-            for entry in piece.as_chunks().0 {
+        self.for_each_index_chunk(|writer, chunk| {
+            checksum.update(chunk);
+            for entry in chunk.as_chunks().0 {
                 match Record::from_bytes(entry, 0) {
                     Ok(Record::Tile(tile)) => digest.tile(&tile),
                     _ => {
@@ -270,11 +273,12 @@ impl Writer {
             header_checksum: xxh3_64(&self.header),
         };
         let trailer = trailer_to_bytes(self.position);
-        // Times and index are multiples of 8 long; the trailer follows them without padding and ends the file.
-        self.put_exactly(&[&Record::Footer(footer).to_bytes(), &times])?;
-        self.index_pieces(|writer, piece| writer.put_exactly(&[piece]))?;
-        self.put_exactly(&[&trailer])?;
-        // Nothing that a failed write left may lie behind the end.
+        // Time stamps and index have lengths that are multiples of 8. The trailer follows them without padding and ends
+        // the file.
+        self.append(&[&Record::Footer(footer).to_bytes(), &times])?;
+        self.for_each_index_chunk(|writer, chunk| writer.append(&[chunk]))?;
+        self.append(&[&trailer])?;
+        // Cut bytes that a failed write may have left behind the end.
         self.file.set_len(self.position).map_err(Error::io("cut", &self.temporary))?;
         self.file.sync_all().map_err(Error::io("sync", &self.temporary))?;
         fs::rename(&self.temporary, &self.path).map_err(Error::io("rename", &self.temporary))?;
@@ -283,8 +287,8 @@ impl Writer {
         Ok(digest.value())
     }
 
-    /// Where the bytes of a constant tile already lie in the file, if they do. Equal checksums only
-    /// suggest it; the bytes are read back and compared.
+    /// Returns the offset of an equal payload already in the file for a constant tile, if there is one. Equal checksums
+    /// are only a hint; the bytes are read back and compared.
     fn shared_payload(&mut self, slot: usize, record: &TileRecord, bytes: &[u8]) -> Result<Option<u64>> {
         let Some(earlier) = self.constants[slot] else { return Ok(None) };
         if !record.may_share(&TileRecord { offset: record.offset, ..earlier }) {
@@ -296,15 +300,15 @@ impl Writer {
         Ok((self.stored == bytes).then_some(earlier.offset))
     }
 
-    /// Appends `parts` and the zeros that bring the next record to a multiple of 64.
-    fn put(&mut self, parts: &[&[u8]]) -> Result<()> {
+    /// Appends `parts`, then zeros up to the next multiple of 64.
+    fn append_padded(&mut self, parts: &[&[u8]]) -> Result<()> {
         let end = self.position + parts.iter().map(|part| part.len() as u64).sum::<u64>();
-        let zeros = [0; RECORD as usize];
-        self.put_exactly(&[parts, &[&zeros[..(align(end) - end) as usize]]].concat())
+        let zeros = [0; RECORD_BYTES as usize];
+        self.append(&[parts, &[&zeros[..(align(end) - end) as usize]]].concat())
     }
 
-    /// Appends `parts`. After an error the position is as before, so that the call may be repeated.
-    fn put_exactly(&mut self, parts: &[&[u8]]) -> Result<()> {
+    /// Appends `parts`. After an error the position is unchanged, so the call may be repeated.
+    fn append(&mut self, parts: &[&[u8]]) -> Result<()> {
         let written = self
             .file
             .seek(SeekFrom::Start(self.position))
@@ -318,13 +322,14 @@ impl Writer {
 impl Drop for Writer {
     fn drop(&mut self) {
         if !self.finished {
-            // Nobody is left to tell of a failure, and the name says that the file is temporary.
+            // A failure cannot be reported from here, and the name shows that the file is temporary.
             let _ = fs::remove_file(&self.temporary);
         }
     }
 }
 
-/// Checks that `times` are finite and strictly increasing and above `before`; the error names the first that is not.
+/// Checks that `times` are finite, strictly increasing and above `before`. The error holds the index of the first bad
+/// one and a description of it.
 pub(crate) fn check_times(before: Option<f64>, times: &[f64]) -> std::result::Result<(), (usize, String)> {
     let mut last = before;
     for (frame, &time) in times.iter().enumerate() {
@@ -339,7 +344,8 @@ pub(crate) fn check_times(before: Option<f64>, times: &[f64]) -> std::result::Re
     Ok(())
 }
 
-/// A new file in the folder of `path`, hidden, named after it and this process, ending in `.tmp`.
+/// Creates a hidden file in the folder of `path`, named after it and this process, ending in `.tmp`. Returns its path
+/// and the open file.
 fn create_beside(path: &Path) -> Result<(PathBuf, File)> {
     static COUNTER: AtomicU64 = AtomicU64::new(0);
     let Some(name) = path.file_name() else {
@@ -352,19 +358,19 @@ fn create_beside(path: &Path) -> Result<(PathBuf, File)> {
         hidden.push(format!(".{}-{number}.tmp", std::process::id()));
         let temporary = path.with_file_name(hidden);
         match OpenOptions::new().read(true).write(true).create_new(true).open(&temporary) {
-            // Left by a killed process that had the same number: take the next name.
+            // Left by a killed process that had the same id: try the next number.
             Err(error) if error.kind() == io::ErrorKind::AlreadyExists => continue,
             opened => return opened.map_err(Error::io("create", &temporary)).map(|file| (temporary, file)),
         }
     }
 }
 
-/// The folder a file lies in.
+/// Returns the folder that contains the file `path`.
 fn folder_of(path: &Path) -> &Path {
     path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."))
 }
 
-/// Makes a rename last through a power failure, where the system can.
+/// Syncs the folder of `path`, so that a rename survives a power failure on systems that support it.
 fn sync_folder(path: &Path) -> Result<()> {
     let folder = folder_of(path);
     splat_platform::sync_folder(folder).map_err(Error::io("sync", folder))

@@ -1,4 +1,4 @@
-//! Damaged files end in an error that names a byte, never in a panic, never in wrong data.
+//! Damaged files cause an error that names a byte; they never cause a panic or wrong data.
 
 mod scene;
 
@@ -9,7 +9,7 @@ use gseq::{Compression, Error, Reader, TileBuffer, TileFrames, TileId, Touched, 
 use scene::{Scene, layout};
 use xxhash_rust::xxh3::xxh3_64;
 
-/// Opens, verifies and reads everything; any error must name a place inside the file, or its end.
+/// Opens, verifies and reads everything. Checks that an error names a byte inside the file or its end.
 fn check(scene: &Scene, path: &Path, len: u64) -> Result<(), Error> {
     let checked = Reader::open(path).and_then(|reader| {
         let verified = reader.verify();
@@ -26,13 +26,14 @@ fn small_scene() -> Scene {
     Scene::new(layout(3, 2, 2, &[2, 1, 1]), 5, 11)
 }
 
-/// With tiles of some bytes, so that a bound pays, though not in all of them; and what comes back of it.
+/// Returns a scene with bounded columns and the same scene as it is read back. Its tiles are large enough that bounded
+/// encoding pays in some of them.
 fn bounded_scene(path: &Path) -> (Scene, Scene) {
     Scene::new(layout(40, 24, 4, &[2, 1, 1, 1]), 9, 11).bounded(1e-2, path)
 }
 
 #[test]
-fn a_flipped_bit_anywhere_is_an_error_and_never_wrong_data() {
+fn flipped_bit_anywhere_is_an_error() {
     let folder = scene::folder();
     let path = folder.path().join("a");
     let scenes = [
@@ -54,7 +55,7 @@ fn a_flipped_bit_anywhere_is_an_error_and_never_wrong_data() {
 }
 
 #[test]
-fn a_file_cut_anywhere_is_an_error_and_recover_saves_its_complete_frame_blocks() {
+fn cut_file_is_an_error_and_recover_saves_whole_blocks() {
     let folder = scene::folder();
     let [path, saved] = ["a", "saved"].map(|name| folder.path().join(name));
     let scene = small_scene();
@@ -62,8 +63,8 @@ fn a_file_cut_anywhere_is_an_error_and_recover_saves_its_complete_frame_blocks()
         scene.write(&path, compression, |_| ());
         let good = fs::read(&path).unwrap();
         let per_block = scene.tiles().len() / 3;
-        // Where the last tile of each frame block ends; shared payloads end with their record, which precedes the own
-        // payload of the block's last tile here.
+        // Offset where the last tile of each frame block ends. In this scene the block's last tile has a payload of its
+        // own, which lies behind all shared ones.
         let reader = Reader::open(&path).unwrap();
         let ends: Vec<u64> = (0..3)
             .map(|block| {
@@ -94,13 +95,13 @@ fn a_file_cut_anywhere_is_an_error_and_recover_saves_its_complete_frame_blocks()
 }
 
 #[test]
-fn recover_of_a_flipped_bit_saves_what_comes_before_it() {
+fn recover_saves_blocks_before_a_flipped_bit() {
     let folder = scene::folder();
     let [path, saved] = ["a", "saved"].map(|name| folder.path().join(name));
     for (written, scene) in [(small_scene(), small_scene()), bounded_scene(&path)] {
         written.write(&path, Compression::Zstd(1), |_| ());
         let good = fs::read(&path).unwrap();
-        // Behind the header and the zeros after it.
+        // Start after the header and its padding.
         for at in (256..good.len()).step_by(3) {
             let mut bad = good.clone();
             bad[at] ^= 0x10;
@@ -119,7 +120,7 @@ fn recover_of_a_flipped_bit_saves_what_comes_before_it() {
 }
 
 #[test]
-fn what_a_killed_writer_leaves_behind_is_recovered() {
+fn file_of_a_killed_writer_is_recovered() {
     let folder = scene::folder();
     let scene = small_scene();
     let mut writer = Writer::create(folder.path().join("a"), scene.layout.clone()).unwrap();
@@ -132,7 +133,8 @@ fn what_a_killed_writer_leaves_behind_is_recovered() {
     scene.compare(&Reader::open(&saved).unwrap(), 5).unwrap();
 }
 
-/// A hostile writer: changes bytes of an index entry and of its record, then makes every checksum agree again.
+/// Simulates a malicious writer: changes bytes of an index entry and of its record, then makes every checksum valid
+/// again.
 fn forge(good: &[u8], tile: usize, change: impl Fn(&mut [u8])) -> Vec<u8> {
     let mut bad = good.to_vec();
     let u64_at = |bytes: &[u8], at: usize| u64::from_le_bytes(bytes[at..at + 8].try_into().unwrap());
@@ -153,7 +155,7 @@ fn forge(good: &[u8], tile: usize, change: impl Fn(&mut [u8])) -> Vec<u8> {
 }
 
 #[test]
-fn hostile_index_entries_with_valid_checksums_are_refused() {
+fn forged_index_entries_are_refused() {
     let folder = scene::folder();
     let path = folder.path().join("a");
     let scene = Scene::new(layout(9, 9, 2, &[3, 1]), 4, 11);
@@ -189,14 +191,14 @@ fn hostile_index_entries_with_valid_checksums_are_refused() {
         assert!(check(&scene, &path, good.len() as u64).is_err(), "{name} passed");
         let unread = Reader::open(&path).is_err();
         assert_eq!(unread, name != "wrong statistics", "{name}: only statistics wait for verification");
-        // Whatever it makes of the record, what it saves is a container.
+        // Whether `recover` keeps the forged tile or not, its output must be a valid container.
         recover(&path, folder.path().join("saved")).unwrap();
         Reader::open(folder.path().join("saved")).unwrap().verify().unwrap();
     }
 }
 
 #[test]
-fn a_file_that_shrinks_under_the_map_ends_in_an_error() {
+fn shrinking_mapped_file_is_an_error() {
     let folder = scene::folder();
     let path = folder.path().join("a");
     for compression in [Compression::Raw, Compression::Zstd(1)] {
@@ -206,15 +208,15 @@ fn a_file_that_shrinks_under_the_map_ends_in_an_error() {
         let at = TileId { column: 0, gaussian_block: 0, frame_block: 1 };
         let (mut buffer, mut touched) = (TileBuffer::default(), Touched::default());
         reader.tile(at, &mut buffer).unwrap();
-        let mut ways = [true, false].map(|in_place| (in_place, TileFrames::default()));
-        for (in_place, frames) in &mut ways {
+        let mut loaded = [true, false].map(|in_place| (in_place, TileFrames::default()));
+        for (in_place, frames) in &mut loaded {
             reader.load(at, &mut buffer, frames, in_place.then_some(&mut touched)).unwrap();
         }
         fs::OpenOptions::new().write(true).open(&path).unwrap().set_len(4096).unwrap();
-        for (in_place, mut frames) in ways {
+        for (in_place, mut frames) in loaded {
             let next = match compression {
                 Compression::Raw => reader.read_frame(&mut frames, 1, &mut vec![0.0; 15_000]),
-                // The tile that was loaded is in memory.
+                // A compressed tile that was loaded is in memory, so load it again.
                 _ => reader.load(at, &mut buffer, &mut frames, in_place.then_some(&mut touched)),
             };
             assert!(matches!(next, Err(Error::Malformed { .. })), "in place {in_place}: {next:?}");
@@ -227,7 +229,7 @@ fn a_file_that_shrinks_under_the_map_ends_in_an_error() {
 }
 
 #[test]
-fn folders_and_empty_and_foreign_files_are_named_for_what_they_are() {
+fn error_names_folders_empty_and_foreign_files() {
     let folder = scene::folder();
     assert!(Reader::open(folder.path()).err().unwrap().to_string().contains("folder"));
     let path = folder.path().join("a");

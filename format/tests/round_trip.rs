@@ -1,4 +1,4 @@
-//! What goes in comes out, bit for bit, whatever the shape and the order of writing.
+//! Values are read back bit for bit, for every shape and order of writing.
 
 mod scene;
 
@@ -38,9 +38,9 @@ proptest! {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(64))]
 
-    /// What comes back lies within the bound, every way of reading gives the same, and bounds are declared in the file.
+    /// Values are within the bound, every method of reading returns the same, and the file declares the bounds.
     #[test]
-    fn columns_with_a_bound_come_back_within_it(
+    fn bounded_columns_are_within_their_bound(
         gaussians in 1u64..90, frames in 1usize..12, gaussian_block in 1u32..70, frame_block in 1u32..6,
         widths in prop::collection::vec(1u32..4, 2..4), seed: u64, max_error in 1e-4f64..1.0,
     ) {
@@ -63,7 +63,7 @@ proptest! {
 }
 
 #[test]
-fn a_tile_further_off_than_its_column_is_refused() {
+fn tile_with_larger_bound_than_column_is_refused() {
     let folder = scene::folder();
     let mut layout = layout(500, 500, 2, &[1]);
     layout.columns[0].max_error = 1e-3;
@@ -84,7 +84,7 @@ fn a_tile_further_off_than_its_column_is_refused() {
 }
 
 #[test]
-fn digest_ignores_the_order_of_writing_and_bytes_follow_it() {
+fn digest_ignores_write_order_but_bytes_do_not() {
     let folder = scene::folder();
     let [a, b, c] = ["a", "b", "c"].map(|name| folder.path().join(name));
     let scene = Scene::new(layout(30, 8, 3, &[3, 2, 1]), 7, 5);
@@ -98,9 +98,10 @@ fn digest_ignores_the_order_of_writing_and_bytes_follow_it() {
     assert_ne!(other.write(&b, Compression::Zstd(1), |_| ()), first, "a changed bit must change the digest");
 }
 
-/// The hash was recorded when version 1 was made (raw tiles: zstd has no part in it). If it changes, so does the version.
+/// The hash was recorded when version 1 was made. The tiles are raw, so zstd does not affect it. If the hash changes,
+/// the format version must change too.
 #[test]
-fn the_bytes_of_version_1_stay_as_they_are() {
+fn bytes_of_version_1_are_unchanged() {
     let folder = scene::folder();
     let path = folder.path().join("a");
     Scene::new(layout(30, 8, 3, &[3, 2, 1]), 7, 5).write(&path, Compression::Raw, |_| ());
@@ -123,8 +124,8 @@ fn a_column_that_never_changes_is_stored_once() {
 }
 
 #[test]
-fn motion_that_returns_to_where_it_began_is_kept() {
-    // Frame 8 is frame 0 again, in one block with all between.
+fn motion_that_returns_to_its_start_is_kept() {
+    // Frame 8 equals frame 0; all frames are in one block.
     let frames = 9;
     let folder = scene::folder();
     let path = folder.path().join("a");
@@ -145,7 +146,7 @@ fn motion_that_returns_to_where_it_began_is_kept() {
 }
 
 #[test]
-fn a_repeated_tile_is_the_tile_written_again() {
+fn repeated_tile_equals_tile_written_again() {
     let folder = scene::folder();
     let [a, b] = ["a", "b"].map(|name| folder.path().join(name));
     let tile = encode_tile(&[1.0, 2.0, 3.0], 1, 3, 1, Compression::Zstd(1)).unwrap();
@@ -198,7 +199,7 @@ fn threads_share_a_reader() {
 }
 
 #[test]
-fn raw_tiles_lie_aligned_in_the_file_and_are_used_in_place() {
+fn raw_tiles_are_aligned_and_used_in_place() {
     let folder = scene::folder();
     let path = folder.path().join("a");
     let scene = Scene::new(layout(7, 3, 2, &[3]), 4, 5);
@@ -214,7 +215,7 @@ fn raw_tiles_lie_aligned_in_the_file_and_are_used_in_place() {
 }
 
 #[test]
-fn reading_every_frame_counts_every_stored_byte_once_also_where_tiles_have_been_verified() {
+fn every_stored_byte_read_is_counted_once() {
     let folder = scene::folder();
     let path = folder.path().join("a");
     let scene = Scene::new(layout(7, 3, 2, &[3, 1]), 5, 5);
@@ -244,7 +245,7 @@ fn reading_every_frame_counts_every_stored_byte_once_also_where_tiles_have_been_
 }
 
 #[test]
-fn nothing_appears_under_the_final_name_before_the_end() {
+fn final_name_appears_only_at_the_end() {
     let folder = scene::folder();
     let path = folder.path().join("a");
     let scene = Scene::new(layout(5, 2, 2, &[3]), 4, 5);
@@ -257,7 +258,7 @@ fn nothing_appears_under_the_final_name_before_the_end() {
 }
 
 #[test]
-fn calls_that_make_no_sense_are_refused_and_leave_the_writer_usable() {
+fn invalid_calls_are_refused_and_writer_stays_usable() {
     let folder = scene::folder();
     let path = folder.path().join("a");
     let mut writer = Writer::create(&path, layout(2, 2, 3, &[1])).unwrap();

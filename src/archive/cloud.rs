@@ -1,7 +1,7 @@
-//! The canonical cloud, each attribute on its grid.
+//! Encodes the canonical Gaussians, each attribute on its own quantization grid.
 //!
-//! In: Gaussians and the steps of their attributes. Out: symbols, and the order in which the Gaussians come back: along
-//! a Morton curve, in which a position is told by how far it is from the one before.
+//! In: Gaussians and the steps of their attributes. Out: symbols, and the order in which the Gaussians are restored:
+//! along a Morton curve, where a position is stored as the distance along the curve from the previous one.
 
 use std::collections::BTreeMap;
 
@@ -13,37 +13,37 @@ use super::residual::Residuals;
 use super::step::QuantizationGrid;
 use crate::model::{Column, Columns, Gaussians, HIGHEST_DEGREE, sh_coefficients};
 
-/// Attributes with a step each, by place in [`CloudSteps`]: harmonics by degree.
+/// Attributes with a step each, in the order of [`CloudSteps`]; SH coefficients by degree.
 pub const ATTRIBUTES: [&str; 8] =
     ["position", "rotation", "log_scale", "opacity_logit", "sh_0", "sh_1", "sh_2", "sh_3"];
 
-/// The grid of each attribute; see [`super::step()`].
+/// Quantization step of each attribute; see [`super::step()`].
 pub type CloudSteps = [i32; ATTRIBUTES.len()];
 
-/// Values that one is expected from: the one before it, the mean of four before it, and the same Gaussian's in the two
-/// planes before.
-const NEIGHBOURS: usize = 4;
-/// Bits of an axis that the curve goes through.
+/// Number of values from which a value is predicted: the previous one, the mean of the previous four, and the values of
+/// the same Gaussian in the two previous planes.
+const NEIGHBORS: usize = 4;
+/// Bits per axis of the Morton curve.
 const CURVE_BITS: u32 = 21;
 
-/// What a cloud is, beside its symbols.
+/// Parameters of encoded Gaussians, without the symbols.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct PointCloudShape {
     pub(super) gaussians: usize,
     pub(super) sh_degree: usize,
     pub(super) steps: CloudSteps,
-    /// Least position on each axis, in steps.
+    /// Minimum position on each axis, in steps.
     pub(super) lowest: [i64; 3],
-    /// Low bits of a position that the curve does not go through.
+    /// Number of low bits of a position that are stored as plain bits and not used by the curve.
     pub(super) loose: u32,
     /// Mean of every plane after the positions, in steps.
     pub(super) means: Vec<i64>,
-    /// How values of every plane are expected.
-    pub(super) parts: Vec<PredictorWeights<NEIGHBOURS>>,
+    /// Predictor weights of every plane after the positions.
+    pub(super) parts: Vec<PredictorWeights<NEIGHBORS>>,
 }
 
-/// The planes after the positions: column, plane of it, and attribute.
+/// Returns the planes after the positions: attribute, plane in it, and index in [`ATTRIBUTES`].
 fn planes(sh_degree: usize) -> Vec<(Columns, usize, usize)> {
     let mut planes: Vec<_> = (0..4).map(|c| (Columns::ROTATION, c, 1)).collect();
     planes.extend((0..3).map(|c| (Columns::LOG_SCALE, c, 2)));
@@ -53,7 +53,7 @@ fn planes(sh_degree: usize) -> Vec<(Columns, usize, usize)> {
 }
 
 impl PointCloudShape {
-    /// Whether it goes together, whatever an archive says.
+    /// Checks that the numbers are consistent. Applies to shapes from untrusted files.
     pub(super) fn is_sound(&self) -> bool {
         self.sh_degree <= HIGHEST_DEGREE
             && self.means.len() == planes(self.sh_degree).len()
@@ -63,13 +63,13 @@ impl PointCloudShape {
             && self.gaussians <= u32::MAX as usize
     }
 
-    /// f32 values of all Gaussians.
+    /// Returns the number of f32 values of all Gaussians; `None` if it overflows.
     pub(super) fn values(&self) -> Option<usize> {
         self.gaussians.checked_mul(Columns::all().width(self.sh_degree))
     }
 }
 
-/// Bits of `x` three apart.
+/// Inserts two zero bits between consecutive bits of `x`.
 fn spread(x: u64) -> u64 {
     let mut x = x & ((1 << CURVE_BITS) - 1);
     for (shift, mask) in [
@@ -84,7 +84,7 @@ fn spread(x: u64) -> u64 {
     x
 }
 
-/// The reverse of [`spread`].
+/// Reverses [`spread`].
 fn gather(x: u64) -> u64 {
     let mut x = x & 0x1249_2492_4924_9249;
     for (shift, mask) in [
@@ -99,8 +99,8 @@ fn gather(x: u64) -> u64 {
     x
 }
 
-/// Positions on their grid above the lowest, the lowest, and the loose bits.
-fn on_grid(position: &Column, grid: QuantizationGrid) -> (Vec<[u64; 3]>, [i64; 3], u32) {
+/// Returns positions in steps above the minimum, the minimum, and the number of bits that the curve does not use.
+fn grid_positions(position: &Column, grid: QuantizationGrid) -> (Vec<[u64; 3]>, [i64; 3], u32) {
     let all: Vec<[i64; 3]> = (0..position.len()).map(|i| position.row(i).map(|x| grid.multiple(x))).collect();
     let lowest = [0, 1, 2].map(|axis| all.iter().map(|p| p[axis]).min().unwrap_or(0));
     let above: Vec<[u64; 3]> = all.iter().map(|p| [0, 1, 2].map(|axis| p[axis].abs_diff(lowest[axis]))).collect();
@@ -108,27 +108,28 @@ fn on_grid(position: &Column, grid: QuantizationGrid) -> (Vec<[u64; 3]>, [i64; 3
     (above, lowest, (64 - most.leading_zeros()).saturating_sub(CURVE_BITS))
 }
 
-fn on_curve(place: &[u64; 3], loose: u32) -> u64 {
+/// Returns the index of a grid position along the Morton curve.
+fn curve_index(place: &[u64; 3], loose: u32) -> u64 {
     let [x, y, z] = place.map(|x| spread(x >> loose));
     x | y << 1 | z << 2
 }
 
-/// Writes a cloud; gives its shape, the symbols, and the ids of the Gaussians in their new order.
-/// The bits of every attribute are added to `bits`.
+/// Encodes Gaussians. Returns the parameters, the symbols, and the ids of the Gaussians in their new order. Adds the
+/// approximate number of bits of every attribute to `bits`.
 pub(super) fn encode(
     cloud: &Gaussians,
     steps: &CloudSteps,
     bits: &mut BTreeMap<String, f64>,
 ) -> (PointCloudShape, Vec<u8>, Vec<u32>) {
     let mut encoder = SymbolEncoder::default();
-    let (places, lowest, loose) = on_grid(&cloud.position, QuantizationGrid::new(steps[0]));
+    let (places, lowest, loose) = grid_positions(&cloud.position, QuantizationGrid::new(steps[0]));
     let mut order: Vec<u32> = (0..cloud.len() as u32).collect();
-    // Stable: ties by id.
-    order.sort_by_key(|&id| on_curve(&places[id as usize], loose));
-    let (mut lengths, mut before) = (RunLengths::new(), 0);
+    // The sort is stable: ties stay in the order of ids.
+    order.sort_by_key(|&id| curve_index(&places[id as usize], loose));
+    let (mut lengths, mut before) = (CurveDistances::new(), 0);
     for &id in &order {
         let place = &places[id as usize];
-        let at = on_curve(place, loose);
+        let at = curve_index(place, loose);
         lengths.encode(at - before, &mut encoder);
         before = at;
         place.iter().for_each(|&x| encoder.long_bits(x, loose));
@@ -144,7 +145,7 @@ pub(super) fn encode(
         means: Vec::new(),
         parts: Vec::new(),
     };
-    let mut walk = PlaneWalker::new(cloud.len());
+    let mut coder = PlaneCoder::new(cloud.len());
     for (column, c, attribute) in planes {
         let grid = QuantizationGrid::new(steps[attribute]);
         let plane = cloud.column(column).plane(c);
@@ -152,14 +153,14 @@ pub(super) fn encode(
         let sum: i128 = multiples.iter().map(|&multiple| i128::from(multiple)).sum();
         let mean = (sum / multiples.len().max(1) as i128) as i64;
         let mut fit = PredictorFit::new();
-        walk.clone().plane(attribute, grid, mean, |i, around, _, _| {
+        coder.clone().plane(attribute, grid, mean, |i, around, _, _| {
             fit.add(around, grid.value(multiples[i]) - grid.value(mean));
             (multiples[i], 0)
         });
         let parts = fit.parts();
         let factors = factors(&parts);
         let before = encoder.cost();
-        walk.plane(attribute, grid, mean, |i, around, size, models| {
+        coder.plane(attribute, grid, mean, |i, around, size, models| {
             let expected = grid.nearest(f64::from(expected(grid.value(mean), &factors, around)));
             let residual = multiples[i] - expected;
             models.encode(residual, size, &mut encoder);
@@ -172,12 +173,12 @@ pub(super) fn encode(
     (shape, encoder.finish(), order)
 }
 
-/// Reads a cloud; none where the bytes are of another.
+/// Decodes Gaussians; `None` if the bytes do not match `shape`.
 pub(super) fn decode(shape: &PointCloudShape, bytes: &[u8]) -> Option<Gaussians> {
     let mut decoder = SymbolDecoder::new(bytes)?;
     let mut cloud = Gaussians::zeros(shape.gaussians, shape.sh_degree);
     let grid = QuantizationGrid::new(shape.steps[0]);
-    let (mut lengths, mut at) = (RunLengths::new(), 0u64);
+    let (mut lengths, mut at) = (CurveDistances::new(), 0u64);
     for i in 0..shape.gaussians {
         at = at.wrapping_add(lengths.decode(&mut decoder));
         let place = [0, 1, 2].map(|axis| {
@@ -186,13 +187,13 @@ pub(super) fn decode(shape: &PointCloudShape, bytes: &[u8]) -> Option<Gaussians>
         });
         cloud.position.set_row(i, place);
     }
-    let mut walk = PlaneWalker::new(shape.gaussians);
+    let mut coder = PlaneCoder::new(shape.gaussians);
     for (k, (column, c, attribute)) in planes(shape.sh_degree).into_iter().enumerate() {
         let grid = QuantizationGrid::new(shape.steps[attribute]);
         let mean = shape.means[k];
         let factors = factors(&shape.parts[k]);
         let plane = cloud.column_mut(column).plane_mut(c);
-        walk.plane(attribute, grid, mean, |i, around, size, models| {
+        coder.plane(attribute, grid, mean, |i, around, size, models| {
             let expected = grid.nearest(f64::from(expected(grid.value(mean), &factors, around)));
             let residual = models.decode(size, &mut decoder);
             let multiple = expected.wrapping_add(residual);
@@ -203,17 +204,20 @@ pub(super) fn decode(shape: &PointCloudShape, bytes: &[u8]) -> Option<Gaussians>
     decoder.is_finished().then_some(cloud)
 }
 
-/// Distances along the curve: how many bits they have as two symbols, and the bits below the first.
-struct RunLengths {
+/// Models of distances along the curve: the number of bits of a distance is coded as two symbols; the bits below the
+/// highest one are plain.
+struct CurveDistances {
     high: SymbolModel,
     low: [SymbolModel; 4],
 }
 
-impl RunLengths {
-    fn new() -> RunLengths {
-        RunLengths { high: SymbolModel::NEW, low: [const { SymbolModel::NEW }; 4] }
+impl CurveDistances {
+    /// Returns models that have seen nothing.
+    fn new() -> CurveDistances {
+        CurveDistances { high: SymbolModel::NEW, low: [const { SymbolModel::NEW }; 4] }
     }
 
+    /// Writes a distance.
     fn encode(&mut self, distance: u64, to: &mut SymbolEncoder) {
         let length = 64 - distance.leading_zeros();
         to.symbol(&mut self.high, length as usize / SYMBOLS);
@@ -221,6 +225,7 @@ impl RunLengths {
         to.long_bits(distance, length.saturating_sub(1));
     }
 
+    /// Reads a distance.
     fn decode(&mut self, from: &mut SymbolDecoder<'_>) -> u64 {
         let high = from.symbol(&mut self.high) & 3;
         let length = (high * SYMBOLS + from.symbol(&mut self.low[high])) as u32;
@@ -229,33 +234,34 @@ impl RunLengths {
     }
 }
 
-/// Goes through one plane after another.
+/// State carried from plane to plane while all planes are coded.
 #[derive(Clone)]
-struct PlaneWalker {
-    /// Differences from their mean in the plane before and the one before that.
+struct PlaneCoder {
+    /// Differences from the mean in the previous plane and in the one before it.
     known: [Vec<f32>; 2],
-    /// How far values of an attribute were from what was expected, in steps: of late, by Gaussian.
+    /// Recent prediction errors of each Gaussian in steps, as a moving average.
     sizes: Vec<f32>,
-    /// The attribute, and the models that its planes share.
+    /// Attribute of the current plane; its planes share the models.
     attribute: usize,
     models: Residuals,
 }
 
-impl PlaneWalker {
-    fn new(count: usize) -> PlaneWalker {
+impl PlaneCoder {
+    /// Returns the state before the first plane of `count` Gaussians.
+    fn new(count: usize) -> PlaneCoder {
         let none = || vec![0.0; count];
-        PlaneWalker { known: [none(), none()], sizes: none(), attribute: usize::MAX, models: Residuals::new() }
+        PlaneCoder { known: [none(), none()], sizes: none(), attribute: usize::MAX, models: Residuals::new() }
     }
 
-    /// Visits every Gaussian of a plane. `code` is given what lies around, how large differences were there, in steps,
-    /// and the models; it gives the multiple of the Gaussian and how far that is from what was expected.
+    /// Visits every Gaussian of a plane. `code` receives the index, the values to predict from, the expected size of
+    /// the error in steps, and the models. It returns the multiple of the step and its difference from the prediction.
     #[inline(always)]
     fn plane(
         &mut self,
         attribute: usize,
         grid: QuantizationGrid,
         mean: i64,
-        mut code: impl FnMut(usize, &[f32; NEIGHBOURS], f32, &mut Residuals) -> (i64, i64),
+        mut code: impl FnMut(usize, &[f32; NEIGHBORS], f32, &mut Residuals) -> (i64, i64),
     ) {
         if self.attribute != attribute {
             (self.attribute, self.models) = (attribute, Residuals::new());
@@ -264,8 +270,8 @@ impl PlaneWalker {
         let [one, two] = &mut self.known;
         let (mut last, mut size) = ([0.0f32; 4], 0.0f32);
         for (i, own) in self.sizes.iter_mut().enumerate() {
-            let of_four = (last[0] + last[1] + last[2] + last[3]) * 0.25;
-            let around = [last[0], of_four, one[i], two[i]];
+            let mean_of_four = (last[0] + last[1] + last[2] + last[3]) * 0.25;
+            let around = [last[0], mean_of_four, one[i], two[i]];
             let (multiple, residual) = code(i, &around, (size + *own) * 0.5, &mut self.models);
             let off = residual.unsigned_abs() as f32;
             last = [grid.value(multiple) - mean, last[0], last[1], last[2]];
@@ -277,7 +283,7 @@ impl PlaneWalker {
     }
 }
 
-/// Puts the values of `attributes` on their grids.
+/// Rounds the values of `attributes` to their grids.
 pub(super) fn round(cloud: &mut Gaussians, steps: &CloudSteps, attributes: &[usize]) {
     let positions = (0..3).map(|c| (Columns::POSITION, c, 0));
     for (column, c, attribute) in positions.chain(planes(cloud.sh_degree())) {
@@ -288,7 +294,7 @@ pub(super) fn round(cloud: &mut Gaussians, steps: &CloudSteps, attributes: &[usi
     }
 }
 
-/// The values of an attribute.
+/// Returns the values of an attribute.
 pub(super) fn values(cloud: &Gaussians, attribute: usize) -> impl Iterator<Item = f32> {
     let positions = (0..3).map(|c| (Columns::POSITION, c, 0));
     let own = positions.chain(planes(cloud.sh_degree())).filter(move |plane| plane.2 == attribute);

@@ -1,33 +1,36 @@
-//! Numbers as few bits: adaptive models of sixteen symbols, coded by an asymmetric numeral system, beside bits as they
-//! are.
+//! Entropy coder: adaptive models of sixteen symbols, coded by an asymmetric numeral system (ANS), next to a stream of
+//! plain bits.
 //!
-//! In: symbols with the models that expect them. Out: words. A model learns from every symbol alike in both
-//! directions, so nothing of it is stored. Memory: 4 bytes a symbol while encoding.
-//! Source: J. Duda, "Asymmetric numeral systems", 2013; what the models learn is F. Giesen's mix of distributions.
+//! In: symbols with the models that predict them. Out: words. Encoder and decoder update the models alike, so models
+//! are not stored. Memory: 4 bytes per symbol while encoding. Source: J. Duda, "Asymmetric numeral systems", 2013;
+//! models are updated by F. Giesen's mixing of distributions.
 
-/// Probabilities are parts of `1 << PRECISION`.
+/// Bits of a probability: probabilities are multiples of 1/2^15.
 const PRECISION: u32 = 15;
+/// Sum of all probabilities less one; the sum itself does not fit into i16.
 const TOTAL: i16 = i16::MAX;
-/// Symbols of a model.
+/// Number of symbols of a model.
 pub(super) const SYMBOLS: usize = 16;
-/// Least part of a symbol, so that none is ever impossible.
-const FLOOR: i16 = 8;
-/// The state of the coder stays at or above it.
-const LOW: u64 = 1 << 31;
-/// How fast a model learns: by a part of `1 << rate` of what it is off, slower the more it has seen.
+/// Minimum probability of a symbol, in units of 1/2^15, so that no symbol becomes impossible.
+const MIN_PROBABILITY: i16 = 8;
+/// Lower bound of the state of the coder.
+const MIN_STATE: u64 = 1 << 31;
+/// Initial learning rate of a model: it moves by 1/2^rate of its error, and slows down as it sees more symbols.
 const FIRST_RATE: u32 = 3;
+/// Final learning rate of a model.
 const LAST_RATE: u32 = 7;
 
-/// Where a model would put the starts of its symbols if it knew that one is next, by symbol.
-const KNOWN: [[i16; SYMBOLS]; SYMBOLS] = {
+/// Cumulative probabilities of a model that is certain of the next symbol, by that symbol.
+const CERTAIN_STARTS: [[i16; SYMBOLS]; SYMBOLS] = {
     let mut known = [[0; SYMBOLS]; SYMBOLS];
     let mut symbol = 0;
     while symbol < SYMBOLS {
         let mut i = 0;
         while i < SYMBOLS {
-            let below = i as i16 * FLOOR;
-            // `TOTAL` is one short of the whole, which has no i16.
-            known[symbol][i] = if i <= symbol { below } else { TOTAL - (SYMBOLS as i16 - i as i16) * FLOOR + 1 };
+            let below = i as i16 * MIN_PROBABILITY;
+            // `TOTAL` is one less than the sum, which does not fit into i16.
+            known[symbol][i] =
+                if i <= symbol { below } else { TOTAL - (SYMBOLS as i16 - i as i16) * MIN_PROBABILITY + 1 };
             i += 1;
         }
         symbol += 1;
@@ -35,15 +38,17 @@ const KNOWN: [[i16; SYMBOLS]; SYMBOLS] = {
     known
 };
 
-/// What is expected of a symbol.
+/// Adaptive probabilities of the next symbol.
 #[derive(Debug, Clone)]
 pub(super) struct SymbolModel {
-    /// Sums of the parts of all symbols before each.
+    /// Cumulative probability of all symbols before each symbol.
     starts: [i16; SYMBOLS],
+    /// Number of symbols seen so far.
     seen: u32,
 }
 
 impl SymbolModel {
+    /// Uniform distribution, before any symbol.
     pub(super) const NEW: SymbolModel = {
         let mut starts = [0; SYMBOLS];
         let mut i = 0;
@@ -54,88 +59,91 @@ impl SymbolModel {
         SymbolModel { starts, seen: 0 }
     };
 
-    /// Start and part of a symbol.
-    fn part(&self, symbol: usize) -> (u32, u32) {
+    /// Returns the cumulative probability before a symbol, and its own probability.
+    fn interval(&self, symbol: usize) -> (u32, u32) {
         let start = self.starts[symbol] as u32;
         let end = self.starts.get(symbol + 1).map_or(1 << PRECISION, |&end| end as u32);
         (start, end - start)
     }
 
-    /// Parts keep at least `FLOOR`: two starts move toward places that are so far apart, by the same share of the way.
+    /// Updates the model with a symbol. Probabilities stay at least `MIN_PROBABILITY`: neighboring starts move by the same
+    /// fraction toward targets that are at least that far apart.
     fn learn(&mut self, symbol: usize) {
         let rate = (FIRST_RATE + self.seen / 8).min(LAST_RATE);
         self.seen = self.seen.saturating_add(1);
-        for (start, known) in self.starts.iter_mut().zip(&KNOWN[symbol]) {
+        for (start, known) in self.starts.iter_mut().zip(&CERTAIN_STARTS[symbol]) {
             *start += (known - *start) >> rate;
         }
     }
 }
 
-/// Writes symbols and bits.
+/// Writer of symbols and bits.
 #[derive(Debug, Default)]
 pub(super) struct SymbolEncoder {
     symbols: Vec<(u16, u16)>,
     bits: Vec<u8>,
-    waiting: u64,
-    waiting_bits: u32,
-    /// Bits of what was written so far, about.
+    pending: u64,
+    pending_bits: u32,
+    /// Approximate number of bits written so far.
     cost: f64,
 }
 
 impl SymbolEncoder {
-    /// Bits of what was written so far, about.
+    /// Returns the approximate number of bits written so far.
     pub(super) fn cost(&self) -> f64 {
         self.cost
     }
 
+    /// Writes a symbol and updates its model.
     pub(super) fn symbol(&mut self, model: &mut SymbolModel, symbol: usize) {
-        let (start, part) = model.part(symbol);
-        self.cost += f64::from(PRECISION) - f64::from(part).log2();
-        self.symbols.push((start as u16, part as u16));
+        let (start, interval) = model.interval(symbol);
+        self.cost += f64::from(PRECISION) - f64::from(interval).log2();
+        self.symbols.push((start as u16, interval as u16));
         model.learn(symbol);
     }
 
-    /// The low `count` bits of `value`, at most 32.
+    /// Writes the low `count` bits of `value`, at most 32.
     pub(super) fn bits(&mut self, value: u64, count: u32) {
-        self.waiting |= (value & ((1 << count) - 1)) << self.waiting_bits;
-        self.waiting_bits += count;
+        self.pending |= (value & ((1 << count) - 1)) << self.pending_bits;
+        self.pending_bits += count;
         self.cost += f64::from(count);
-        while self.waiting_bits >= 8 {
-            self.bits.push(self.waiting as u8);
-            self.waiting >>= 8;
-            self.waiting_bits -= 8;
+        while self.pending_bits >= 8 {
+            self.bits.push(self.pending as u8);
+            self.pending >>= 8;
+            self.pending_bits -= 8;
         }
     }
 
-    /// A number below 2^63 of whose magnitude nothing is known: of one more, how many bits follow the first, and these.
+    /// Writes a number below 2^63 of unknown magnitude: for the number plus one, how many bits follow its first bit,
+    /// and these bits.
     pub(super) fn number(&mut self, value: u64) {
         let length = 64 - (value + 1).leading_zeros();
         self.bits(u64::from(length - 1), 6);
         self.long_bits(value + 1, length - 1);
     }
 
-    /// The low `count` bits of `value`, at most 63.
+    /// Writes the low `count` bits of `value`, at most 63.
     pub(super) fn long_bits(&mut self, value: u64, count: u32) {
         let low = count.min(32);
         self.bits(value, low);
         self.bits(value >> 32, count - low);
     }
 
-    /// The words of the symbols with their length in front, and the bits.
+    /// Returns the length of the words, the words of the symbols, and the bits.
     pub(super) fn finish(mut self) -> Vec<u8> {
-        if self.waiting_bits > 0 {
-            self.bits.push(self.waiting as u8);
+        if self.pending_bits > 0 {
+            self.bits.push(self.pending as u8);
         }
-        // The last symbol goes in first: the decoder takes them from the top.
-        let mut state = LOW;
+        // ANS is last in, first out: encoding in reverse lets the decoder read symbols in order.
+        let mut state = MIN_STATE;
         let mut words: Vec<u32> = Vec::new();
-        for &(start, part) in self.symbols.iter().rev() {
-            let (start, part) = (u64::from(start), u64::from(part));
-            if state >= (LOW >> PRECISION << 32) * part {
+        for &(start, interval) in self.symbols.iter().rev() {
+            let (start, interval) = (u64::from(start), u64::from(interval));
+            if state >= (MIN_STATE >> PRECISION << 32) * interval {
                 words.push(state as u32);
                 state >>= 32;
             }
-            state = ((state / part) << PRECISION) + state % part + start;
+            state = ((state / interval) << PRECISION) + state % interval + start;
         }
         words.extend([state as u32, (state >> 32) as u32]);
         let mut out = Vec::with_capacity(8 + 4 * words.len() + self.bits.len());
@@ -146,36 +154,39 @@ impl SymbolEncoder {
     }
 }
 
-/// Reads what [`SymbolEncoder`] wrote. Bytes that are no such thing give other symbols, and a [`SymbolDecoder::is_finished`] that is false.
+/// Reader of the output of [`SymbolEncoder`]. Other bytes give arbitrary symbols, and [`SymbolDecoder::is_finished`] is
+/// false at the end.
 #[derive(Debug)]
 pub(super) struct SymbolDecoder<'a> {
     state: u64,
     words: std::slice::Iter<'a, [u8; 4]>,
     bits: &'a [u8],
-    waiting: u64,
-    waiting_bits: u32,
+    pending: u64,
+    pending_bits: u32,
+    /// Whether more words were needed than there are.
     is_short: bool,
 }
 
 impl<'a> SymbolDecoder<'a> {
-    /// None where the lengths do not fit.
+    /// Returns a decoder of `bytes`; `None` if the lengths do not fit.
     pub(super) fn new(bytes: &'a [u8]) -> Option<SymbolDecoder<'a>> {
         let (length, rest) = bytes.split_first_chunk::<8>()?;
         let (words, bits) = rest.split_at_checked(usize::try_from(u64::from_le_bytes(*length)).ok()?)?;
         let ([head, words @ ..], []) = words.as_chunks::<4>() else { return None };
         let (second, words) = words.split_first()?;
         let state = u64::from(u32::from_le_bytes(*head)) << 32 | u64::from(u32::from_le_bytes(*second));
-        Some(SymbolDecoder { state, words: words.iter(), bits, waiting: 0, waiting_bits: 0, is_short: false })
+        Some(SymbolDecoder { state, words: words.iter(), bits, pending: 0, pending_bits: 0, is_short: false })
     }
 
+    /// Reads a symbol and updates its model.
     #[inline(always)]
     pub(super) fn symbol(&mut self, model: &mut SymbolModel) -> usize {
         let place = (self.state & ((1 << PRECISION) - 1)) as i16;
         let at_or_below: i16 = model.starts.iter().map(|&start| i16::from(start <= place)).sum();
         let symbol = (at_or_below as usize - 1) & (SYMBOLS - 1);
-        let (start, part) = model.part(symbol);
-        self.state = u64::from(part) * (self.state >> PRECISION) + u64::from(place as u32 - start);
-        if self.state < LOW {
+        let (start, interval) = model.interval(symbol);
+        self.state = u64::from(interval) * (self.state >> PRECISION) + u64::from(place as u32 - start);
+        if self.state < MIN_STATE {
             let word = self.words.next().map_or_else(
                 || {
                     self.is_short = true;
@@ -189,43 +200,46 @@ impl<'a> SymbolDecoder<'a> {
         symbol
     }
 
-    /// So many bits, at most 32.
+    /// Reads `count` bits, at most 32.
     #[inline(always)]
     pub(super) fn bits(&mut self, count: u32) -> u64 {
-        if self.waiting_bits < count {
+        if self.pending_bits < count {
             self.fill();
         }
-        let value = self.waiting & ((1 << count) - 1);
-        self.waiting >>= count;
-        self.waiting_bits -= count;
+        let value = self.pending & ((1 << count) - 1);
+        self.pending >>= count;
+        self.pending_bits -= count;
         value
     }
 
+    /// Refills the buffer of bits.
     #[inline(never)]
     fn fill(&mut self) {
-        while self.waiting_bits <= 56 {
-            // Beyond the last one there are zeros: a checksum has seen all bytes before.
+        while self.pending_bits <= 56 {
+            // Zeros follow the last byte; a checksum has verified that all bytes are present.
             let (&byte, rest) = self.bits.split_first().unwrap_or((&0, &[]));
             self.bits = rest;
-            self.waiting |= u64::from(byte) << self.waiting_bits;
-            self.waiting_bits += 8;
+            self.pending |= u64::from(byte) << self.pending_bits;
+            self.pending_bits += 8;
         }
     }
 
+    /// Reads a number written by [`SymbolEncoder::number`].
     pub(super) fn number(&mut self) -> u64 {
         let follow = self.bits(6) as u32;
         (1 << follow | self.long_bits(follow)) - 1
     }
 
+    /// Reads `count` bits, at most 63.
     pub(super) fn long_bits(&mut self, count: u32) -> u64 {
         let low = count.min(32);
         let value = self.bits(low);
         value | self.bits(count - low) << 32
     }
 
-    /// Whether everything was read, no more and no less.
+    /// Returns whether exactly the written symbols and bits were read.
     pub(super) fn is_finished(&self) -> bool {
-        !self.is_short && self.state == LOW && self.words.len() == 0 && self.bits.is_empty()
+        !self.is_short && self.state == MIN_STATE && self.words.len() == 0 && self.bits.is_empty()
     }
 }
 
@@ -236,7 +250,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn symbols_and_bits_come_back_in_their_order(
+        fn symbols_and_bits_are_read_back_in_order(
             items in prop::collection::vec((0usize..SYMBOLS, 0usize..3, any::<u64>(), 0u32..64), 0..2000)
         ) {
             let mut models = vec![SymbolModel::NEW; 3];
@@ -258,7 +272,7 @@ mod tests {
         }
 
         #[test]
-        fn any_bytes_decode_to_something_without_a_panic(bytes in prop::collection::vec(any::<u8>(), 0..200)) {
+        fn decoding_any_bytes_never_panics(bytes in prop::collection::vec(any::<u8>(), 0..200)) {
             if let Some(mut decoder) = SymbolDecoder::new(&bytes) {
                 let mut model = SymbolModel::NEW;
                 for _ in 0..300 {
@@ -273,16 +287,17 @@ mod tests {
             let mut model = SymbolModel::NEW;
             for symbol in symbols {
                 model.learn(symbol);
-                for of in 0..SYMBOLS {
-                    prop_assert!(model.part(of).1 >= FLOOR as u32, "{:?}", model.starts);
+                for other in 0..SYMBOLS {
+                    prop_assert!(model.interval(other).1 >= MIN_PROBABILITY as u32, "{:?}", model.starts);
                 }
             }
         }
     }
 
     #[test]
-    fn a_skewed_source_takes_its_entropy() {
-        // Three quarters of one symbol, the rest even over three others: H = 0.75·log2(4/3) + 0.25·log2(12) = 1.2075.
+    fn a_skewed_source_needs_about_its_entropy() {
+        // Three quarters are one symbol, the rest is spread evenly over three others: H = 0.75·log2(4/3) +
+        // 0.25·log2(12) = 1.2075.
         let mut encoder = SymbolEncoder::default();
         let mut model = SymbolModel::NEW;
         let mut random = 1u64;

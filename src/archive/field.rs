@@ -1,78 +1,78 @@
-//! The tensors of a deformation field, each on its grid.
+//! Encodes the tensors of a deformation field, each on its own quantization grid.
 //!
-//! In: a state dict, what of it is read and how, the stored positions. Out: symbols and a table of tensors. Planes store
-//! the texels that some Gaussian reads at some time, on finer grids where more of what is read is theirs; matrices store
-//! all of their values; what nothing reads comes back as zeros.
+//! In: a state dict, the roles of its tensors, the stored positions. Out: symbols and a table of tensors. Planes store
+//! only the texels that some Gaussian reads at some time, with finer steps where a texel is read more. Matrices store
+//! all of their values. Tensors that nothing reads are restored as zeros.
 
 use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
 use super::entropy::{SymbolDecoder, SymbolEncoder};
-use super::lattice::{NEIGHBOURS, QuantizedTensor};
 use super::predict::PredictorWeights;
+use super::quantized_tensor::{NEIGHBORS, QuantizedTensor};
 use super::residual::Residuals;
 use super::step::QuantizationGrid;
 use super::texels;
 use crate::deform::{Box3, Tensor, Tensors};
 use crate::model::Column;
 
-/// Eighths of an octave by which a grid is finer for each octave that more is read of a texel: the square of its error
-/// counts by that.
+/// Eighths of an octave by which the step of a texel is finer for each octave of its summed squared read weights, by
+/// which its squared error counts.
 const FINER_PER_OCTAVE: i32 = 4;
 
-/// Class of a weight to whose step nothing is added; others by so many eighths of an octave.
-const MIDDLE: u8 = 100;
+/// Class of a weight whose step has no offset; other classes differ from it by the offset in eighths of an octave.
+const ZERO_OFFSET_CLASS: u8 = 100;
 
-/// What a tensor is to those that read it.
+/// Use of a tensor by the deformation field.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Role {
-    /// `[1, channels, size_b, size_a]` over two axes of space: (a, b).
+    /// Plane `[1, channels, size_b, size_a]` over two spatial axes (a, b).
     Plane([usize; 2]),
-    /// `[1, channels, times, size]` over an axis of space and time.
+    /// Plane `[1, channels, times, size]` over a spatial axis and time.
     TimePlane(usize),
     /// Weights: `[outputs, inputs]` or any other shape.
     Weights,
-    /// Kept to the bit.
+    /// Values stored bit for bit.
     Exact,
-    /// Read by nobody.
+    /// Values that are never used; not stored.
     Unread,
 }
 
-/// A tensor in the archive's table.
+/// Entry of a tensor in the table of an archive.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct TensorEntry {
     pub(super) name: String,
     pub(super) shape: Vec<usize>,
     pub(super) role: Role,
-    /// Its grid; see [`super::step()`].
+    /// Quantization step; see [`super::step()`].
     pub(super) step: i32,
-    /// What is added to it: by channel of a plane, by row and then by column of a matrix; none: nothing.
+    /// Offsets added to the step: by channel of a plane, by row and then by column of a matrix; empty: none.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub(super) channels: Vec<i8>,
-    /// Its mean, in steps.
+    /// Mean of the values, in steps.
     pub(super) mean: i64,
-    /// How its values are expected from their neighbors.
-    pub(super) parts: PredictorWeights<NEIGHBOURS>,
+    /// Weights by which values are predicted from their neighbors.
+    pub(super) parts: PredictorWeights<NEIGHBORS>,
 }
 
-/// How finely tensors are to be stored, by name.
+/// Quantization steps of the tensors, by name.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct FieldSteps(pub BTreeMap<String, TensorSteps>);
 
-/// How finely a tensor is to be stored.
+/// Quantization step of a tensor, with offsets.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct TensorSteps {
-    /// Its grid; see [`super::step()`].
+    /// Quantization step; see [`super::step()`].
     pub step: i32,
-    /// What is added to it: by channel of a plane, by row and then by column of a matrix, by place of any other tensor of
-    /// weights; none: nothing.
+    /// Offsets added to the step: by channel of a plane, by row and then by column of a matrix, by element of any other
+    /// tensor of weights; empty: none.
     pub channels: Vec<i8>,
 }
 
-/// Where planes are read.
+/// Positions and times at which planes are read.
 #[derive(Debug)]
 pub(super) struct Readers<'a> {
     pub(super) position: &'a Column,
@@ -82,18 +82,19 @@ pub(super) struct Readers<'a> {
 }
 
 impl TensorEntry {
+    /// Returns the entry of a tensor before its mean and predictor are known.
     pub(super) fn new(name: &str, tensor: &Tensor, role: Role, steps: Option<&TensorSteps>) -> TensorEntry {
         let TensorSteps { step, channels } = steps.cloned().unwrap_or_default();
         let (name, shape) = (name.to_owned(), tensor.shape.clone());
-        TensorEntry { name, shape, role, step, channels, mean: 0, parts: [0; NEIGHBOURS] }
+        TensorEntry { name, shape, role, step, channels, mean: 0, parts: [0; NEIGHBORS] }
     }
 
-    /// Values, unless so many have no number.
+    /// Returns the number of values; `None` if it overflows.
     pub(super) fn values(&self) -> Option<usize> {
         self.shape.iter().try_fold(1usize, |product, &extent| product.checked_mul(extent))
     }
 
-    /// Channels, rows and columns.
+    /// Returns the numbers of channels, rows and columns.
     fn extents(&self) -> [usize; 3] {
         match (self.role, &self.shape[..]) {
             (Role::Plane(_) | Role::TimePlane(_), &[_, channels, rows, columns]) => [channels, rows, columns],
@@ -102,13 +103,13 @@ impl TensorEntry {
         }
     }
 
-    /// Whether shape, role and grids go together, whatever an archive says.
+    /// Checks that shape, role and steps are consistent. Applies to entries from untrusted files.
     pub(super) fn is_sound(&self) -> bool {
         let plane = |axes: &[usize]| {
             self.shape.len() == 4
                 && self.shape[0] == 1
                 && axes.iter().all(|&axis| axis < 3)
-                // Up to there f32 holds every whole number.
+                // f32 represents every whole number up to this size.
                 && self.shape.iter().all(|extent| (1..=1 << 24).contains(extent))
         };
         let fits = match self.role {
@@ -126,7 +127,8 @@ impl TensorEntry {
         fits && channels && super::STEPS.contains(&self.step)
     }
 
-    /// Which models it shares: planes of a kind and size, matrices, vectors.
+    /// Returns the key of the models that the tensor shares with others: planes of the same kind and size, matrices,
+    /// vectors.
     fn family(&self) -> (u8, usize) {
         match self.role {
             Role::Plane(_) => (0, self.shape[3]),
@@ -136,41 +138,51 @@ impl TensorEntry {
         }
     }
 
-    /// The grid of a class of a channel.
+    /// Returns the grid of a class in a channel.
     fn grid(&self, channel: usize, class: u8) -> QuantizationGrid {
         QuantizationGrid::new(match self.role {
-            Role::Weights => self.step + i32::from(class) - i32::from(MIDDLE),
+            Role::Weights => self.step + i32::from(class) - i32::from(ZERO_OFFSET_CLASS),
             _ => {
-                let of_channel = i32::from(self.channels.get(channel).copied().unwrap_or(0));
-                self.step + of_channel - FINER_PER_OCTAVE * texels::octaves(class)
+                let channel_offset = i32::from(self.channels.get(channel).copied().unwrap_or(0));
+                self.step + channel_offset - FINER_PER_OCTAVE * texels::octaves(class)
             }
         })
     }
 
-    /// Classes of weights: what is added to their step.
+    /// Returns the class of each weight: the sum of the offsets of its row and column.
     fn weight_classes(&self) -> Vec<u8> {
         let [_, rows, columns] = self.extents();
-        let (of_rows, of_columns) = self.channels.split_at(self.channels.len().saturating_sub(columns));
-        let class = |added: i32| (i32::from(MIDDLE) + added).clamp(0, 2 * i32::from(MIDDLE)) as u8;
-        let of = |row: usize, column: usize| {
-            class([of_rows.get(row), of_columns.get(column)].into_iter().flatten().map(|&added| i32::from(added)).sum())
+        let (row_offsets, column_offsets) = self.channels.split_at(self.channels.len().saturating_sub(columns));
+        let class =
+            |added: i32| (i32::from(ZERO_OFFSET_CLASS) + added).clamp(0, 2 * i32::from(ZERO_OFFSET_CLASS)) as u8;
+        let class_at = |row: usize, column: usize| {
+            class(
+                [row_offsets.get(row), column_offsets.get(column)]
+                    .into_iter()
+                    .flatten()
+                    .map(|&added| i32::from(added))
+                    .sum(),
+            )
         };
-        (0..rows).flat_map(|row| (0..columns).map(move |column| of(row, column))).collect()
+        (0..rows).flat_map(|row| (0..columns).map(move |column| class_at(row, column))).collect()
     }
 
-    /// Calls `with` with how the tensor lies on its grids; nothing where nothing of it is stored so.
-    fn lay<R>(&self, readers: &Readers<'_>, with: impl FnOnce(&QuantizedTensor<'_>) -> R) -> Option<R> {
+    /// Calls `with` with the tensor on its grids and returns the result; `None` if the tensor has no quantized values.
+    fn with_quantized<R>(&self, readers: &Readers<'_>, with: impl FnOnce(&QuantizedTensor<'_>) -> R) -> Option<R> {
         if self.values() == Some(0) {
             return None;
         }
         let [channels, rows, columns] = self.extents();
         let (classes, stored) = match (self.role, readers.space) {
             (Role::Plane(axes), Some(space)) => {
-                (texels::of_plane(readers.position, &space, axes, [columns, rows]), 0..rows)
+                (texels::plane_classes(readers.position, &space, axes, [columns, rows]), 0..rows)
             }
             (Role::TimePlane(axis), Some(space)) => {
                 let [first, last] = readers.times;
-                (texels::of_line(readers.position, &space, axis, columns), texels::rows(first, last, rows))
+                (
+                    texels::time_plane_classes(readers.position, &space, axis, columns),
+                    texels::time_rows(first, last, rows),
+                )
             }
             (Role::Weights, _) => (self.weight_classes(), 0..rows),
             _ => return None,
@@ -182,16 +194,21 @@ impl TensorEntry {
             stored,
             classes: &classes,
             grids: &|channel, class| self.grid(channel, class),
-            class_count: if self.role == Role::Weights { 2 * usize::from(MIDDLE) + 1 } else { texels::CLASSES },
+            class_count: if self.role == Role::Weights {
+                2 * usize::from(ZERO_OFFSET_CLASS) + 1
+            } else {
+                texels::CLASSES
+            },
             mean: QuantizationGrid::new(self.step).value(self.mean),
         }))
     }
 }
 
-/// Models by what shares them.
-struct Shared(Vec<((u8, usize), Residuals)>);
+/// Entropy models, by the key of the family of tensors that shares them.
+struct SharedModels(Vec<((u8, usize), Residuals)>);
 
-impl Shared {
+impl SharedModels {
+    /// Returns the models of the family of `entry`.
     fn residuals(&mut self, entry: &TensorEntry) -> &mut Residuals {
         let family = entry.family();
         let place = self.0.iter().position(|(known, _)| *known == family).unwrap_or_else(|| {
@@ -202,8 +219,8 @@ impl Shared {
     }
 }
 
-/// Writes the tensors of `entries`, whose means and parts are found; gives the symbols and the values that are exact.
-/// The bits of every tensor are added to `bits`.
+/// Encodes the tensors of `entries`, and stores their means and predictor weights in the entries. Returns the symbols
+/// and the values of exact tensors. Adds the approximate number of bits of every tensor to `bits`.
 pub(super) fn encode(
     entries: &mut [TensorEntry],
     tensors: &Tensors,
@@ -211,21 +228,21 @@ pub(super) fn encode(
     bits: &mut BTreeMap<String, f64>,
 ) -> (Vec<u8>, Vec<f32>) {
     let (mut encoder, mut exact) = (SymbolEncoder::default(), Vec::new());
-    let mut shared = Shared(Vec::new());
+    let mut shared = SharedModels(Vec::new());
     for entry in entries {
         let Some(tensor) = tensors.get(&entry.name) else { continue };
         if entry.role == Role::Exact {
             exact.extend(&tensor.data);
         }
         if matches!(entry.role, Role::Plane(_) | Role::TimePlane(_)) {
-            let mean = entry.lay(readers, |lattice| lattice.mean(&tensor.data)).unwrap_or(0.0);
+            let mean = entry.with_quantized(readers, |quantized| quantized.mean(&tensor.data)).unwrap_or(0.0);
             entry.mean = QuantizationGrid::new(entry.step).nearest(mean);
         }
-        if let Some(parts) = entry.lay(readers, |lattice| lattice.fit(&mut tensor.data.clone())) {
+        if let Some(parts) = entry.with_quantized(readers, |quantized| quantized.fit(&mut tensor.data.clone())) {
             entry.parts = parts;
             let before = encoder.cost();
-            entry.lay(readers, |lattice| {
-                lattice.encode(&parts, shared.residuals(entry), &mut tensor.data.clone(), &mut encoder);
+            entry.with_quantized(readers, |quantized| {
+                quantized.encode(&parts, shared.residuals(entry), &mut tensor.data.clone(), &mut encoder);
             });
             bits.insert(entry.name.clone(), encoder.cost() - before);
         }
@@ -233,7 +250,7 @@ pub(super) fn encode(
     (encoder.finish(), exact)
 }
 
-/// Reads the tensors of `entries`; none where the bytes are of other tensors. Shapes have been checked.
+/// Decodes the tensors of `entries`; `None` if the bytes do not match them. Shapes have been checked.
 pub(super) fn decode(
     entries: &[TensorEntry],
     bytes: &[u8],
@@ -241,7 +258,7 @@ pub(super) fn decode(
     readers: &Readers<'_>,
 ) -> Option<Tensors> {
     let mut decoder = SymbolDecoder::new(bytes)?;
-    let mut shared = Shared(Vec::new());
+    let mut shared = SharedModels(Vec::new());
     let mut tensors = Tensors::new();
     for entry in entries {
         let count = entry.values()?;
@@ -251,8 +268,9 @@ pub(super) fn decode(
             own.to_vec()
         } else {
             let mut data = vec![0.0; count];
-            entry
-                .lay(readers, |lattice| lattice.decode(&entry.parts, shared.residuals(entry), &mut data, &mut decoder));
+            entry.with_quantized(readers, |quantized| {
+                quantized.decode(&entry.parts, shared.residuals(entry), &mut data, &mut decoder)
+            });
             data
         };
         tensors.insert(entry.name.clone(), Tensor { shape: entry.shape.clone(), data });
@@ -260,11 +278,12 @@ pub(super) fn decode(
     (decoder.is_finished() && exact.is_empty()).then_some(tensors)
 }
 
-/// What a tensor comes back as where its grid is that of `steps`, its neighbors aside.
+/// Returns a tensor rounded with `steps`, as an archive would restore it. Ignores that unread rows are restored from
+/// their neighbors.
 pub fn rounded(tensor: &Tensor, role: Role, steps: &TensorSteps, position: &Column, space: Option<Box3>) -> Tensor {
     let entry = TensorEntry::new("", tensor, role, Some(steps));
     let readers = Readers { position, space, times: [-1.0, 1.0] };
     let mut data = tensor.data.clone();
-    entry.lay(&readers, |lattice| lattice.fit(&mut data));
+    entry.with_quantized(&readers, |quantized| quantized.fit(&mut data));
     Tensor { shape: tensor.shape.clone(), data }
 }

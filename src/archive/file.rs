@@ -1,7 +1,7 @@
-//! The file of an archive: a head with lengths and checksums, and four sections.
+//! File layout of an archive: a head with lengths and checksums, and four sections.
 //!
-//! In: sections. Out: bytes, and back. All that is believed of a file has been checked before: lengths against the file,
-//! checksums against the bytes, what is to be allocated against the file's length and the memory that reading may take.
+//! In: sections. Out: bytes, and back. Everything read from a file is checked before it is used: lengths against the
+//! file, checksums against the bytes, sizes to allocate against the length of the file and the memory limit.
 
 use std::path::Path;
 
@@ -11,63 +11,68 @@ use xxhash_rust::xxh3::xxh3_64;
 use crate::error::{Error, Result};
 use crate::limits::ReadLimit;
 
-/// How an archive begins; the line ends show when a file was sent as text.
+/// First bytes of an archive; the line ends reveal a file that was transferred as text.
 pub const MAGIC: [u8; 8] = *b"\x89GSZ\r\n\x1a\n";
-/// The version that is written, and the only one that is read.
+/// Version that is written, and the only version that is read.
 pub const VERSION: u16 = 1;
 
+/// Number of sections.
 const SECTIONS: usize = 4;
+/// Names of the sections, for messages.
 const NAMES: [&str; SECTIONS] = ["table", "cloud", "field", "blobs"];
-/// Magic, version, two zero bytes; of each section its length in the file, that of its content and a checksum; their own.
+/// Length of the head in bytes: magic, version, two zero bytes; for each section its length in the file, the length of
+/// its content and a checksum; checksum of the head.
 pub const HEAD: usize = 12 + SECTIONS * 24 + 8;
-/// Level of zstd for what is small.
-const LEVEL: i32 = 19;
-/// Bytes of content that a byte of the file may stand for. Those of trained models are 20 to 60 times as large as their
-/// archives. Symbols could stand for 800 bytes each, and unread texels for any number, but a file of 300 KB must not cost
-/// gigabytes.
-const MOST_PER_BYTE: u64 = 512;
-/// What may be allocated whatever the file's length.
-const ALWAYS: u64 = 64 << 20;
+/// Compression level of zstd for the table and the blobs, which are small.
+const ZSTD_LEVEL: i32 = 19;
+/// Maximum number of bytes of content per byte of the file. The contents of trained models are 20 to 60 times as large
+/// as their archives. Symbols could stand for 800 bytes each, and unread texels for any number, but a file of 300 KB
+/// must not cost gigabytes.
+const MAX_CONTENT_PER_BYTE: u64 = 512;
+/// Number of bytes that may be allocated whatever the length of the file.
+const ALWAYS_ALLOWED_BYTES: u64 = 64 << 20;
 
-/// Largest table. Those of trained models have some 50 KB. The values read from it take up to 16 times its bytes.
-const MOST_TABLE: u64 = 1 << 20;
+/// Maximum length of the table in bytes. Tables of trained models have about 50 KB. The values parsed from it take up
+/// to 16 times its bytes.
+const MAX_TABLE_BYTES: u64 = 1 << 20;
 
-/// The contents of the sections.
+/// Contents of the sections.
 #[derive(Debug, PartialEq)]
 pub(super) struct Sections {
-    /// JSON.
+    /// Table, in JSON.
     pub(super) table: Vec<u8>,
-    /// Symbols.
+    /// Entropy-coded symbols of the Gaussians.
     pub(super) cloud: Vec<u8>,
-    /// Symbols.
+    /// Entropy-coded symbols of the deformation field.
     pub(super) field: Vec<u8>,
-    /// Bytes as they are.
+    /// Plain bytes.
     pub(super) blobs: Vec<u8>,
 }
 
-/// Bytes of an archive, and of its parts.
+/// Number of bytes of an archive, by purpose.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ArchiveSize {
-    /// The cloud.
+    /// Bytes of the Gaussians.
     pub cloud: u64,
-    /// The deformation field.
+    /// Bytes of the deformation field.
     pub field: u64,
-    /// All else.
+    /// Number of all other bytes.
     pub rest: u64,
 }
 
 impl ArchiveSize {
+    /// Returns the sizes of an archive of `total` bytes.
     fn new(total: u64, cloud: u64, field: u64) -> ArchiveSize {
         ArchiveSize { cloud, field, rest: total - cloud - field }
     }
 
-    /// All of them.
+    /// Returns the number of bytes of the archive.
     pub fn total(&self) -> u64 {
         self.cloud + self.field + self.rest
     }
 }
 
-/// What is wrong with an archive.
+/// Description of a defect of an archive, without the path of its file.
 #[derive(Debug)]
 pub(super) struct Damage {
     place: String,
@@ -76,20 +81,25 @@ pub(super) struct Damage {
 }
 
 impl Damage {
+    /// Returns a defect at `place`.
     pub(super) fn new(place: &str, expected: impl Into<String>, found: impl Into<String>) -> Damage {
         Damage { place: place.to_owned(), expected: expected.into(), found: found.into() }
     }
 
+    /// Returns the error about this defect in the file at `path`.
     pub(super) fn in_file(self, path: &Path) -> Error {
         Error::input(path, self.place, self.expected, self.found)
             .hint("the archive is damaged or cut short; copy it again")
     }
 }
 
-/// The bytes of an archive and of its parts.
+/// Returns the bytes of an archive and their numbers by purpose.
+///
+/// # Errors
+/// Compression fails.
 pub(super) fn write(sections: &Sections) -> Result<(Vec<u8>, ArchiveSize)> {
     let pack = |bytes: &[u8]| {
-        zstd::bulk::compress(bytes, LEVEL)
+        zstd::bulk::compress(bytes, ZSTD_LEVEL)
             .map_err(|error| Error::internal(format!("cannot compress an archive: {error}")))
     };
     let (table, blobs) = (pack(&sections.table)?, pack(&sections.blobs)?);
@@ -110,16 +120,16 @@ pub(super) fn write(sections: &Sections) -> Result<(Vec<u8>, ArchiveSize)> {
     Ok((out, parts))
 }
 
-/// The head of an archive.
+/// Head of an archive.
 pub(super) struct ArchiveHeader {
-    /// Bytes of the whole file.
+    /// Length of the whole file in bytes.
     whole: u64,
-    /// Of each section: bytes in the file, bytes of content, checksum of the bytes in the file.
+    /// For each section: bytes in the file, bytes of content, checksum of the bytes in the file.
     sections: [[u64; 3]; SECTIONS],
 }
 
 impl ArchiveHeader {
-    /// Parses the first bytes of a file of `whole` bytes, at least [`HEAD`] of them if the file has so many.
+    /// Parses the head of a file of `whole` bytes. `head` has at least [`HEAD`] bytes, unless the file is shorter.
     pub(super) fn parse(head: &[u8], whole: u64) -> std::result::Result<ArchiveHeader, Damage> {
         if !head.starts_with(&MAGIC) {
             let first = head.get(..8.min(head.len())).unwrap_or_default();
@@ -130,7 +140,7 @@ impl ArchiveHeader {
             return Err(Damage::new(
                 "byte 8",
                 format!("version {VERSION}"),
-                format!("version {found}: another splatsieve's"),
+                format!("version {found}, of another version of splatsieve"),
             ));
         }
         let Some(head) = head.get(..HEAD) else {
@@ -154,32 +164,33 @@ impl ArchiveHeader {
             return Err(Damage::new("end", "nothing after the last section", format!("{rest} bytes")));
         }
         let table = sections[0][1];
-        if table > MOST_TABLE {
-            let expected = format!("at most {MOST_TABLE} bytes of content");
+        if table > MAX_TABLE_BYTES {
+            let expected = format!("at most {MAX_TABLE_BYTES} bytes of content");
             return Err(Damage::new("section table", expected, format!("{table} bytes")));
         }
         Ok(ArchiveHeader { whole, sections })
     }
 
-    /// Bytes that the file and the contents of its sections take in memory, each twice: as a whole and in parts.
+    /// Returns the memory in bytes of the file and the contents of its sections, each counted twice: as a whole and in
+    /// parts.
     pub(super) fn bytes(&self) -> u64 {
         let [[_, table, _], .., [_, blobs, _]] = self.sections;
         2 * self.whole + 16 * table + 2 * blobs
     }
 
-    /// Confirms that reading the archive at `path` keeps within `memory`.
-    pub(super) fn admit(&self, path: &Path, memory: ReadLimit) -> Result<()> {
+    /// Checks that reading the archive at `path` stays within `memory`.
+    pub(super) fn check_memory(&self, path: &Path, memory: ReadLimit) -> Result<()> {
         memory.check(path, "head", "the archive and its content", self.bytes())
     }
 }
 
-/// The sections of an archive with head `head`, each with its checksum right, and the sizes of its parts.
+/// Returns the sections of an archive with head `head`, after verifying their checksums, and the sizes by purpose.
 pub(super) fn read(head: &ArchiveHeader, bytes: &[u8]) -> std::result::Result<(Sections, ArchiveSize), Damage> {
     let mut rest = &bytes[HEAD..];
     let mut sections: [&[u8]; SECTIONS] = [&[]; SECTIONS];
     for (k, name) in NAMES.iter().enumerate() {
         let [stored, _, checksum] = head.sections[k];
-        // The head was parsed with the length of `bytes`.
+        // The head was parsed with the length of `bytes`, so this fails only if `bytes` changed.
         let Some((own, after)) = rest.split_at_checked(stored as usize) else {
             return Err(Damage::new(name, format!("{stored} bytes"), format!("{} bytes", rest.len())));
         };
@@ -201,13 +212,14 @@ pub(super) fn read(head: &ArchiveHeader, bytes: &[u8]) -> std::result::Result<(S
     Ok((content, parts))
 }
 
-/// Confirms that so many bytes may be allocated for a file of `length`; none: they have no number.
+/// Checks that `bytes` may be allocated for a file of `length` bytes. `None` stands for a number that overflowed and is
+/// refused.
 pub(super) fn check_size(bytes: Option<usize>, length: u64) -> std::result::Result<(), Damage> {
-    let most = length.saturating_mul(MOST_PER_BYTE).saturating_add(ALWAYS);
+    let most = length.saturating_mul(MAX_CONTENT_PER_BYTE).saturating_add(ALWAYS_ALLOWED_BYTES);
     match bytes.map(|bytes| bytes as u64) {
         Some(bytes) if bytes <= most => Ok(()),
         bytes => {
-            let found = bytes.map_or("more than there are".to_owned(), |bytes| bytes.to_string());
+            let found = bytes.map_or("a number that overflows".to_owned(), |bytes| bytes.to_string());
             Err(Damage::new("table", format!("at most {most} bytes of content in {length}"), found))
         }
     }

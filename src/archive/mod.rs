@@ -1,16 +1,18 @@
-//! The archive of a model: what it is drawn from, on grids as coarse as its pictures allow, entropy coded.
+//! Compressed archive of a model (`.gsz`): canonical Gaussians and deformation field, quantized with the coarsest steps
+//! that keep the renders good, and entropy coded.
 //!
-//! In: [`Content`] and [`Steps`]. Out: bytes, as `format/ARCHIVE.md` specifies them, and back. Memory: the content twice.
-//! Every value comes back within half a step of its grid, every other byte as it was; texels that no Gaussian reads and
-//! tensors that nothing reads come back as what is nearest or as zeros.
+//! In: [`Content`] and [`Steps`]. Out: bytes in the format of `format/ARCHIVE.md`, and back. Memory: twice the content.
+//! Every quantized value is restored within half a step of its grid, every other byte exactly. Texels that no Gaussian
+//! reads are restored as the nearest stored texels or an average of their neighbors; tensors that nothing reads are
+//! restored as zeros.
 
 mod cloud;
 mod entropy;
 mod field;
 mod file;
 mod importance;
-mod lattice;
 mod predict;
+mod quantized_tensor;
 mod residual;
 mod step;
 #[cfg(test)]
@@ -35,57 +37,57 @@ use crate::model::{Columns, Gaussians};
 use field::{Readers, TensorEntry};
 use file::{ArchiveHeader, Damage, Sections};
 
-/// Name of the tensor that holds the box that planes cover.
+/// Name of the tensor that holds the box covered by the planes.
 pub const BOX: &str = "deformation_net.grid.aabb";
 
-/// What an archive holds.
+/// Content of an archive.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Content {
-    /// The canonical cloud.
+    /// Canonical Gaussians.
     pub cloud: Gaussians,
-    /// The deformation field, if there is one, each tensor with what it is to those that read it.
+    /// Role of each tensor of the deformation field; empty if there is no field.
     pub field: BTreeMap<String, Role>,
-    /// The tensors of the field.
+    /// Tensors of the deformation field.
     pub tensors: Tensors,
-    /// First and last time at which the field is read.
+    /// First and last time at which the deformation field is evaluated.
     pub times: [f32; 2],
-    /// What else there is of every Gaussian, as many bytes of each, one Gaussian after the other.
+    /// Extra (non-Gaussian) bytes of every Gaussian, the same number for each, one Gaussian after another.
     pub beside: Vec<u8>,
     /// Files and other bytes, by name.
     pub files: BTreeMap<String, Vec<u8>>,
 }
 
-/// How finely a content is stored.
+/// Quantization steps of a content.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Steps {
-    /// Of the cloud.
+    /// Steps of the attributes of the Gaussians.
     pub cloud: CloudSteps,
-    /// Of the field.
+    /// Steps of the tensors of the deformation field.
     pub field: FieldSteps,
 }
 
-/// An archive, encoded.
+/// Encoded archive.
 #[derive(Debug, Serialize, Deserialize)]
 pub struct Encoded {
-    /// The file.
+    /// Bytes of the file.
     pub bytes: Vec<u8>,
-    /// How many of them are for what.
+    /// Number of bytes by purpose.
     pub parts: ArchiveSize,
-    /// For every Gaussian of the archive its place in the content.
+    /// For every Gaussian of the archive, its index in the content.
     pub order: Vec<u32>,
-    /// Bits of each attribute and of each tensor that has a grid, by name, about.
+    /// Approximate number of bits of each attribute and of each quantized tensor, by name.
     pub bits: BTreeMap<String, f64>,
 }
 
-/// The table of an archive: everything about it but symbols and blobs.
+/// Table of an archive: everything except entropy-coded symbols and plain bytes (blobs).
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Table {
     cloud: cloud::PointCloudShape,
-    /// Bits of the first and the last time, which a text would round.
+    /// Bits of the first and the last time; decimal text would round them.
     times: [u32; 2],
     tensors: Vec<TensorEntry>,
-    /// Bytes beside the attributes of each Gaussian.
+    /// Number of extra bytes per Gaussian.
     beside: usize,
     /// Names and lengths of files.
     files: Vec<(String, usize)>,
@@ -94,13 +96,14 @@ struct Table {
 /// Encodes `content`.
 ///
 /// # Errors
-/// A value that is not finite, or too large for its grid; the error names it.
+/// A value is not finite, or a step or tensor is not allowed in an archive; the error names it.
 pub fn encode(content: &Content, steps: &Steps) -> Result<Encoded> {
     check(content, steps)?;
     let mut bits = BTreeMap::new();
     let (shape, cloud, order) = cloud::encode(&content.cloud, &steps.cloud, &mut bits);
-    // The positions that a reader will have.
-    let stored = cloud::decode(&shape, &cloud).ok_or_else(|| Error::internal("a cloud does not come back"))?;
+    // Positions as a reader will decode them.
+    let stored =
+        cloud::decode(&shape, &cloud).ok_or_else(|| Error::internal("the encoded Gaussians cannot be decoded"))?;
     let readers = Readers { position: &stored.position, space: space(content), times: content.times };
     let entry = |(name, tensor): (&String, &Tensor)| {
         let role = content.field.get(name).copied().unwrap_or(Role::Unread);
@@ -109,7 +112,9 @@ pub fn encode(content: &Content, steps: &Steps) -> Result<Encoded> {
     let mut entries: Vec<TensorEntry> = content.tensors.iter().map(entry).collect();
     if let Some(entry) = entries.iter().find(|entry| !entry.is_sound()) {
         let TensorEntry { name, shape, .. } = entry;
-        return Err(Error::usage(format!("an archive holds no tensor such as {name} of shape {shape:?}")));
+        return Err(Error::usage(format!(
+            "an archive cannot hold tensor {name} of shape {shape:?}: its shape does not fit its use"
+        )));
     }
     let (field, exact) = field::encode(&mut entries, &content.tensors, &readers, &mut bits);
     let width = content.beside.len() / content.cloud.len().max(1);
@@ -121,7 +126,7 @@ pub fn encode(content: &Content, steps: &Steps) -> Result<Encoded> {
         files: content.files.iter().map(|(name, bytes)| (name.clone(), bytes.len())).collect(),
     };
     let mut blobs: Vec<u8> = exact.iter().flat_map(|value| value.to_le_bytes()).collect();
-    // By place in the row: what is alike lies together.
+    // Ordered by byte position in the row, so that similar bytes are adjacent.
     for at in 0..width {
         blobs.extend(order.iter().map(|&id| content.beside[id as usize * width + at]));
     }
@@ -134,35 +139,35 @@ pub fn encode(content: &Content, steps: &Steps) -> Result<Encoded> {
 /// Decodes the archive `bytes`, read from `path`.
 ///
 /// # Errors
-/// Bytes that are no archive, are cut short or damaged, of a later version, or that declare more than they can hold, or
-/// more than `memory`. Nothing is allocated by what they declare before it is checked.
+/// The bytes are not an archive, are truncated or damaged, have another version, or declare more than they can hold or
+/// than `memory` allows. Declared sizes are checked before anything is allocated.
 pub fn decode(bytes: &[u8], path: &Path, memory: ReadLimit) -> Result<(Content, ArchiveSize)> {
     let head = ArchiveHeader::parse(bytes, bytes.len() as u64).map_err(|damage| damage.in_file(path))?;
-    head.admit(path, memory)?;
+    head.check_memory(path, memory)?;
     let (sections, parts) = file::read(&head, bytes).map_err(|damage| damage.in_file(path))?;
     let table = table(&sections, bytes.len()).map_err(|damage| damage.in_file(path))?;
     let values = table.tensors.iter().filter_map(TensorEntry::values).chain(table.cloud.values()).sum::<usize>() as u64;
-    // Decoding knows two values of each Gaussian and its error.
+    // While decoding, two values of each Gaussian and its error size are kept.
     let needed = head.bytes() + 4 * values + 12 * table.cloud.gaussians as u64;
     memory.check(path, "table", "the archive and its content", needed)?;
     decoded(sections, table, parts).map_err(|damage| damage.in_file(path))
 }
 
-/// Checks the first [`HEAD`] bytes of the archive at `path`, which has `whole` bytes, before the others are read.
+/// Checks the first [`HEAD`] bytes of the archive at `path`, which has `whole` bytes, before the rest is read.
 ///
 /// # Errors
-/// A head that is not that of an archive of so many bytes; an archive that exceeds `memory` with its content.
+/// The head is not that of an archive of this length; the archive and its content exceed `memory`.
 pub fn check_head(head: &[u8], whole: u64, path: &Path, memory: ReadLimit) -> Result<()> {
-    ArchiveHeader::parse(head, whole).map_err(|damage| damage.in_file(path))?.admit(path, memory)
+    ArchiveHeader::parse(head, whole).map_err(|damage| damage.in_file(path))?.check_memory(path, memory)
 }
 
-/// The table of an archive of `length` bytes, whose parts go together.
+/// Parses the table of an archive of `length` bytes and checks that its numbers are consistent.
 fn table(sections: &Sections, length: usize) -> std::result::Result<Table, Damage> {
     let table: Table = serde_json::from_slice(&sections.table)
         .map_err(|error| Damage::new("table", "a table of this version", error.to_string()))?;
-    let unsound = |place: &str| Damage::new(place, "numbers that go together", "others");
+    let unsound = |place: &str| Damage::new(place, "consistent numbers", "inconsistent ones");
     if !table.cloud.is_sound() {
-        return Err(unsound("table of the cloud"));
+        return Err(unsound("table of the Gaussians"));
     }
     if let Some(entry) = table.tensors.iter().find(|entry| !entry.is_sound()) {
         return Err(unsound(&format!("tensor {}", entry.name)));
@@ -175,14 +180,15 @@ fn table(sections: &Sections, length: usize) -> std::result::Result<Table, Damag
     Ok(table)
 }
 
+/// Decodes the sections of an archive with a checked table.
 fn decoded(
     sections: Sections,
     table: Table,
     parts: ArchiveSize,
 ) -> std::result::Result<(Content, ArchiveSize), Damage> {
     let Sections { cloud, field, blobs, .. } = sections;
-    let unsound = |place: &str| Damage::new(place, "numbers that go together", "others");
-    let cloud = cloud::decode(&table.cloud, &cloud).ok_or_else(|| unsound("cloud"))?;
+    let unsound = |place: &str| Damage::new(place, "consistent numbers", "inconsistent ones");
+    let cloud = cloud::decode(&table.cloud, &cloud).ok_or_else(|| unsound("Gaussians"))?;
 
     let count = |entry: &&TensorEntry| entry.role == Role::Exact;
     let exact = table.tensors.iter().filter(count).filter_map(TensorEntry::values).sum::<usize>() * 4;
@@ -210,7 +216,7 @@ fn decoded(
         content.files.insert(name, own.to_vec());
         rest = after;
     }
-    // The box is among what is exact; planes need it before they are read.
+    // The box is one of the exact tensors; it is needed before planes are decoded.
     let before = table.tensors.iter().take_while(|entry| entry.name != BOX).filter(count);
     let start: usize = before.filter_map(TensorEntry::values).sum();
     let has_box = table.tensors.iter().any(|entry| entry.name == BOX && entry.role == Role::Exact);
@@ -225,29 +231,30 @@ fn decoded(
     Ok((content, parts))
 }
 
-/// The box that planes cover.
+/// Returns the box covered by the planes of the deformation field; `None` without such a field.
 pub fn space(content: &Content) -> Option<Box3> {
     content.tensors.get(BOX).and_then(|tensor| Box3::new(&tensor.data))
 }
 
-/// What a content comes back as, its order aside.
+/// Rounds `attributes` of the Gaussians to their grids, as in an archive, but without changing their order.
 pub fn round_cloud(cloud: &mut Gaussians, steps: &CloudSteps, attributes: &[usize]) {
     cloud::round(cloud, steps, attributes);
 }
 
-/// The values of the attribute [`ATTRIBUTES`]`[k]`.
+/// Returns the values of attribute [`ATTRIBUTES`]`[k]` of all Gaussians.
 pub fn attribute(cloud: &Gaussians, k: usize) -> impl Iterator<Item = f32> {
     cloud::values(cloud, k)
 }
 
-/// Confirms that every value has a place on its grid.
+/// Checks that every value is finite and every step is within [`STEPS`].
 fn check(content: &Content, steps: &Steps) -> Result<()> {
     for column in Columns::all().iter() {
         let values = content.cloud.column(column);
         if let Some(at) = values.planes().iter().position(|value| !value.is_finite()) {
             let (id, value) = (at % values.len(), values.planes()[at]);
             return Err(Error::usage(format!(
-                "an archive holds finite values: {} of Gaussian {id} of the result is {value}\n  drop it with --drop-ids",
+                "an archive holds finite values: {} of Gaussian {id} of the result is {value}\n  \
+                 drop it with --drop-ids",
                 column.name()
             )));
         }
@@ -263,7 +270,7 @@ fn check(content: &Content, steps: &Steps) -> Result<()> {
     let coarse = steps.cloud.iter().chain(steps.field.0.values().map(|steps| &steps.step));
     match coarse.into_iter().find(|step| !STEPS.contains(step)) {
         Some(step) => {
-            Err(Error::usage(format!("an archive has steps from {} to {}: {step}", STEPS.start(), STEPS.end())))
+            Err(Error::usage(format!("the steps of an archive are {} to {}; found {step}", STEPS.start(), STEPS.end())))
         }
         None => Ok(()),
     }

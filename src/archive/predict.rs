@@ -1,17 +1,18 @@
-//! What is expected of a value: its plane's mean, and parts of what others that are known already differ from theirs.
+//! Prediction of a value: the mean of its plane plus a weighted sum of the differences of known values from their
+//! means.
 
-/// Parts are whole multiples of `1 / PARTS`.
-const PARTS: f32 = 64.0;
+/// Denominator of the weights: they are multiples of 1/64.
+const WEIGHT_DENOMINATOR: f32 = 64.0;
 
-/// Parts of `N` differences, each in 64ths from −2 to 127/64.
+/// Weights of `N` differences, each in 64ths from −2 to 127/64.
 pub(super) type PredictorWeights<const N: usize> = [i8; N];
 
-/// Parts in the form that is calculated with.
+/// Returns the weights as f32.
 pub(super) fn factors<const N: usize>(parts: &PredictorWeights<N>) -> [f32; N] {
-    parts.map(|part| f32::from(part) / PARTS)
+    parts.map(|part| f32::from(part) / WEIGHT_DENOMINATOR)
 }
 
-/// The sum of all parts, in order.
+/// Returns the prediction: `mean` plus the weighted `differences`, summed in order.
 #[inline(always)]
 pub(super) fn expected<const N: usize>(mean: f32, factors: &[f32; N], differences: &[f32; N]) -> f32 {
     let mut sum = mean;
@@ -21,19 +22,22 @@ pub(super) fn expected<const N: usize>(mean: f32, factors: &[f32; N], difference
     sum
 }
 
-/// Finds the parts whose squared error is least.
+/// Least-squares fit of predictor weights.
 #[derive(Debug)]
 pub(super) struct PredictorFit<const N: usize> {
+    /// Sums of products of differences (lower triangle).
     products: [[f64; N]; N],
+    /// Sums of products of differences with the value.
     with_value: [f64; N],
 }
 
 impl<const N: usize> PredictorFit<N> {
+    /// Returns a fit without samples.
     pub(super) fn new() -> Self {
         PredictorFit { products: [[0.0; N]; N], with_value: [0.0; N] }
     }
 
-    /// Learns that `value`, less its mean, stood beside `differences`.
+    /// Adds a sample: `value`, less its mean, next to `differences`.
     #[inline(always)]
     pub(super) fn add(&mut self, differences: &[f32; N], value: f32) {
         for i in 0..N {
@@ -44,7 +48,8 @@ impl<const N: usize> PredictorFit<N> {
         }
     }
 
-    /// The parts: normal equations, with as much of a ridge as makes them solvable (R. Cholesky).
+    /// Returns the weights: solves the normal equations by Cholesky factorization, with a ridge of 1e-4 times the mean
+    /// diagonal so that they are solvable. All weights are 0 if every difference is 0 or one is not finite.
     pub(super) fn parts(mut self) -> PredictorWeights<N> {
         let trace: f64 = (0..N).map(|i| self.products[i][i]).sum();
         if !(trace.is_finite() && trace > 0.0) {
@@ -71,7 +76,7 @@ impl<const N: usize> PredictorFit<N> {
             found[i] = (found[i] - known) / root[i][i];
         }
         // `as` saturates and turns NaN into 0.
-        found.map(|part| (part * f64::from(PARTS)).round() as i8)
+        found.map(|part| (part * f64::from(WEIGHT_DENOMINATOR)).round() as i8)
     }
 }
 
@@ -80,7 +85,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_a_sum_of_parts_is_found_as_such() {
+    fn a_weighted_sum_is_recovered_exactly() {
         let mut fit = PredictorFit::new();
         for i in 0..400 {
             let x = [(i as f32 * 0.7).sin(), (i as f32 * 1.3).cos(), (i as f32 * 0.11).sin()];
@@ -92,7 +97,7 @@ mod tests {
     }
 
     #[test]
-    fn where_nothing_differs_nothing_is_expected() {
+    fn zero_or_nan_differences_give_zero_weights() {
         let mut fit = PredictorFit::<4>::new();
         fit.add(&[0.0; 4], 1.0);
         assert_eq!(fit.parts(), [0; 4]);

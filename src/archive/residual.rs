@@ -1,11 +1,11 @@
-//! Differences from what was expected, coded by how large those around them were.
+//! Codes prediction errors; the model of each is chosen by the size of the errors around it.
 //!
-//! The magnitude of a difference falls into one of sixteen classes, which is a symbol; where in the class it lies, and
-//! its sign, are bits as they are: within a class the likelihoods hardly differ.
+//! The magnitude of an error falls into one of sixteen classes, which is coded as a symbol. Its position within the
+//! class and its sign are plain bits, because probabilities within a class hardly differ.
 
 use super::entropy::{SYMBOLS, SymbolDecoder, SymbolEncoder, SymbolModel};
 
-/// First magnitude and bits of each class but the last, which has no end.
+/// First magnitude and number of bits of each class; the last class is unlimited.
 const CLASSES: [(u64, u32); SYMBOLS] = [
     (0, 0),
     (1, 0),
@@ -25,29 +25,32 @@ const CLASSES: [(u64, u32); SYMBOLS] = [
     (128, 0),
 ];
 
-/// Half octaves of the size that is expected, from a quarter of a step.
+/// Number of models: half octaves of the expected size, from a quarter of a step.
 const CONTEXTS: usize = 16;
 
-/// The models of a group of planes that behave alike.
+/// Models shared by a group of similar planes.
 #[derive(Debug, Clone)]
 pub(super) struct Residuals([SymbolModel; CONTEXTS]);
 
 impl Residuals {
+    /// Returns models that have seen nothing.
     pub(super) fn new() -> Residuals {
         Residuals([SymbolModel::NEW; CONTEXTS])
     }
 
-    /// By the mean magnitude of what lies around, in steps; told by exponent and first bit of the mantissa.
+    /// Returns the model for `size`, the mean magnitude of the errors around, in steps. The index is the exponent and
+    /// the first bit of the mantissa.
     #[inline(always)]
-    fn around(&mut self, size: f32) -> &mut SymbolModel {
+    fn model_for_size(&mut self, size: f32) -> &mut SymbolModel {
         let half_octaves = (size.abs().to_bits() >> 22) as i32 - ((127 - 2) << 1);
         &mut self.0[half_octaves.clamp(0, CONTEXTS as i32 - 1) as usize]
     }
 
+    /// Writes a prediction error.
     pub(super) fn encode(&mut self, residual: i64, size: f32, to: &mut SymbolEncoder) {
         let magnitude = residual.unsigned_abs();
         let class = CLASSES.iter().rposition(|&(first, _)| first <= magnitude).unwrap_or(0);
-        to.symbol(self.around(size), class);
+        to.symbol(self.model_for_size(size), class);
         let above = magnitude - CLASSES[class].0;
         if class == SYMBOLS - 1 {
             to.number(above);
@@ -59,9 +62,10 @@ impl Residuals {
         }
     }
 
+    /// Reads a prediction error.
     #[inline(always)]
     pub(super) fn decode(&mut self, size: f32, from: &mut SymbolDecoder<'_>) -> i64 {
-        let class = from.symbol(self.around(size));
+        let class = from.symbol(self.model_for_size(size));
         if class == 0 {
             return 0;
         }
@@ -84,7 +88,7 @@ mod tests {
     }
 
     #[test]
-    fn differences_come_back_whatever_was_around() {
+    fn errors_are_read_back_for_every_expected_size() {
         let values: Vec<i64> = (-300..300).chain([1 << 40, -(1 << 50), i64::from(i32::MAX)]).collect();
         for size in [0.0, 0.3, 1.0, 50.0, f32::INFINITY, f32::NAN] {
             let (mut models, mut encoder) = (Residuals::new(), SymbolEncoder::default());

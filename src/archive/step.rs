@@ -1,7 +1,7 @@
-//! Steps of uniform grids, by whole numbers so that every machine makes the same of them.
+//! Steps of uniform quantization grids, given by whole numbers so that every machine computes the same values.
 //!
-//! Step `k` is 2^(k/8). A value `v` on the grid of a step `s` is the multiple `round(v / s)`; it comes back as the
-//! nearest f32 of that multiple, so that |v' − v| ≤ s/2 but for half a unit in the last place of an f32.
+//! Step `k` is 2^(k/8). A value `v` on the grid with step `s` is stored as the multiple `round(v / s)` and restored as
+//! the nearest f32 of that multiple, so that |v' − v| ≤ s/2, except for half a unit in the last place of an f32.
 
 /// 2^(i/8).
 const EIGHTHS: [f64; 8] = [
@@ -15,27 +15,27 @@ const EIGHTHS: [f64; 8] = [
     1.834_008_086_409_342_4,
 ];
 
-/// Steps are within 2^±40.
+/// Range of allowed steps: 2^−40 to 2^40.
 pub const STEPS: std::ops::RangeInclusive<i32> = -320..=320;
 
-/// Multiples stay exact in an f64, with room for sums.
-const LARGEST: f64 = (1u64 << 50) as f64;
+/// Maximum absolute multiple, so that multiples and sums of them are exact in an f64.
+const MAX_MULTIPLE: f64 = (1u64 << 50) as f64;
 
-/// Added and taken away again it leaves the nearest whole number, halves to even; |x| < 2^51.
+/// Constant 1.5 · 2^52: adding and subtracting it rounds to the nearest whole number, halves to even, for |x| < 2^51.
 const ROUNDING: f64 = 6_755_399_441_055_744.0;
 
-/// The step `k`.
+/// Returns the step `k`, 2^(k/8).
 pub fn step(k: i32) -> f64 {
     let whole = k.div_euclid(8).clamp(-1000, 1000);
     EIGHTHS[k.rem_euclid(8) as usize] * f64::from_bits(((1023 + whole) as u64) << 52)
 }
 
-/// The `k` whose step comes closest to `size`, positive, in octaves; within [`STEPS`].
+/// Returns the `k` whose step is closest to `size`, which is positive, in octaves; within [`STEPS`].
 pub fn nearest(size: f64) -> i32 {
     ((8.0 * size.log2()).round() as i32).clamp(*STEPS.start(), *STEPS.end())
 }
 
-/// A grid to put values on.
+/// Uniform grid of quantized values.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct QuantizationGrid {
     step: f64,
@@ -43,40 +43,44 @@ pub(super) struct QuantizationGrid {
 }
 
 impl QuantizationGrid {
+    /// Returns the grid with step `k`.
     pub(super) fn new(k: i32) -> QuantizationGrid {
         let step = step(k);
         QuantizationGrid { step, inverse: 1.0 / step }
     }
 
-    /// The multiple nearest to `value`.
+    /// Returns the multiple nearest to `value`.
     #[inline(always)]
     pub(super) fn multiple(self, value: f32) -> i64 {
         self.nearest(f64::from(value))
     }
 
-    /// The multiple nearest to `value`, at most [`LARGEST`]; of what is no number 0.
+    /// Returns the multiple nearest to `value`, at most [`MAX_MULTIPLE`] in magnitude; 0 for NaN.
     #[inline(always)]
     pub(super) fn nearest(self, value: f64) -> i64 {
-        let x = (value * self.inverse).clamp(-LARGEST, LARGEST);
+        let x = (value * self.inverse).clamp(-MAX_MULTIPLE, MAX_MULTIPLE);
         (x + ROUNDING - ROUNDING) as i64
     }
 
+    /// Returns the value of a multiple.
     #[inline(always)]
     pub(super) fn value(self, multiple: i64) -> f32 {
         (multiple as f64 * self.step) as f32
     }
 
-    /// `size` in steps.
+    /// Returns `size` in steps.
     #[inline(always)]
     pub(super) fn in_steps(self, size: f32) -> f32 {
         size * self.inverse as f32
     }
 
+    /// Returns the step.
     #[inline(always)]
     pub(super) fn size(self) -> f32 {
         self.step as f32
     }
 
+    /// Returns the nearest value on the grid.
     pub(super) fn round(self, value: f32) -> f32 {
         self.value(self.multiple(value))
     }
@@ -98,14 +102,14 @@ mod tests {
 
     proptest! {
         #[test]
-        fn a_value_comes_back_within_half_a_step(value in -1e6f32..1e6, k in -100i32..60) {
+        fn a_value_is_restored_within_half_a_step(value in -1e6f32..1e6, k in -100i32..60) {
             let back = QuantizationGrid::new(k).round(value);
             let bound = step(k) / 2.0 + f64::from(value.abs()) * f64::from(f32::EPSILON);
             prop_assert!((f64::from(back) - f64::from(value)).abs() <= bound, "{value} {back} {bound}");
         }
 
         #[test]
-        fn what_is_on_the_grid_stays(multiple in -(1i64 << 20)..1 << 20, k in -100i32..60) {
+        fn values_on_the_grid_are_unchanged(multiple in -(1i64 << 20)..1 << 20, k in -100i32..60) {
             let grid = QuantizationGrid::new(k);
             prop_assert_eq!(grid.multiple(grid.value(multiple)), multiple);
         }

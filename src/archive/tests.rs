@@ -1,4 +1,4 @@
-//! What comes back of an archive, and what becomes of a damaged one.
+//! Tests of encoding and decoding archives, and of damaged archives.
 
 use std::path::Path;
 
@@ -8,27 +8,27 @@ use xxhash_rust::xxh3::xxh3_64;
 use super::*;
 use crate::deform::{Tensor, tap};
 
-/// Numbers that look random, the same for the same seed.
-struct Dice(u64);
+/// Deterministic pseudo-random numbers.
+struct SeededNoise(u64);
 
-impl Dice {
+impl SeededNoise {
     fn next(&mut self) -> f32 {
         self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
         (self.0 >> 40) as f32 / (1 << 23) as f32 - 1.0
     }
 }
 
-fn tensor(dice: &mut Dice, shape: &[usize]) -> Tensor {
-    let data = (0..shape.iter().product()).map(|_| dice.next()).collect();
+fn tensor(noise: &mut SeededNoise, shape: &[usize]) -> Tensor {
+    let data = (0..shape.iter().product()).map(|_| noise.next()).collect();
     Tensor { shape: shape.to_vec(), data }
 }
 
-/// A model of `count` Gaussians with every role of tensors.
+/// Returns a content of `count` Gaussians with tensors of every role.
 fn content(seed: u64, count: usize, sh_degree: usize) -> Content {
-    let mut dice = Dice(seed);
+    let mut noise = SeededNoise(seed);
     let mut cloud = Gaussians::zeros(count, sh_degree);
     for column in cloud.columns_mut(Columns::all()) {
-        column.planes_mut().iter_mut().for_each(|value| *value = 3.0 * dice.next());
+        column.planes_mut().iter_mut().for_each(|value| *value = 3.0 * noise.next());
     }
     let mut content = Content { cloud, times: [0.0, 1.0], ..Content::default() };
     let plane = [1, 3, 7, 9];
@@ -44,7 +44,7 @@ fn content(seed: u64, count: usize, sh_degree: usize) -> Content {
         ("a.exact", &[2, 2, 2], Role::Exact),
         ("a.unread", &[4, 4], Role::Unread),
     ] {
-        content.tensors.insert(name.to_owned(), tensor(&mut dice, shape));
+        content.tensors.insert(name.to_owned(), tensor(&mut noise, shape));
         content.field.insert(name.to_owned(), role);
     }
     let corners = Tensor { shape: vec![2, 3], data: vec![2.5, 2.0, 3.5, -2.5, -3.0, -2.0] };
@@ -57,8 +57,8 @@ fn content(seed: u64, count: usize, sh_degree: usize) -> Content {
 }
 
 fn some_steps(content: &Content, octave: i32) -> Steps {
-    let of = |k: i32| TensorSteps { step: 8 * octave + k, channels: Vec::new() };
-    let tensors = content.field.keys().zip(0..).map(|(name, k)| (name.clone(), of(k)));
+    let step = |k: i32| TensorSteps { step: 8 * octave + k, channels: Vec::new() };
+    let tensors = content.field.keys().zip(0..).map(|(name, k)| (name.clone(), step(k)));
     let mut steps = Steps { cloud: [0; 8], field: FieldSteps(tensors.collect()) };
     steps.cloud.iter_mut().zip(0..).for_each(|(step, k)| *step = 8 * octave - k);
     steps
@@ -72,7 +72,7 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(40))]
 
     #[test]
-    fn values_come_back_within_half_a_step_and_bytes_as_they_were(
+    fn values_are_within_half_a_step_and_bytes_are_exact(
         seed in any::<u64>(), count in 0usize..60, degree in 0usize..4, octave in -8i32..2
     ) {
         let content = content(seed, count, degree);
@@ -111,7 +111,7 @@ proptest! {
                 Role::Plane(_) | Role::TimePlane(_) => (),
             }
         }
-        // What a Gaussian samples of a plane is off by no more than half a step at the coarsest weight it may have.
+        // The error of a plane at a Gaussian is at most half a step at the coarsest weight that the Gaussian may have.
         let space = space(&content).unwrap();
         for (name, axes) in [("a.plane.xy", [0, 1]), ("a.plane.yz", [1, 2])] {
             let [rows, columns] = [7usize, 9];
@@ -125,7 +125,8 @@ proptest! {
                             let at = (c * rows + row as usize) * columns + column as usize;
                             let off = f64::from(content.tensors[name].data[at] - back.tensors[name].data[at]).abs();
                             let step = step(steps.field.0[name].step);
-                            // An octave less is read of a texel: its step is half an octave more, and the class is whole.
+                            // If a texel is read one octave less, its step is half an octave larger; classes are whole
+                            // octaves.
                             prop_assert!(off * weight <= 0.75 * step + 1e-4 * weight, "{name} {off} x {weight} of {step}");
                         }
                     }
@@ -135,7 +136,7 @@ proptest! {
     }
 
     #[test]
-    fn damage_under_right_checksums_is_an_error_or_another_content_but_never_a_panic(
+    fn damage_with_valid_checksums_never_panics(
         seed in any::<u64>(), places in prop::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 1..6)
     ) {
         let content = content(seed, 20, 1);
@@ -149,7 +150,7 @@ proptest! {
     }
 }
 
-/// Makes the checksums of an archive those of its bytes, as far as its lengths can be followed.
+/// Recomputes the checksums of an archive, as far as its lengths are valid.
 fn reseal(bytes: &mut [u8]) {
     let long = |bytes: &[u8], at: usize| u64::from_le_bytes(bytes[at..at + 8].try_into().unwrap()) as usize;
     let head: usize = 12 + 4 * 24 + 8;
@@ -165,7 +166,7 @@ fn reseal(bytes: &mut [u8]) {
 }
 
 #[test]
-fn an_archive_cut_short_anywhere_is_an_error_that_names_it() {
+fn truncated_archives_are_refused_by_name() {
     let content = content(3, 12, 0);
     let bytes = encode(&content, &some_steps(&content, -3)).unwrap().bytes;
     for length in 0..bytes.len() {
@@ -182,7 +183,7 @@ fn an_archive_cut_short_anywhere_is_an_error_that_names_it() {
 }
 
 #[test]
-fn any_bit_that_flips_is_seen() {
+fn any_flipped_bit_is_detected() {
     let content = content(4, 12, 0);
     let bytes = encode(&content, &some_steps(&content, -3)).unwrap().bytes;
     for bit in 0..8 * bytes.len() {
@@ -193,7 +194,7 @@ fn any_bit_that_flips_is_seen() {
 }
 
 #[test]
-fn lengths_that_no_file_of_its_size_has_are_refused_before_anything_is_allocated() {
+fn impossible_lengths_are_refused_before_allocation() {
     let content = content(5, 12, 0);
     let sound = encode(&content, &some_steps(&content, -3)).unwrap().bytes;
     for place in [0, 8] {
@@ -202,7 +203,7 @@ fn lengths_that_no_file_of_its_size_has_are_refused_before_anything_is_allocated
         reseal(&mut bytes);
         assert!(decode(&bytes, Path::new("a.gsz"), ReadLimit::NONE).is_err());
     }
-    // So many Gaussians, of a table that is sound.
+    // A consistent table that declares too many Gaussians.
     let (Sections { table, cloud, field, blobs }, _) =
         file::read(&ArchiveHeader::parse(&sound, sound.len() as u64).unwrap(), &sound).unwrap();
     let table = String::from_utf8(table).unwrap().replace("\"gaussians\":12", "\"gaussians\":4000000000");
@@ -230,7 +231,7 @@ fn a_later_version_is_named() {
 }
 
 #[test]
-fn values_that_are_not_finite_are_refused_by_name() {
+fn non_finite_values_are_refused_by_name() {
     let mut bad = content(7, 3, 0);
     bad.cloud.opacity_logit.set_row(1, [f32::NAN]);
     let message = encode(&bad, &some_steps(&bad, -3)).unwrap_err().to_string();
@@ -241,16 +242,16 @@ fn values_that_are_not_finite_are_refused_by_name() {
 }
 
 #[test]
-fn texels_that_nobody_reads_take_nothing() {
+fn unread_texels_take_no_bits() {
     let all = content(8, 40, 0);
     let mut far = all.clone();
-    // All in one place: four texels of each plane.
+    // All Gaussians at one position read four texels of each plane.
     for i in 0..far.cloud.len() {
         far.cloud.position.set_row(i, [0.1, 0.2, 0.3]);
     }
     let bits = |content: &Content, name: &str| encode(content, &some_steps(content, -6)).unwrap().bits[name];
     assert!(bits(&far, "a.plane.xy") < 0.25 * bits(&all, "a.plane.xy"));
-    // Nor are rows of times before the first: of six at -1 to 1 the first two.
+    // Rows of times before the first are not stored: of six rows for times -1 to 1, the first two.
     let mut never = all.clone();
     let row = never.tensors.get_mut("a.plane.xt").unwrap();
     row.data.iter_mut().enumerate().filter(|(i, _)| (i / 9) % 6 < 2).for_each(|(_, value)| *value = 1e4);
@@ -258,12 +259,12 @@ fn texels_that_nobody_reads_take_nothing() {
 }
 
 #[test]
-fn tensors_that_fit_no_role_are_refused_by_name_and_what_is_kept_to_the_bit_may_be_anything() {
+fn malformed_tensors_are_refused_by_name() {
     let whole = content(5, 20, 0);
     let steps = some_steps(&whole, -4);
     for shape in [&[7][..], &[2, 1, 4, 4], &[1, 1, 0, 4]] {
         let mut odd = whole.clone();
-        odd.tensors.insert("a.plane.xy".to_owned(), tensor(&mut Dice(1), shape));
+        odd.tensors.insert("a.plane.xy".to_owned(), tensor(&mut SeededNoise(1), shape));
         let message = encode(&odd, &steps).map(|_| ()).unwrap_err().to_string();
         assert!(message.contains("a.plane.xy") && message.contains(&format!("{shape:?}")), "{message}");
     }

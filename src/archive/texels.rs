@@ -1,62 +1,63 @@
-//! Which texels of a plane are read, and how much of what is read is theirs.
+//! Determines which texels of a plane are read, and with what total weight.
 //!
-//! In: canonical positions as they are stored, the box, a plane's axes and size. Out: a class per texel. Writer and reader
-//! of an archive both derive it, so nothing of it is stored; sums and products of f32 in a fixed order give the same
-//! classes on every machine.
+//! In: canonical positions as they are stored, the box, the axes and size of a plane. Out: a class for each texel.
+//! Writer and reader of an archive both compute the classes, so they are not stored. Sums and products of f32 in a
+//! fixed order give the same classes on every machine.
 
-use super::lattice::UNREAD;
+use super::quantized_tensor::UNREAD;
 use crate::deform::{Box3, tap};
 use crate::model::Column;
 
-/// Powers of two of the part that is read, from 2^`LEAST` on, and then in octaves.
-const LEAST: i32 = -8;
-/// Classes of texels.
+/// Exponent (floor of log2) of the summed squared weights of class 0. Smaller sums also belong to class 0.
+const MIN_EXPONENT: i32 = -8;
+/// Number of classes of texels.
 pub(super) const CLASSES: usize = 16;
 
-/// Octaves by which the part that is read of a class is above that of one texel that is read alone and once.
+/// Returns the summed squared weight of a class in octaves, relative to a texel that is read once with weight 1.
 pub(super) fn octaves(class: u8) -> i32 {
-    i32::from(class) + LEAST
+    i32::from(class) + MIN_EXPONENT
 }
 
-/// The class of a texel of which the squares of the weights, with which Gaussians read it, sum to `part`.
-fn class(part: f32) -> u8 {
-    if part <= 0.0 {
+/// Returns the class of a texel. `squared_weight` is the sum of the squared interpolation weights with which Gaussians
+/// read the texel.
+fn class(squared_weight: f32) -> u8 {
+    if squared_weight <= 0.0 {
         return UNREAD;
     }
-    let exponent = (part.to_bits() >> 23) as i32 - 127;
-    (exponent - LEAST).clamp(0, CLASSES as i32 - 1) as u8
+    let exponent = (squared_weight.to_bits() >> 23) as i32 - 127;
+    (exponent - MIN_EXPONENT).clamp(0, CLASSES as i32 - 1) as u8
 }
 
-/// Classes `[size_b, size_a]` of a plane over two axes of space.
-pub(super) fn of_plane(position: &Column, space: &Box3, axes: [usize; 2], size: [usize; 2]) -> Vec<u8> {
-    let mut parts = vec![0.0f32; size[0] * size[1]];
+/// Returns the classes `[size_b, size_a]` of a plane over two spatial axes.
+pub(super) fn plane_classes(position: &Column, space: &Box3, axes: [usize; 2], size: [usize; 2]) -> Vec<u8> {
+    let mut squared_weights = vec![0.0f32; size[0] * size[1]];
     for i in 0..position.len() {
         let u = space.normalized(position.row(i));
         let (a, b) = (tap(u[axes[0]], size[0]), tap(u[axes[1]], size[1]));
         for (row, in_b) in [(b.low, 1.0 - b.fraction), (b.high, b.fraction)] {
             for (column, in_a) in [(a.low, 1.0 - a.fraction), (a.high, a.fraction)] {
                 let weight = in_a * in_b;
-                parts[row as usize * size[0] + column as usize] += weight * weight;
+                squared_weights[row as usize * size[0] + column as usize] += weight * weight;
             }
         }
     }
-    parts.into_iter().map(class).collect()
+    squared_weights.into_iter().map(class).collect()
 }
 
-/// Classes `[size]` of the columns of a plane over an axis and time.
-pub(super) fn of_line(position: &Column, space: &Box3, axis: usize, size: usize) -> Vec<u8> {
-    let mut parts = vec![0.0f32; size];
+/// Returns the classes `[size]` of the columns of a plane over a spatial axis and time.
+pub(super) fn time_plane_classes(position: &Column, space: &Box3, axis: usize, size: usize) -> Vec<u8> {
+    let mut squared_weights = vec![0.0f32; size];
     for i in 0..position.len() {
         let a = tap(space.normalized(position.row(i))[axis], size);
         for (column, weight) in [(a.low, 1.0 - a.fraction), (a.high, a.fraction)] {
-            parts[column as usize] += weight * weight;
+            squared_weights[column as usize] += weight * weight;
         }
     }
-    parts.into_iter().map(class).collect()
+    squared_weights.into_iter().map(class).collect()
 }
 
-/// Rows of a plane over time that are read at times from `first` to `last`.
-pub(super) fn rows(first: f32, last: f32, size: usize) -> std::ops::Range<usize> {
+/// Returns the rows of a plane over time that are read at times from `first` to `last`.
+pub(super) fn time_rows(first: f32, last: f32, size: usize) -> std::ops::Range<usize> {
     let (first, last) = (tap(first, size), tap(last, size));
     let end = if last.fraction > 0.0 { last.high } else { last.low };
     first.low as usize..end as usize + 1

@@ -1,8 +1,8 @@
-//! Pieces as files.
+//! File format of cache entries.
 //!
-//! A piece, all numbers little-endian:
+//! Layout, all numbers little-endian:
 //!
-//! | bytes | what |
+//! | bytes | content |
 //! |---|---|
 //! | 8 | `SPLSPIEC` |
 //! | 4 | version, 1 |
@@ -10,10 +10,10 @@
 //! | 8 | length of the content |
 //! | 8 | XXH3-64 of text and content |
 //! | 16 | key |
-//! | ... | text: what the piece belongs to, UTF-8; none in a scratch file |
+//! | ... | text: description of the input that the entry belongs to, UTF-8; empty in a scratch file |
 //! | ... | content |
 //!
-//! Its name: `<stage>.<key, 32 hexadecimal digits>.piece`, of a part `<stage>.<key>.<i>-of-<n>.piece`.
+//! File name: `<stage>.<key, 32 hexadecimal digits>.piece`; for a shard `<stage>.<key>.<i>-of-<n>.piece`.
 
 use std::fs::{self, File};
 use std::io::{self, BufReader, BufWriter, Read, Seek, SeekFrom, Write};
@@ -29,20 +29,20 @@ use crate::files::digest::hash_rest;
 
 const MAGIC: [u8; 8] = *b"SPLSPIEC";
 const VERSION: u32 = 1;
-/// Bytes before the text.
+/// Bytes of the header before the text.
 const HEADER: usize = 48;
-/// Ends the names of pieces.
-pub(super) const ENDING: &str = ".piece";
-/// Bytes of all texts in a piece, at most.
-const MOST_TEXT: u64 = 8 << 20;
+/// Extension of the file names of cache entries.
+pub(super) const EXTENSION: &str = ".piece";
+/// Maximum bytes of all strings in the value of an entry.
+const MAX_STRING_BYTES: u64 = 8 << 20;
 
-/// What a piece is called.
+/// File name of a cache entry.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) struct EntryName {
     pub(super) stage: String,
-    /// In 32 digits.
+    /// Cache key as 32 hexadecimal digits.
     pub(super) key: String,
-    /// Index and number of parts; 1 of 1 is the whole.
+    /// Index of the shard, from 1, and number of shards; (1, 1) is the full result.
     pub(super) part: (usize, usize),
 }
 
@@ -54,14 +54,14 @@ impl EntryName {
     pub(super) fn file(&self) -> String {
         let EntryName { stage, key, part } = self;
         match part {
-            (_, 1) => format!("{stage}.{key}{ENDING}"),
-            (index, of) => format!("{stage}.{key}.{index}-of-{of}{ENDING}"),
+            (_, 1) => format!("{stage}.{key}{EXTENSION}"),
+            (index, of) => format!("{stage}.{key}.{index}-of-{of}{EXTENSION}"),
         }
     }
 
-    /// That of a file, if it is one of a piece.
+    /// Parses the file name of a cache entry; returns `None` for other files.
     pub(super) fn parse(file: &str) -> Option<EntryName> {
-        let mut fields = file.strip_suffix(ENDING)?.split('.');
+        let mut fields = file.strip_suffix(EXTENSION)?.split('.');
         let (stage, key, part) = (fields.next()?, fields.next()?, fields.next());
         let part = match part {
             None => (1, 1),
@@ -71,12 +71,12 @@ impl EntryName {
             }
         };
         let name = EntryName { stage: stage.to_owned(), key: key.to_owned(), part };
-        // Nothing else is written that way.
+        // Accept only names that `file` produces.
         (fields.next().is_none() && key.len() == 32 && name.file() == file).then_some(name)
     }
 }
 
-/// Names of all pieces of `folder`.
+/// Returns the names of all cache entries in `folder`, sorted.
 pub(super) fn names(folder: &Path) -> Result<Vec<EntryName>> {
     let mut found = Vec::new();
     for entry in fs::read_dir(folder).map_err(Error::io("read the work folder", folder))? {
@@ -87,19 +87,19 @@ pub(super) fn names(folder: &Path) -> Result<Vec<EntryName>> {
     Ok(found)
 }
 
-/// Writes a piece to a file.
+/// Writer of the file of a cache entry.
 pub(super) struct EntryWriter {
     file: BufWriter<File>,
     key: u128,
     text: u32,
     length: u64,
     hash: Box<Xxh3>,
-    /// What went wrong, for who is told only that something did.
+    /// Last error of a write. The serializer does not pass errors on, so they are kept here.
     pub(super) failed: Option<io::Error>,
 }
 
 impl EntryWriter {
-    /// Behind room for the header.
+    /// Begins the file with an empty header and the text `about`.
     pub(super) fn new(file: File, key: u128, about: &str) -> io::Result<EntryWriter> {
         let mut writer = EntryWriter {
             file: BufWriter::new(file),
@@ -115,12 +115,12 @@ impl EntryWriter {
         Ok(writer)
     }
 
-    /// Where the content begins.
+    /// Returns the file offset of the content.
     pub(super) fn start(&self) -> u64 {
         HEADER as u64 + u64::from(self.text)
     }
 
-    /// Writes the header; gives the file, open for reading.
+    /// Writes the header and returns the file, which is open for reading.
     pub(super) fn finish(self) -> io::Result<File> {
         let mut header = Vec::with_capacity(HEADER);
         header.extend_from_slice(&MAGIC);
@@ -138,23 +138,23 @@ impl EntryWriter {
 
 impl Write for EntryWriter {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
-        let written = self.file.write(bytes).inspect_err(|error| self.failed = Some(again(error)))?;
+        let written = self.file.write(bytes).inspect_err(|error| self.failed = Some(copied_error(error)))?;
         self.hash.update(&bytes[..written]);
         self.length += written as u64;
         Ok(written)
     }
 
     fn flush(&mut self) -> io::Result<()> {
-        self.file.flush().inspect_err(|error| self.failed = Some(again(error)))
+        self.file.flush().inspect_err(|error| self.failed = Some(copied_error(error)))
     }
 }
 
-/// The same error once more.
-fn again(error: &io::Error) -> io::Error {
+/// Returns a copy of the error.
+fn copied_error(error: &io::Error) -> io::Error {
     error.raw_os_error().map_or_else(|| io::Error::new(error.kind(), error.to_string()), io::Error::from_raw_os_error)
 }
 
-/// A piece that was written, open for reading at its content.
+/// Cache entry that was read and verified, open for reading.
 pub(super) struct CacheEntry {
     file: File,
     about: String,
@@ -162,7 +162,7 @@ pub(super) struct CacheEntry {
     length: u64,
 }
 
-/// Numbers of a header.
+/// Numbers in the header of a cache entry.
 struct EntryHeader {
     text: u64,
     content: u64,
@@ -176,7 +176,7 @@ impl EntryHeader {
             bytes[start..start + length].iter().rev().fold(0u128, |number, &byte| number << 8 | u128::from(byte))
         };
         if bytes[..8] != MAGIC {
-            return Err("it is no piece".to_owned());
+            return Err("it is not a result of this program".to_owned());
         }
         if number(8, 4) != u128::from(VERSION) {
             return Err(format!("version {}, expected {VERSION}", number(8, 4)));
@@ -187,15 +187,16 @@ impl EntryHeader {
 }
 
 impl CacheEntry {
-    /// Opens a piece and looks at every byte of it; of a damaged one what is wrong. `key`: the one it should have.
+    /// Opens a cache entry and verifies the hash of all its bytes. Returns the reason, as inner `Err`, if the entry is
+    /// damaged or its key is not `key`.
     ///
-    /// Plain reads: a map of a large piece would count as memory of this process.
+    /// Reads the file in plain reads: a memory map of a large entry would count as memory of this process.
     pub(super) fn open(path: &Path, key: &str) -> Result<std::result::Result<CacheEntry, String>> {
         let failed = |error| Error::io("read", path)(error);
         let mut file = File::open(path).map_err(Error::io("open", path))?;
         let length = file.metadata().map_err(failed)?.len();
         if length < HEADER as u64 {
-            return Ok(Err(format!("{length} bytes, of a header of {HEADER}")));
+            return Ok(Err(format!("{length} bytes, expected at least {HEADER}")));
         }
         let mut bytes = [0; HEADER];
         file.read_exact(&mut bytes).map_err(failed)?;
@@ -208,12 +209,12 @@ impl CacheEntry {
             return Ok(Err(format!("{length} bytes, expected {}", u128::from(start) + u128::from(content))));
         }
         if key != format!("{own:032x}") {
-            return Ok(Err("it is another piece than its name says".to_owned()));
+            return Ok(Err("its key does not match its file name".to_owned()));
         }
         let mut found = Xxh3::new();
         hash_rest(&mut file, path, &mut found)?;
         if found.digest() != hash {
-            return Ok(Err("its bytes are not those that were written".to_owned()));
+            return Ok(Err("its checksum does not match".to_owned()));
         }
         let mut about = vec![0; text as usize];
         file.seek(SeekFrom::Start(HEADER as u64)).and_then(|_| file.read_exact(&mut about)).map_err(failed)?;
@@ -221,19 +222,19 @@ impl CacheEntry {
         Ok(Ok(CacheEntry { file, about, start, length: content }))
     }
 
-    /// Its file, and where its content begins.
+    /// Returns the file and the offset of the content.
     pub(super) fn into_file(self) -> (File, u64) {
         (self.file, self.start)
     }
 
-    /// What it holds.
+    /// Reads the value of the entry.
     pub(super) fn value<T: DeserializeOwned>(self) -> postcard::Result<T> {
-        // Texts are read into it one after the other.
-        let mut texts = vec![0; self.length.min(MOST_TEXT) as usize];
-        postcard::from_io((BufReader::new(self.file), &mut texts)).map(|(value, _)| value)
+        // Buffer into which the deserializer reads strings one after the other.
+        let mut string_buffer = vec![0; self.length.min(MAX_STRING_BYTES) as usize];
+        postcard::from_io((BufReader::new(self.file), &mut string_buffer)).map(|(value, _)| value)
     }
 
-    /// What it belongs to.
+    /// Returns the description of the input that the entry belongs to.
     pub(super) fn about(&self) -> &str {
         &self.about
     }

@@ -1,4 +1,4 @@
-//! What is in a work folder, for people.
+//! Listing and cleaning of a work folder for the command line.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -8,44 +8,44 @@ use std::path::Path;
 use bytesize::ByteSize;
 use serde::Serialize;
 
-use crate::cache::entry::{CacheEntry, ENDING, EntryName, names};
+use crate::cache::entry::{CacheEntry, EXTENSION, EntryName, names};
 use crate::error::{Error, Result};
 use crate::files::atomic::remove_leftovers;
 use crate::model::ranges;
 
-/// A result that is in a work folder, in one piece or in parts.
+/// Result in a work folder, complete or in shards.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Listed {
-    /// The stage that found it.
+    /// Name of the stage.
     pub stage: String,
-    /// Digest of all that it follows from.
+    /// Cache key of the result, 32 hexadecimal digits.
     pub key: String,
-    /// How many parts it is in; 1: it is whole.
+    /// Number of shards; 1: the result is not divided.
     pub parts: usize,
-    /// Those that are not there.
+    /// Indices of the shards that are missing.
     pub missing: Vec<usize>,
-    /// Those that are damaged, and will be computed again.
+    /// Indices of the damaged shards, which will be computed again.
     pub damaged: Vec<usize>,
-    /// Bytes of its files.
+    /// Bytes of all files of the result.
     pub bytes: u64,
-    /// What it belongs to.
+    /// Description of the input that the result belongs to.
     pub belongs_to: String,
 }
 
-/// Everything in the work folder `folder`, by what it belongs to and by stage. Looks at every byte.
+/// Returns all results in the work folder `folder`, sorted by input and stage. Reads and verifies every byte.
 ///
 /// # Errors
-/// A folder that cannot be read.
+/// Fails if the folder cannot be read.
 pub fn list(folder: &Path) -> Result<Vec<Listed>> {
     let mut found: BTreeMap<(String, String, usize), Listed> = BTreeMap::new();
     for name in names(folder)? {
         let path = folder.join(name.file());
-        let EntryName { stage, key, part: (index, of) } = name;
-        let listed = found.entry((stage.clone(), key.clone(), of)).or_insert_with(|| Listed {
+        let EntryName { stage, key, part: (index, count) } = name;
+        let listed = found.entry((stage.clone(), key.clone(), count)).or_insert_with(|| Listed {
             stage,
             key: key.clone(),
-            parts: of,
-            missing: (1..=of).collect(),
+            parts: count,
+            missing: (1..=count).collect(),
             damaged: Vec::new(),
             bytes: 0,
             belongs_to: String::new(),
@@ -53,7 +53,7 @@ pub fn list(folder: &Path) -> Result<Vec<Listed>> {
         listed.missing.retain(|&missing| missing != index);
         listed.bytes += fs::metadata(&path).map_err(Error::io("read the size of", &path))?.len();
         match CacheEntry::open(&path, &key)? {
-            Ok(piece) => piece.about().clone_into(&mut listed.belongs_to),
+            Ok(entry) => entry.about().clone_into(&mut listed.belongs_to),
             Err(_) => listed.damaged.push(index),
         }
     }
@@ -62,14 +62,14 @@ pub fn list(folder: &Path) -> Result<Vec<Listed>> {
     Ok(found)
 }
 
-/// What was listed, for a person.
+/// Formats a listing for display.
 pub fn text(listed: &[Listed]) -> String {
     let mut out = String::new();
-    for of_run in listed.chunk_by(|a, b| a.belongs_to == b.belongs_to) {
-        let bytes = ByteSize(of_run.iter().map(|of| of.bytes).sum());
-        let belongs_to = if of_run[0].belongs_to.is_empty() { "damaged" } else { &of_run[0].belongs_to };
+    for run_entries in listed.chunk_by(|a, b| a.belongs_to == b.belongs_to) {
+        let bytes = ByteSize(run_entries.iter().map(|entry| entry.bytes).sum());
+        let belongs_to = if run_entries[0].belongs_to.is_empty() { "damaged" } else { &run_entries[0].belongs_to };
         _ = writeln!(out, "{belongs_to}: {}", bytes.display().si());
-        for Listed { stage, key, parts, missing, damaged, bytes, .. } in of_run {
+        for Listed { stage, key, parts, missing, damaged, bytes, .. } in run_entries {
             let mut state = if *parts == 1 { "whole".to_owned() } else { format!("{parts} parts") };
             for (what, which) in [("missing", missing), ("damaged", damaged)] {
                 if !which.is_empty() {
@@ -81,15 +81,16 @@ pub fn text(listed: &[Listed]) -> String {
         }
     }
     if listed.is_empty() {
-        out.push_str("nothing is kept here\n");
+        out.push_str("no results are stored here\n");
     }
     out
 }
 
-/// Removes all pieces of the work folder `folder`, and the folder if nothing else is in it; gives their number and bytes.
+/// Removes all cache entries of the work folder `folder`, and the folder if it is empty then. Returns the number of
+/// files and their bytes.
 ///
 /// # Errors
-/// A folder that cannot be read, a file that cannot be removed.
+/// Fails if the folder cannot be read or a file cannot be removed.
 pub fn clean(folder: &Path) -> Result<(usize, u64)> {
     let (mut files, mut bytes) = (0, 0);
     for name in names(folder)? {
@@ -98,8 +99,8 @@ pub fn clean(folder: &Path) -> Result<(usize, u64)> {
         fs::remove_file(&path).map_err(Error::io("remove", &path))?;
         files += 1;
     }
-    remove_leftovers(folder, ENDING);
-    // Other files are somebody else's.
+    remove_leftovers(folder, EXTENSION);
+    // A folder with files of other programs is not empty, so it stays.
     let _ = fs::remove_dir(folder);
     Ok((files, bytes))
 }

@@ -1,32 +1,32 @@
-//! Digests of all that a result follows from.
+//! Cache keys: digests of everything that a result depends on.
 
 use std::io::{self, Write};
 
 use serde::Serialize;
 use xxhash_rust::xxh3::Xxh3;
 
-/// The digest of everything that a result follows from.
+/// Digest of everything that a result depends on.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct CacheKey(Option<u128>);
 
 impl CacheKey {
-    /// Of whatever: nothing is looked up under it.
+    /// Key of a run without a work folder: no result is looked up under it.
     pub const NONE: CacheKey = CacheKey(None);
 
-    /// Of `value`, by its bits.
+    /// Returns the digest of `value`, by its bits.
     pub fn new(value: &impl Serialize) -> CacheKey {
         let mut hash = Hash(Xxh3::new());
-        // Nothing that is hashed here has a part that cannot be written down.
+        // Every hashed value can be serialized.
         postcard::to_io(value, &mut hash).expect("plain data");
         CacheKey(Some(hash.0.digest128()))
     }
 
-    /// Of what this stands for, and `value`.
+    /// Returns the key that depends on this key and on `value`.
     pub fn and(self, value: &impl Serialize) -> CacheKey {
         self.0.map_or(CacheKey::NONE, |before| CacheKey::new(&(before, CacheKey::new(value))))
     }
 
-    /// In 32 digits.
+    /// Returns the key as 32 hexadecimal digits.
     pub(super) fn text(self) -> String {
         format!("{:032x}", self.0.unwrap_or_default())
     }
@@ -38,7 +38,7 @@ impl Serialize for CacheKey {
     }
 }
 
-/// Takes bytes in.
+/// Writer that hashes the bytes.
 struct Hash(Xxh3);
 
 impl Write for Hash {

@@ -1,12 +1,14 @@
-//! A work folder: what stages found, kept so that a run that was cut short goes on and that several runs share the work.
+//! Cache of stage results in a work folder. An interrupted run continues from it, and several processes share work
+//! through it.
 //!
-//! Every result of a stage is a *piece*, a file named after the stage and the digest of all that the result follows from:
-//! input, cameras, parameters, this program's version and the machine's instructions. So a piece is never out of date; a
-//! changed recipe asks for pieces of other names. A stage that can be divided has *units* (blocks of Gaussians, pictures,
-//! frame blocks); part `i` of `n` of it is a run of consecutive units, and parts join to what the whole would have been,
-//! bit for bit. Pieces appear whole or not at all, and one that is damaged is computed again.
+//! Every result of a stage is a *cache entry*: a file named after the stage and the cache key, the digest of everything
+//! that the result depends on (input, cameras, parameters, version of this program, instruction set of the machine). So
+//! an entry is never out of date; a changed recipe uses entries with other names. A stage that can be divided has
+//! *units* (blocks of Gaussians, views, frame blocks). Shard `i` of `n` is a range of consecutive units, and joined
+//! shards equal the undivided result bit for bit. Entries appear completely or not at all. A damaged entry is computed
+//! again.
 //!
-//! Without a folder nothing is kept: the same calls compute what they are asked for.
+//! Without a work folder nothing is stored, and the same calls always compute.
 
 pub(crate) mod dir;
 pub(crate) mod entry;
@@ -25,7 +27,7 @@ use serde::de::DeserializeOwned;
 
 use crate::cache::dir::CacheDir;
 use crate::cache::entry::EntryName;
-use crate::cache::shard::MOST_PARTS;
+use crate::cache::shard::MAX_SHARDS;
 pub use crate::cache::shard::{Completion, Shard};
 use crate::error::{Error, Result};
 use crate::model::ranges;
@@ -33,58 +35,60 @@ pub use folder::{Listed, clean, list, text};
 pub use key::CacheKey;
 pub use spill::{Spill, SpillWriter};
 
-/// What a user asks for.
+/// Work folder and shard that the user asks for.
 #[derive(Debug, Clone)]
 pub struct CacheRequest {
-    /// The work folder.
+    /// Path of the work folder.
     pub folder: PathBuf,
-    /// Of the next stage that can be divided this part is computed and nothing else; none: everything.
+    /// Shard of the next stage that can be divided. The run computes only this shard. `None`: the run computes
+    /// everything.
     pub part: Option<Shard>,
 }
 
-/// Where the results of stages are kept, if anywhere, and which part of the work is this run's.
+/// Cache of stage results, if there is a work folder, and the shard that this run computes.
 #[derive(Debug, Default)]
 pub struct Cache {
-    place: Option<CacheDir>,
+    dir: Option<CacheDir>,
     part: Option<Shard>,
-    /// Key of the Gaussians that the input is read without; none: it is read with all.
+    /// Cache key of the ids of Gaussians that are excluded from the input; `None`: none are excluded.
     absent: Mutex<Option<CacheKey>>,
-    said: Mutex<Vec<String>>,
+    notes: Mutex<Vec<String>>,
 }
 
 impl Cache {
-    /// Nothing is kept.
+    /// Returns a cache that stores nothing.
     pub fn none() -> Cache {
         Cache::default()
     }
 
-    /// As `asked`, in a folder that is created if it is not there. `about` says in words what the pieces belong to.
+    /// Opens the cache in the work folder of `asked`, which is created if it does not exist. `about` describes in words
+    /// what the entries belong to.
     ///
     /// # Errors
-    /// A folder that cannot be created, or is none.
+    /// Fails if the folder cannot be created or the path is not a folder.
     pub fn open(asked: &CacheRequest, about: String) -> Result<Cache> {
-        Ok(Cache { place: Some(CacheDir::at(&asked.folder, about)?), part: asked.part, ..Cache::default() })
+        Ok(Cache { dir: Some(CacheDir::open_or_create(&asked.folder, about)?), part: asked.part, ..Cache::default() })
     }
 
-    /// From now on everything follows from what `context` stands for, too.
+    /// Makes all further keys also depend on `context`.
     pub fn follow_from(&mut self, context: CacheKey) {
-        if let Some(place) = &mut self.place {
-            place.follow_from(context);
+        if let Some(dir) = &mut self.dir {
+            dir.depend_on(context);
         }
     }
 
-    /// Whether anything is kept.
+    /// Returns whether results are stored.
     pub fn keeps(&self) -> bool {
-        self.place.is_some()
+        self.dir.is_some()
     }
 
-    /// Has all keys made from now on follow from the ids of the Gaussians that the input is read without, if there are any.
+    /// Makes all further keys also depend on the ids of Gaussians that are excluded from the input, if there are any.
     pub fn set_absent(&self, ids: &[u32]) {
         *self.absent.lock().unwrap_or_else(PoisonError::into_inner) =
             (self.keeps() && !ids.is_empty()).then(|| CacheKey::new(&ids));
     }
 
-    /// The key of `value`; where nothing is kept it stands for nothing, and takes no time.
+    /// Returns the cache key of `value`. Without a work folder returns [`CacheKey::NONE`] and does not hash.
     pub fn key(&self, value: &impl Serialize) -> CacheKey {
         let absent = *self.absent.lock().unwrap_or_else(PoisonError::into_inner);
         match (self.keeps(), absent) {
@@ -94,36 +98,36 @@ impl Cache {
         }
     }
 
-    /// Things a person should know, said once.
+    /// Returns the notes for the user since the last call.
     pub fn take_notes(&self) -> Vec<String> {
-        std::mem::take(&mut self.said.lock().unwrap_or_else(PoisonError::into_inner))
+        std::mem::take(&mut self.notes.lock().unwrap_or_else(PoisonError::into_inner))
     }
 
-    fn say(&self, note: String) {
-        self.said.lock().unwrap_or_else(PoisonError::into_inner).push(note);
+    fn add_note(&self, note: String) {
+        self.notes.lock().unwrap_or_else(PoisonError::into_inner).push(note);
     }
 
-    /// What `stage` found earlier for `key`, if that is there.
+    /// Returns the stored result of `stage` for `key`, if there is one.
     ///
     /// # Errors
-    /// A folder that cannot be read. A damaged piece counts as none, with a note.
+    /// Fails if the folder cannot be read. A damaged entry counts as missing and causes a note.
     pub fn find<T: DeserializeOwned>(&self, stage: &str, key: CacheKey) -> Result<Option<T>> {
-        self.find_part(stage, key, Shard::WHOLE)
+        self.read_shard(stage, key, Shard::WHOLE)
     }
 
-    /// Keeps what `stage` found for `key`.
+    /// Stores the result `found` of `stage` for `key`.
     ///
     /// # Errors
-    /// A folder that cannot be written.
+    /// Fails if the folder cannot be written.
     pub fn keep<T: Serialize>(&self, stage: &str, key: CacheKey, found: &T) -> Result<()> {
-        self.keep_part(stage, key, Shard::WHOLE, found)
+        self.write_shard(stage, key, Shard::WHOLE, found)
     }
 
-    /// What `compute` finds as `stage` for `key`, or found earlier. A run of a part computes it too, unless `compute` says
-    /// that it is [not divided](Work::not_divided).
+    /// Returns the stored result of `stage` for `key`, or computes and stores it. A run of a single shard computes it,
+    /// too, unless `compute` ends the run with [`not_divided`](Cache::not_divided).
     ///
     /// # Errors
-    /// Those of `compute`, and of the folder.
+    /// Fails if `compute` fails or the folder cannot be read or written.
     pub fn known<T: Serialize + DeserializeOwned>(
         &self,
         stage: &str,
@@ -138,25 +142,25 @@ impl Cache {
         Ok(found)
     }
 
-    /// Ends a run of a part before `stage`, which cannot be divided.
+    /// Ends a run of a single shard before `stage`, which cannot be divided.
     ///
     /// # Errors
-    /// [`Error::ShardDone`] in a run of a part.
+    /// Fails with [`Error::ShardDone`] in a run of a single shard.
     pub fn not_divided(&self, stage: &str) -> Result<()> {
         match self.part {
             None => Ok(()),
             Some(part) => Err(Error::ShardDone(format!(
-                "part {part}: nothing to do; what comes next, {stage}, is not divided: run without --part"
+                "part {part}: nothing left to do; the next stage, {stage}, is not divided: run without --shard"
             ))),
         }
     }
 
-    /// What `join` makes of what `compute` finds for consecutive runs of all `units` of `stage`, in order; here or in other
-    /// runs. However often they are cut, the same must come out.
+    /// Returns the result of `stage` from shards: `compute` is called for consecutive ranges of all `units`, here or in
+    /// other runs, and `join` combines the results in order. The combined result must not depend on the division.
     ///
     /// # Errors
-    /// Those of `compute` and `join`, and of the folder; [`Error::ShardDone`] in a run of a part, which has computed it then
-    /// if it was not there.
+    /// Fails if `compute` or `join` fails or the folder cannot be used. In a run of a single shard, ends with
+    /// [`Error::ShardDone`] once the shard is stored.
     pub fn divided<T: Serialize + DeserializeOwned, U: Serialize + DeserializeOwned>(
         &self,
         stage: &str,
@@ -168,26 +172,26 @@ impl Cache {
         if let Some(whole) = self.find(stage, key)? {
             return Ok(whole);
         }
-        let find = |part| self.find_part(stage, key, part);
+        let find = |part| self.read_shard(stage, key, part);
         let make = |part: Shard| -> Result<T> {
-            let found = compute(part.of_units(units))?;
-            self.keep_part(stage, key, part, &found)?;
+            let found = compute(part.unit_range(units))?;
+            self.write_shard(stage, key, part, &found)?;
             Ok(found)
         };
-        let of = self.divide(stage, key, &find, &make)?;
-        let whole = match of {
+        let count = self.divide(stage, key, &find, &make)?;
+        let whole = match count {
             1 => join(&mut std::iter::once_with(|| compute(0..units)))?,
-            _ => join(&mut Shard::all(of).map(|part| find(part)?.map_or_else(|| make(part), Ok)))?,
+            _ => join(&mut Shard::all(count).map(|part| find(part)?.map_or_else(|| make(part), Ok)))?,
         };
         self.keep(stage, key, &whole)?;
         self.complete(stage, whole)
     }
 
-    /// The same of content that stays on the disk, written by `write`; in `scratch`, where nothing is kept. Gives the
-    /// units of every part, and their content.
+    /// Works like [`Cache::divided`] for content that stays on disk, written by `write`. Without a work folder the
+    /// content is in a scratch file in the folder `scratch`. Returns the units of every shard and their content.
     ///
     /// # Errors
-    /// Those of [`Cache::divided`].
+    /// Fails where [`Cache::divided`] fails.
     pub fn divided_spill(
         &self,
         stage: &str,
@@ -196,37 +200,40 @@ impl Cache {
         scratch: &Path,
         write: impl Fn(Range<usize>, &mut SpillWriter) -> Result<()>,
     ) -> Result<Vec<(Range<usize>, Spill)>> {
-        let find = |part| match &self.place {
+        let find = |part| match &self.dir {
             None => Ok(None),
-            Some(place) => place.open(&EntryName::new(stage, place.key(key), part), |note| self.say(note)),
+            Some(dir) => dir.open(&EntryName::new(stage, dir.key(key), part), |note| self.add_note(note)),
         };
         let make = |part: Shard| -> Result<Spill> {
-            let mut spilling = match &self.place {
+            let mut spilling = match &self.dir {
                 None => SpillWriter::new(scratch)?,
-                Some(place) => place.begin(&EntryName::new(stage, place.key(key), part))?,
+                Some(dir) => dir.begin_entry(&EntryName::new(stage, dir.key(key), part))?,
             };
-            write(part.of_units(units), &mut spilling)?;
+            write(part.unit_range(units), &mut spilling)?;
             spilling.finish()
         };
         if let Some(whole) = find(Shard::WHOLE)? {
             return Ok(vec![(0..units, whole)]);
         }
-        let of = self.divide(stage, key, &find, &make)?;
-        let spill = |part: Shard| Ok((part.of_units(units), find(part)?.map_or_else(|| make(part), Ok)?));
-        let spills = Shard::all(of).map(spill).collect::<Result<_>>()?;
+        let count = self.divide(stage, key, &find, &make)?;
+        let spill = |part: Shard| Ok((part.unit_range(units), find(part)?.map_or_else(|| make(part), Ok)?));
+        let spills = Shard::all(count).map(spill).collect::<Result<_>>()?;
         self.complete(stage, spills)
     }
 
-    /// All of `stage`, with which a run of its only part ends.
+    /// Returns `whole`, the full result of `stage`. Ends a run of shard 1/1, which is complete then.
     fn complete<T>(&self, stage: &str, whole: T) -> Result<T> {
         match self.part {
-            Some(Shard::WHOLE) => Err(Error::ShardDone(format!("{stage}: part {} is done; it is all", Shard::WHOLE))),
+            Some(Shard::WHOLE) => {
+                Err(Error::ShardDone(format!("{stage}: part {} is done; it is the whole stage", Shard::WHOLE)))
+            }
             _ => Ok(whole),
         }
     }
 
-    /// In how many parts `stage`, of which the whole is not there, is to be taken: they are there or to be made; 1: the
-    /// whole is to be made. A run of one of several parts makes that and ends.
+    /// Returns the number of shards into which `stage` is to be divided, if its full result is not stored. The shards
+    /// are stored already or have to be computed; 1: the full result has to be computed. A run of a single shard
+    /// computes this shard and ends.
     fn divide<T>(
         &self,
         stage: &str,
@@ -234,25 +241,29 @@ impl Cache {
         find: &dyn Fn(Shard) -> Result<Option<T>>,
         make: &dyn Fn(Shard) -> Result<T>,
     ) -> Result<usize> {
-        let Some(place) = &self.place else { return Ok(1) };
-        // By the number of parts, those that are there.
-        let there = place.parts(stage, key)?;
-        if let Some((&of, _)) = there.iter().find(|(of, parts)| parts.len() == **of) {
-            return Ok(of);
+        let Some(dir) = &self.dir else { return Ok(1) };
+        // Stored shards by the number of shards.
+        let stored = dir.stored_shards(stage, key)?;
+        if let Some((&count, _)) = stored.iter().find(|(count, parts)| parts.len() == **count) {
+            return Ok(count);
         }
         let Some(part) = self.part else {
-            let Some((&of, parts)) = there.iter().max_by_key(|(of, parts)| parts.len() * MOST_PARTS / **of) else {
-                self.say_of_others(place, stage, key)?;
+            let Some((&count, parts)) = stored.iter().max_by_key(|(count, parts)| parts.len() * MAX_SHARDS / **count)
+            else {
+                self.note_unusable_shards(dir, stage, key)?;
                 return Ok(1);
             };
-            self.say(format!("{stage}: missing of {of} parts, and computed here: {}", missing(parts, of)));
-            return Ok(of);
+            self.add_note(format!(
+                "{stage}: of {count} parts these are missing and computed here: {}",
+                missing(parts, count)
+            ));
+            return Ok(count);
         };
-        let (_, of) = part.numbers();
-        if of == 1 {
+        let (_, count) = part.numbers();
+        if count == 1 {
             return Ok(1);
         }
-        // One that has its name may be damaged.
+        // A file with the name of this shard may be damaged, so it is read.
         let done = match find(part)? {
             Some(_) => "is there already",
             None => {
@@ -260,43 +271,43 @@ impl Cache {
                 "is done"
             }
         };
-        if there.is_empty() {
-            self.say_of_others(place, stage, key)?;
+        if stored.is_empty() {
+            self.note_unusable_shards(dir, stage, key)?;
         }
-        let there = place.parts(stage, key)?.remove(&of).unwrap_or_default();
-        let mut said = match there.len() == of {
+        let stored = dir.stored_shards(stage, key)?.remove(&count).unwrap_or_default();
+        let mut report = match stored.len() == count {
             true => format!("{stage}: part {part} {done}; all parts are there"),
-            false => format!("{stage}: part {part} {done}; missing: {}", missing(&there, of)),
+            false => format!("{stage}: part {part} {done}; missing: {}", missing(&stored, count)),
         };
-        self.take_notes().iter().for_each(|note| said += &format!("\n  note: {note}"));
-        Err(Error::ShardDone(said))
+        self.take_notes().iter().for_each(|note| report += &format!("\n  note: {note}"));
+        Err(Error::ShardDone(report))
     }
 
-    /// Says that there are parts of `stage` that are none of this run's.
-    fn say_of_others(&self, place: &CacheDir, stage: &str, key: CacheKey) -> Result<()> {
-        for other in place.others(stage, key)? {
-            self.say(format!(
-                "{stage}: parts that are there are of another input, recipe, version or kind of processor, and are not \
-                 used; they belong to {other}"
+    /// Adds a note if shards of `stage` are stored that this run cannot use.
+    fn note_unusable_shards(&self, dir: &CacheDir, stage: &str, key: CacheKey) -> Result<()> {
+        for other in dir.foreign_inputs(stage, key)? {
+            self.add_note(format!(
+                "{stage}: parts in the work folder are not used because they come from another input, recipe, \
+                 program version or kind of processor; they belong to {other}"
             ));
         }
         Ok(())
     }
 
-    fn find_part<T: DeserializeOwned>(&self, stage: &str, key: CacheKey, part: Shard) -> Result<Option<T>> {
-        let Some(place) = &self.place else { return Ok(None) };
-        place.read(&EntryName::new(stage, place.key(key), part), |note| self.say(note))
+    fn read_shard<T: DeserializeOwned>(&self, stage: &str, key: CacheKey, part: Shard) -> Result<Option<T>> {
+        let Some(dir) = &self.dir else { return Ok(None) };
+        dir.read(&EntryName::new(stage, dir.key(key), part), |note| self.add_note(note))
     }
 
-    fn keep_part<T: Serialize>(&self, stage: &str, key: CacheKey, part: Shard, found: &T) -> Result<()> {
-        let Some(place) = &self.place else { return Ok(()) };
-        place.write(&EntryName::new(stage, place.key(key), part), found)
+    fn write_shard<T: Serialize>(&self, stage: &str, key: CacheKey, part: Shard, found: &T) -> Result<()> {
+        let Some(dir) = &self.dir else { return Ok(()) };
+        dir.write(&EntryName::new(stage, dir.key(key), part), found)
     }
 }
 
-/// Which of `of` parts are not `there`.
-fn missing(there: &BTreeSet<usize>, of: usize) -> String {
-    ranges(&(1..=of).filter(|index| !there.contains(index)).collect::<Vec<_>>()).join(", ")
+/// Returns the indices of the `count` shards that are not in `stored`, as text.
+fn missing(stored: &BTreeSet<usize>, count: usize) -> String {
+    ranges(&(1..=count).filter(|index| !stored.contains(index)).collect::<Vec<_>>()).join(", ")
 }
 
 #[cfg(test)]

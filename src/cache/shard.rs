@@ -1,4 +1,4 @@
-//! Parts of the work of a stage.
+//! Shards of the work of a stage.
 
 use std::fmt;
 use std::ops::Range;
@@ -6,24 +6,24 @@ use std::str::FromStr;
 
 use crate::error::{Error, Result};
 
-/// Most parts that a stage is divided into: each is a file, and of pictures all may be open at once.
-pub(super) const MOST_PARTS: usize = 900;
+/// Maximum number of shards of a stage. Each shard is a file, and all files of a stage may be open at once.
+pub(super) const MAX_SHARDS: usize = 900;
 
-/// Result of a run that may have been asked for one part of the work alone.
+/// Result of a run that may have computed only one shard of the work.
 #[derive(Debug)]
 #[must_use]
 pub enum Completion<T> {
     /// The run did all the work.
     Whole(T),
-    /// The run did the part it was asked for and wrote no result. Holds what it did, for a person.
+    /// The run computed one shard and wrote no result. Holds a report for display.
     Shard(String),
 }
 
 impl<T> Completion<T> {
-    /// Turns [`Error::ShardDone`], the early end of a run of one part, into a success.
+    /// Turns [`Error::ShardDone`], the early end of a run of one shard, into a success.
     ///
     /// # Errors
-    /// Every other error of `result`.
+    /// Fails with every other error of `result`.
     pub(crate) fn from_result(result: Result<T>) -> Result<Completion<T>> {
         match result {
             Ok(whole) => Ok(Completion::Whole(whole)),
@@ -33,37 +33,37 @@ impl<T> Completion<T> {
     }
 }
 
-/// Part `index`, counted from 1, of `of`.
+/// Shard `index`, counted from 1, of `count` shards.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Shard {
     index: usize,
-    of: usize,
+    count: usize,
 }
 
 impl Shard {
-    /// All there is.
-    pub(super) const WHOLE: Shard = Shard { index: 1, of: 1 };
+    /// Shard 1 of 1: all the work.
+    pub(super) const WHOLE: Shard = Shard { index: 1, count: 1 };
 
-    /// Every part of `of`.
-    pub(super) fn all(of: usize) -> impl Iterator<Item = Shard> {
-        (1..=of).map(move |index| Shard { index, of })
+    /// Returns all shards of a division into `count`.
+    pub(super) fn all(count: usize) -> impl Iterator<Item = Shard> {
+        (1..=count).map(move |index| Shard { index, count })
     }
 
-    /// Its number, and how many there are.
+    /// Returns the index of the shard and the number of shards.
     pub(super) fn numbers(self) -> (usize, usize) {
-        (self.index, self.of)
+        (self.index, self.count)
     }
 
-    /// Which of `units` are its own.
-    pub(super) fn of_units(self, units: usize) -> Range<usize> {
-        let end = |parts: usize| (units as u128 * parts as u128 / self.of as u128) as usize;
+    /// Returns the range of `units` that belongs to this shard.
+    pub(super) fn unit_range(self, units: usize) -> Range<usize> {
+        let end = |shards: usize| (units as u128 * shards as u128 / self.count as u128) as usize;
         end(self.index - 1)..end(self.index)
     }
 }
 
 impl fmt::Display for Shard {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{}/{}", self.index, self.of)
+        write!(f, "{}/{}", self.index, self.count)
     }
 }
 
@@ -71,10 +71,10 @@ impl FromStr for Shard {
     type Err = String;
 
     fn from_str(text: &str) -> std::result::Result<Shard, String> {
-        let numbers = text.split_once('/').and_then(|(index, of)| Some((index.parse().ok()?, of.parse().ok()?)));
+        let numbers = text.split_once('/').and_then(|(index, count)| Some((index.parse().ok()?, count.parse().ok()?)));
         match numbers {
-            Some((index, of)) if (1..=of).contains(&index) && of <= MOST_PARTS => Ok(Shard { index, of }),
-            _ => Err(format!("expected i/n with 1 <= i <= n <= {MOST_PARTS}, such as 3/8")),
+            Some((index, count)) if (1..=count).contains(&index) && count <= MAX_SHARDS => Ok(Shard { index, count }),
+            _ => Err(format!("expected i/n with 1 <= i <= n <= {MAX_SHARDS}, such as 3/8")),
         }
     }
 }

@@ -1,4 +1,4 @@
-//! Values that wait on the disk: in a file without a name while a run lasts, or in a piece that stays.
+//! Data kept on disk: in an unnamed file that lasts as long as the run, or in a cache entry that stays.
 
 use std::fs::File;
 use std::io::{self, Write as _};
@@ -12,45 +12,46 @@ use crate::cache::entry::EntryWriter;
 use crate::error::{Error, Result};
 use crate::files::atomic::{Replace, StagedFile};
 
-/// Bytes that this process has read back of all [`Spill`]s.
+/// Number of bytes that this process has read back from all [`Spill`]s.
 static READ_BACK: AtomicU64 = AtomicU64::new(0);
 
-/// Content that was written once from its start, to be read in pieces.
+/// Content of a file that is written once and then read in arbitrary pieces.
 #[derive(Debug)]
 pub struct Spill {
     file: File,
     start: u64,
-    at: PathBuf,
+    path: PathBuf,
 }
 
-/// A [`Spill`] that is being written.
+/// Writer of a [`Spill`].
 pub struct SpillWriter {
     writer: EntryWriter,
-    /// What it is called in messages: its own name, or the folder of one without.
-    at: PathBuf,
-    /// Where it gets its name.
+    /// Path for error messages: the file itself, or the folder of an unnamed file.
+    path: PathBuf,
+    /// Temporary file that is renamed when the spill is complete; `None` for an unnamed file.
     staged: Option<StagedFile>,
 }
 
 impl Spill {
-    /// The content of `file` from byte `start` on.
-    pub(super) fn of(file: File, start: u64, at: PathBuf) -> Spill {
-        Spill { file, start, at }
+    /// Returns the content of `file` from byte `start` on.
+    pub(super) fn from_file(file: File, start: u64, path: PathBuf) -> Spill {
+        Spill { file, start, path }
     }
 
-    /// Reads as many bytes as `bytes` has from byte `start` on.
+    /// Reads `bytes.len()` bytes, beginning at byte `start` of the content.
     ///
     /// # Errors
-    /// A failed read; the end of the file.
+    /// Fails if a read fails or the content ends.
     pub fn read(&self, start: u64, bytes: &mut [u8]) -> Result<()> {
         READ_BACK.fetch_add(bytes.len() as u64, Ordering::Relaxed);
-        read_exact_at(&self.file, bytes, self.start + start).map_err(Error::io("read back values from", &self.at))
+        read_exact_at(&self.file, bytes, self.start + start).map_err(Error::io("read back values from", &self.path))
     }
 
-    /// Reads into `bytes` what [`SpillWriter::write_record`] wrote at `start`; gives where the next one is.
+    /// Reads the record that [`SpillWriter::write_record`] wrote at `start` into `bytes`. Returns the start of the next
+    /// record.
     ///
     /// # Errors
-    /// Those of [`Spill::read`].
+    /// Fails where [`Spill::read`] fails.
     pub fn read_record(&self, start: u64, bytes: &mut Vec<u8>) -> Result<u64> {
         let mut length = [0; 8];
         self.read(start, &mut length)?;
@@ -60,72 +61,72 @@ impl Spill {
         Ok(start + 8 + length)
     }
 
-    /// Bytes that this process has read back so far, of all of them.
+    /// Returns the number of bytes that this process has read back from all spills.
     pub fn read_back() -> u64 {
         READ_BACK.load(Ordering::Relaxed)
     }
 }
 
 impl SpillWriter {
-    /// An empty one without a name in `folder`: the system removes it with the process.
+    /// Creates an unnamed file in `folder`. The system removes it when the process ends.
     ///
     /// # Errors
-    /// A folder that does not exist; the system refuses.
+    /// Fails if the folder does not exist or the system refuses.
     pub fn new(folder: &Path) -> Result<SpillWriter> {
         let file = tempfile::tempfile_in(folder).map_err(Error::io("create a scratch file in", folder))?;
         let writer = EntryWriter::new(file, 0, "").map_err(Error::io("write a scratch file in", folder))?;
-        Ok(SpillWriter { writer, at: folder.to_owned(), staged: None })
+        Ok(SpillWriter { writer, path: folder.to_owned(), staged: None })
     }
 
-    /// An empty one that gets the name `target` at its end.
+    /// Creates a file that gets the name `target` when it is complete.
     pub(super) fn named(target: &Path, key: u128, about: &str) -> Result<SpillWriter> {
         let staged = StagedFile::new(target, Replace::Existing)?;
         let file = File::options().read(true).write(true).create_new(true).open(staged.path());
         let file = file.map_err(Error::io("create", target))?;
         let writer = EntryWriter::new(file, key, about).map_err(Error::io("write", target))?;
-        Ok(SpillWriter { writer, at: target.to_owned(), staged: Some(staged) })
+        Ok(SpillWriter { writer, path: target.to_owned(), staged: Some(staged) })
     }
 
-    /// What fails with a write: a scratch file has no name to call it by.
-    fn action(&self) -> &'static str {
+    /// Returns the action for error messages; a scratch file has no name that could be shown.
+    fn write_action(&self) -> &'static str {
         if self.staged.is_some() { "write values to" } else { "write a scratch file in" }
     }
 
-    /// Writes `bytes` behind what is there.
+    /// Appends `bytes`.
     ///
     /// # Errors
-    /// A failed write.
+    /// Fails if the write fails.
     pub fn write(&mut self, bytes: &[u8]) -> Result<()> {
-        let failed = Error::io(self.action(), &self.at);
+        let failed = Error::io(self.write_action(), &self.path);
         self.writer.write_all(bytes).map_err(failed)
     }
 
-    /// Writes the length of `bytes`, then these, behind what is there.
+    /// Appends the length of `bytes`, then `bytes`.
     ///
     /// # Errors
-    /// A failed write.
+    /// Fails if the write fails.
     pub fn write_record(&mut self, bytes: &[u8]) -> Result<()> {
         self.write(&(bytes.len() as u64).to_le_bytes())?;
         self.write(bytes)
     }
 
-    /// Writes `value` behind what is there.
+    /// Appends the serialized `value`.
     pub(super) fn write_value(&mut self, value: &impl Serialize) -> Result<()> {
         let Err(error) = postcard::to_io(value, &mut self.writer) else { return Ok(()) };
         let failed = self.writer.failed.take().unwrap_or_else(|| io::Error::other(error));
-        Err(Error::io(self.action(), &self.at)(failed))
+        Err(Error::io(self.write_action(), &self.path)(failed))
     }
 
-    /// Ends writing: only then can be read, and only then it has its name, if it gets one.
+    /// Completes the file and gives it its name, if it has one. The content can be read only then.
     ///
     /// # Errors
-    /// A failed write.
+    /// Fails if a write fails.
     pub fn finish(self) -> Result<Spill> {
-        let action = self.action();
-        let SpillWriter { writer, at, staged } = self;
+        let write_action = self.write_action();
+        let SpillWriter { writer, path, staged } = self;
         let start = writer.start();
-        let file = writer.finish().map_err(Error::io(action, &at))?;
+        let file = writer.finish().map_err(Error::io(write_action, &path))?;
         staged.map_or(Ok(()), StagedFile::commit)?;
-        Ok(Spill { file, start, at })
+        Ok(Spill { file, start, path })
     }
 }

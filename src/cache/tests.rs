@@ -3,15 +3,16 @@ use std::fs;
 
 use super::*;
 
-fn asked(folder: &Path, part: Option<&str>) -> CacheRequest {
+fn request(folder: &Path, part: Option<&str>) -> CacheRequest {
     CacheRequest { folder: folder.join("work"), part: part.map(|part| part.parse().unwrap()) }
 }
 
-fn open(folder: &Path, part: Option<&str>) -> Cache {
-    Cache::open(&asked(folder, part), "a test".to_owned()).unwrap()
+fn open_cache(folder: &Path, part: Option<&str>) -> Cache {
+    Cache::open(&request(folder, part), "a test".to_owned()).unwrap()
 }
 
-/// Squares of the first `units` numbers, divided; and which units were computed.
+/// Computes the squares of the first `units` numbers in shards. Returns the result and the units that were computed
+/// here.
 fn squares(work: &Cache, units: usize) -> (Result<Vec<u64>>, Vec<usize>) {
     let computed = RefCell::new(Vec::new());
     let compute = |some: Range<usize>| {
@@ -29,7 +30,7 @@ fn squares(work: &Cache, units: usize) -> (Result<Vec<u64>>, Vec<usize>) {
     (found, computed.into_inner())
 }
 
-fn plainly(units: usize) -> Vec<u64> {
+fn undivided_squares(units: usize) -> Vec<u64> {
     (0..units as u64).map(|unit| unit * unit).collect()
 }
 
@@ -41,85 +42,85 @@ fn names_in(folder: &Path) -> Vec<String> {
 }
 
 #[test]
-fn parts_of_any_number_in_any_order_and_twice_join_to_the_whole_and_are_computed_once() {
+fn shards_in_any_order_join_to_the_undivided_result() {
     for (units, of) in [(10, 1), (10, 2), (10, 7), (10, 64), (0, 3), (1, 2)] {
         let folder = tempfile::tempdir().unwrap();
         let mut computed = Vec::new();
         for index in (1..=of).rev().chain([1, of]).take(if of == 1 { 1 } else { 2 * of }) {
-            if of > 1 && names_in_work(folder.path()) == of {
+            if of > 1 && count_files(folder.path()) == of {
                 break;
             }
-            let (found, units) = squares(&open(folder.path(), Some(&format!("{index}/{of}"))), units);
+            let (found, units) = squares(&open_cache(folder.path(), Some(&format!("{index}/{of}"))), units);
             let message = found.unwrap_err().to_string();
             assert!(message.contains(&format!("part {index}/{of} is done")), "{message}");
             computed.extend(units);
         }
         computed.sort_unstable();
         assert_eq!(computed, (0..units).collect::<Vec<_>>(), "{of} parts");
-        let (found, again) = squares(&open(folder.path(), None), units);
-        assert_eq!((found.unwrap(), again), (plainly(units), Vec::new()), "{of} parts");
+        let (found, again) = squares(&open_cache(folder.path(), None), units);
+        assert_eq!((found.unwrap(), again), (undivided_squares(units), Vec::new()), "{of} parts");
     }
 }
 
-fn names_in_work(folder: &Path) -> usize {
+fn count_files(folder: &Path) -> usize {
     let work = folder.join("work");
     if work.exists() { names_in(&work).len() } else { 0 }
 }
 
 #[test]
-fn a_part_that_is_there_is_not_computed_again_and_missing_ones_are_named_and_then_computed() {
+fn stored_shard_is_not_recomputed_missing_ones_are_named() {
     let folder = tempfile::tempdir().unwrap();
     for index in [2, 3, 5] {
-        _ = squares(&open(folder.path(), Some(&format!("{index}/6"))), 12);
+        _ = squares(&open_cache(folder.path(), Some(&format!("{index}/6"))), 12);
     }
-    let (found, computed) = squares(&open(folder.path(), Some("3/6")), 12);
+    let (found, computed) = squares(&open_cache(folder.path(), Some("3/6")), 12);
     assert_eq!(found.unwrap_err().to_string(), "squares: part 3/6 is there already; missing: 1, 4, 6");
     assert!(computed.is_empty());
-    let work = open(folder.path(), None);
+    let work = open_cache(folder.path(), None);
     let (found, computed) = squares(&work, 12);
-    assert_eq!((found.unwrap(), computed), (plainly(12), vec![0, 1, 6, 7, 10, 11]));
-    assert_eq!(work.take_notes(), ["squares: missing of 6 parts, and computed here: 1, 4, 6"]);
-    // From now on the whole is there.
-    assert!(squares(&open(folder.path(), Some("1/2")), 12).0.is_ok());
+    assert_eq!((found.unwrap(), computed), (undivided_squares(12), vec![0, 1, 6, 7, 10, 11]));
+    assert_eq!(work.take_notes(), ["squares: of 6 parts these are missing and computed here: 1, 4, 6"]);
+    // The undivided result is stored now.
+    assert!(squares(&open_cache(folder.path(), Some("1/2")), 12).0.is_ok());
 }
 
 #[test]
-fn parts_of_another_input_are_refused_by_name() {
+fn shards_of_another_input_are_refused_by_name() {
     let folder = tempfile::tempdir().unwrap();
-    let of = |about: &str, part: Option<&str>| {
-        let mut work = Cache::open(&asked(folder.path(), part), about.to_owned()).unwrap();
+    let open_for = |about: &str, part: Option<&str>| {
+        let mut work = Cache::open(&request(folder.path(), part), about.to_owned()).unwrap();
         work.follow_from(CacheKey::new(&about));
         work
     };
-    _ = squares(&of("the first", Some("1/2")), 8);
-    let message = squares(&of("the second", Some("2/2")), 8).0.unwrap_err().to_string();
+    _ = squares(&open_for("the first", Some("1/2")), 8);
+    let message = squares(&open_for("the second", Some("2/2")), 8).0.unwrap_err().to_string();
     assert!(message.contains("missing: 1") && message.contains("they belong to the first"), "{message}");
-    let third = of("the third", None);
-    assert_eq!(squares(&third, 8).0.unwrap(), plainly(8));
+    let third = open_for("the third", None);
+    assert_eq!(squares(&third, 8).0.unwrap(), undivided_squares(8));
     let notes = third.take_notes().join("\n");
     assert!(notes.contains("belong to the first") && notes.contains("belong to the second"), "{notes}");
 }
 
 #[test]
-fn other_inputs_and_parameters_find_nothing() {
+fn other_inputs_and_parameters_do_not_find_the_result() {
     let folder = tempfile::tempdir().unwrap();
     let key = |number: f64| CacheKey::new(&("stage", number));
-    let mut work = open(folder.path(), None);
+    let mut work = open_cache(folder.path(), None);
     work.follow_from(CacheKey::new(&"an input"));
     work.keep("stage", key(0.0), &7u32).unwrap();
     assert_eq!(work.find("stage", key(0.0)).unwrap(), Some(7u32));
     assert_eq!(work.find::<u32>("stage", key(-0.0)).unwrap(), None);
     assert_eq!(work.find::<u32>("another", key(0.0)).unwrap(), None);
-    let mut other = open(folder.path(), None);
+    let mut other = open_cache(folder.path(), None);
     assert_eq!(other.find::<u32>("stage", key(0.0)).unwrap(), None);
     other.follow_from(CacheKey::new(&"another input"));
     assert_eq!(other.find::<u32>("stage", key(0.0)).unwrap(), None);
 }
 
 #[test]
-fn a_piece_cut_short_flipped_or_renamed_is_computed_again_with_a_note() {
+fn damaged_or_renamed_entry_is_recomputed_with_a_note() {
     let folder = tempfile::tempdir().unwrap();
-    _ = squares(&open(folder.path(), None), 40).0.unwrap();
+    _ = squares(&open_cache(folder.path(), None), 40).0.unwrap();
     let (work, [name]) = (folder.path().join("work"), &names_in(&folder.path().join("work"))[..]) else {
         panic!("one piece is kept")
     };
@@ -134,28 +135,28 @@ fn a_piece_cut_short_flipped_or_renamed_is_computed_again_with_a_note() {
     let longer = [&whole[..], &[0]].concat();
     for (case, damaged) in cut.into_iter().chain(flipped).chain([longer]).enumerate() {
         fs::write(work.join(name), damaged).unwrap();
-        let kept = open(folder.path(), None);
+        let kept = open_cache(folder.path(), None);
         let (found, computed) = squares(&kept, 40);
-        assert_eq!((found.unwrap(), computed.len()), (plainly(40), 40), "case {case}");
+        assert_eq!((found.unwrap(), computed.len()), (undivided_squares(40), 40), "case {case}");
         assert!(kept.take_notes()[0].contains("is damaged"), "case {case}");
         assert_eq!(fs::read(work.join(name)).unwrap(), whole, "case {case}");
     }
     let other = name.replace("squares", "cubes");
     fs::rename(work.join(name), work.join(&other)).unwrap();
-    assert_eq!(squares(&open(folder.path(), None), 40).1.len(), 40);
+    assert_eq!(squares(&open_cache(folder.path(), None), 40).1.len(), 40);
 }
 
 #[test]
-fn content_on_the_disk_is_divided_too_and_without_a_folder_it_has_no_name() {
+fn content_on_disk_is_divided_and_unnamed_without_a_folder() {
     let write =
         |some: Range<usize>, to: &mut SpillWriter| some.map(|unit| unit as u8).try_for_each(|byte| to.write(&[byte]));
     let read = |spills: Vec<(Range<usize>, Spill)>| -> Vec<u8> {
-        let of_spill = |(some, spill): &(Range<usize>, Spill)| {
+        let contents = |(some, spill): &(Range<usize>, Spill)| {
             let mut bytes = vec![0; some.len()];
             spill.read(0, &mut bytes).unwrap();
             bytes
         };
-        spills.iter().flat_map(of_spill).collect()
+        spills.iter().flat_map(contents).collect()
     };
     let expected: Vec<u8> = (0..50).collect();
     let folder = tempfile::tempdir().unwrap();
@@ -163,39 +164,40 @@ fn content_on_the_disk_is_divided_too_and_without_a_folder_it_has_no_name() {
     assert_eq!(read(spilled(&Cache::none()).unwrap()), expected);
     assert!(names_in(folder.path()).is_empty());
     for index in 1..=3 {
-        assert!(spilled(&open(folder.path(), Some(&format!("{index}/3")))).is_err());
+        assert!(spilled(&open_cache(folder.path(), Some(&format!("{index}/3")))).is_err());
     }
-    let found = spilled(&open(folder.path(), None)).unwrap();
+    let found = spilled(&open_cache(folder.path(), None)).unwrap();
     assert_eq!(found.len(), 3);
     assert_eq!(read(found), expected);
-    // One of them is damaged.
+    // Damage one of the shards.
     let work = folder.path().join("work");
     fs::write(work.join(&names_in(&work)[1]), b"SPLSPIEC").unwrap();
-    assert_eq!(read(spilled(&open(folder.path(), None)).unwrap()), expected);
+    assert_eq!(read(spilled(&open_cache(folder.path(), None)).unwrap()), expected);
 }
 
 #[test]
-fn what_is_not_divided_ends_a_run_of_a_part() {
+fn undivided_stage_ends_a_run_of_a_shard() {
     let folder = tempfile::tempdir().unwrap();
-    let of_part = |work: &Cache| work.known("alone", CacheKey::new(&1), || work.not_divided("alone").map(|()| 5u8));
-    let message = of_part(&open(folder.path(), Some("1/2"))).unwrap_err().to_string();
-    assert!(message.contains("what comes next, alone, is not divided"), "{message}");
-    assert_eq!(of_part(&open(folder.path(), None)).unwrap(), 5);
-    assert_eq!(of_part(&open(folder.path(), Some("1/2"))).unwrap(), 5);
+    let run_undivided =
+        |work: &Cache| work.known("alone", CacheKey::new(&1), || work.not_divided("alone").map(|()| 5u8));
+    let message = run_undivided(&open_cache(folder.path(), Some("1/2"))).unwrap_err().to_string();
+    assert!(message.contains("the next stage, alone, is not divided"), "{message}");
+    assert_eq!(run_undivided(&open_cache(folder.path(), None)).unwrap(), 5);
+    assert_eq!(run_undivided(&open_cache(folder.path(), Some("1/2"))).unwrap(), 5);
 }
 
 #[test]
-fn a_folder_says_what_is_in_it_and_is_removed_but_for_what_is_somebody_elses() {
+fn listing_names_contents_and_cleaning_keeps_other_files() {
     let folder = tempfile::tempdir().unwrap();
     let work = folder.path().join("work");
-    _ = squares(&open(folder.path(), Some("2/3")), 9);
-    open(folder.path(), None).keep("stage", CacheKey::new(&1), &[1u64, 2]).unwrap();
+    _ = squares(&open_cache(folder.path(), Some("2/3")), 9);
+    open_cache(folder.path(), None).keep("stage", CacheKey::new(&1), &[1u64, 2]).unwrap();
     let listed = list(&work).unwrap();
     assert_eq!(listed.len(), 2);
     let [squares, stage] = [0, 1].map(|k| &listed[k]);
     assert_eq!((&squares.stage[..], squares.parts, &squares.missing[..]), ("squares", 3, &[1, 3][..]));
     assert_eq!((&stage.stage[..], stage.parts, stage.missing.len(), stage.damaged.len()), ("stage", 1, 0, 0));
-    assert!(listed.iter().all(|of| of.belongs_to == "a test" && of.bytes > 48));
+    assert!(listed.iter().all(|entry| entry.belongs_to == "a test" && entry.bytes > 48));
     assert!(text(&listed).contains("3 parts, missing: 1, 3"), "{}", text(&listed));
     fs::write(work.join("mine.txt"), "kept").unwrap();
     assert_eq!(clean(&work).unwrap().0, 2);
@@ -206,13 +208,13 @@ fn a_folder_says_what_is_in_it_and_is_removed_but_for_what_is_somebody_elses() {
 }
 
 #[test]
-fn a_folder_that_is_none_or_has_vanished_is_an_error_that_names_it() {
+fn invalid_or_vanished_folder_is_an_error_that_names_it() {
     let folder = tempfile::tempdir().unwrap();
     fs::write(folder.path().join("work"), "a file").unwrap();
-    let message = Cache::open(&asked(folder.path(), None), String::new()).unwrap_err().to_string();
-    assert!(message.contains("is no folder"), "{message}");
+    let message = Cache::open(&request(folder.path(), None), String::new()).unwrap_err().to_string();
+    assert!(message.contains("expected a folder"), "{message}");
     fs::remove_file(folder.path().join("work")).unwrap();
-    let work = open(folder.path(), None);
+    let work = open_cache(folder.path(), None);
     fs::remove_dir(folder.path().join("work")).unwrap();
     for message in [
         work.keep("stage", CacheKey::new(&1), &1).unwrap_err(),
@@ -220,12 +222,12 @@ fn a_folder_that_is_none_or_has_vanished_is_an_error_that_names_it() {
     ] {
         assert!(message.to_string().contains("work"), "{message}");
     }
-    let message = Cache::open(&asked(&folder.path().join("nowhere"), None), String::new()).unwrap_err().to_string();
+    let message = Cache::open(&request(&folder.path().join("nowhere"), None), String::new()).unwrap_err().to_string();
     assert!(message.contains("nowhere"), "{message}");
 }
 
 #[test]
-fn parts_are_named_by_two_numbers() {
+fn shard_is_parsed_from_index_and_count() {
     for good in ["1/1", "3/8", "64/64"] {
         assert_eq!(good.parse::<Shard>().unwrap().to_string(), good);
     }
@@ -235,7 +237,7 @@ fn parts_are_named_by_two_numbers() {
 }
 
 #[test]
-fn where_nothing_is_kept_no_key_is_made() {
+fn no_key_is_hashed_without_a_work_folder() {
     struct Untouched;
     impl Serialize for Untouched {
         fn serialize<S: serde::Serializer>(&self, _: S) -> std::result::Result<S::Ok, S::Error> {

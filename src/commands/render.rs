@@ -89,7 +89,7 @@ fn render_whole(options: &RenderOptions) -> Result<Rendered> {
     inputs.extend(options.input.cameras.as_deref());
     check_target(output, kind, &inputs, options.overwrite)?;
     if options.input.work.is_some() && kind == Kind::File {
-        return Err(Error::usage("--work: one picture is not divided; expected --all"));
+        return Err(Error::usage("--cache: one picture is not divided; expected --all"));
     }
     let mut scene = open_scene(&InputOptions { split: None, ..options.input.clone() })?;
     scene.keep_to(options.input.memory, |work, limits| needs(work, limits, options.input.work.is_some()))?;

@@ -75,7 +75,7 @@ pub fn video(options: &VideoOptions) -> Result<Filmed> {
     let output = options.output.as_path();
     let format = FilmFormat::from_path(output)?;
     if options.input.work.is_some() {
-        return Err(Error::usage("--work: a film is not divided; --all renders pictures in parts"));
+        return Err(Error::usage("--cache: a film is not divided; --all renders pictures in parts"));
     }
     let mut inputs = vec![options.input.path.as_path()];
     inputs.extend(options.input.cameras.as_deref());

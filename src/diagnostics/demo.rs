@@ -1,4 +1,4 @@
-//! The built-in demo: a generated scene, compressed, and what happened to each kind of Gaussian in it.
+//! The built-in demo: generates a scene, compresses it, and reports the result for each kind of body in it.
 
 use std::fmt::Write as _;
 use std::fs;
@@ -21,40 +21,41 @@ use crate::progress::Events;
 use crate::recipe::Recipe;
 use crate::scene::{InputOptions, Scene};
 
-/// What the demo is asked for.
+/// Options of the demo.
 #[derive(Debug)]
 pub struct DemoOptions {
-    /// Gaussians of the scene.
+    /// Number of Gaussians of the scene.
     pub gaussians: usize,
-    /// Frames of the scene.
+    /// Number of frames of the scene.
     pub frames: usize,
-    /// How many of the Gaussians stay.
+    /// Number of Gaussians to keep.
     pub kept: Target,
-    /// How the scene is compressed.
+    /// Recipe of the compression.
     pub recipe: Recipe,
-    /// Folder that keeps `scene.gseq`, `cameras.json` and `compressed.gseq`; without one everything is gone afterwards.
+    /// Folder for `scene.gseq`, `cameras.json` and `compressed.gseq`; `None`: a temporary folder that is deleted at the
+    /// end.
     pub output: Option<PathBuf>,
-    /// What may be replaced there.
+    /// Policy if the folder exists.
     pub overwrite: Replace,
-    /// Memory to keep to.
+    /// Memory limit of the run.
     pub memory: Budget,
-    /// Where the events of the run go.
+    /// Receiver of the events of the run.
     pub events: Events,
 }
 
-/// What the demo did.
+/// Result of the demo.
 #[derive(Debug)]
 pub struct DemoReport {
-    /// The compression.
+    /// Summary of the compression.
     pub summary: Summary,
-    /// For every body its Gaussians: all, kept as they were or as leaders, merged away.
+    /// Numbers of Gaussians of every body: all, kept unchanged or as leaders, merged into another.
     pub bodies: Vec<(DemoBody, usize, usize, usize)>,
 }
 
-/// Generates the scene, packs it, compresses it.
+/// Generates the scene, writes it as a container and compresses that.
 ///
 /// # Errors
-/// A number to keep that cannot be; those of compressing; a failed write.
+/// Fails if the number of Gaussians to keep is impossible, if the compression fails, or if a file cannot be written.
 pub fn run(options: &DemoOptions) -> Result<DemoReport> {
     options.kept.count(options.gaussians)?;
     let Some(output) = &options.output else {
@@ -69,24 +70,25 @@ pub fn run(options: &DemoOptions) -> Result<DemoReport> {
 }
 
 fn run_in(folder: &Path, options: &DemoOptions) -> Result<DemoReport> {
-    let made = demo_scene::Scene::new(options.gaussians, options.frames);
+    let demo = demo_scene::Scene::new(options.gaussians, options.frames);
     let packed = folder.join("scene.gseq");
-    write_sequence(&made, OutputKind::Gseq, &packed, 1, &options.events)?;
-    let rig = made.rig();
+    write_sequence(&demo, OutputKind::Gseq, &packed, 1, &options.events)?;
+    let rig = demo.rig();
     let cameras = folder.join("cameras.json");
     fs::write(&cameras, cameras_json(&rig)).map_err(Error::io("write", &cameras))?;
 
     let input = Box::new(Container::open(&packed)?);
     let mut scene = Scene::new(PathBuf::from("scene.gseq"), input, rig, Some(Split::Train))?;
     scene.events = options.events.clone();
-    let plain = InputOptions { memory: options.memory, events: options.events.clone(), ..InputOptions::default() };
+    let input_options =
+        InputOptions { memory: options.memory, events: options.events.clone(), ..InputOptions::default() };
     let request = Request {
         target: Some(options.kept),
-        ..Request::new(plain, folder.join("compressed.gseq"), options.recipe.clone())
+        ..Request::new(input_options, folder.join("compressed.gseq"), options.recipe.clone())
     };
     keep_to_budget(&mut scene, &request)?;
     let (mut summary, map) = compress_scene(&scene, &request)?;
-    // Where it lies now it does not stay.
+    // The path is temporary, so it is not reported.
     summary.output.clear();
     let marker = folder.join(MARKER);
     fs::write(&marker, summary.json()).map_err(Error::io("write", &marker))?;
@@ -95,8 +97,9 @@ fn run_in(folder: &Path, options: &DemoOptions) -> Result<DemoReport> {
     let bodies = DemoBody::ALL
         .iter()
         .map(|&body| {
-            let members = made.members(body);
-            // The first Gaussian to reach a place of the output stands for it here.
+            let members = demo.members(body);
+            // The first Gaussian with an index of the output counts as kept; later ones with the same index count as
+            // merged.
             let kept = members
                 .clone()
                 .filter(|&id| map[id].is_some_and(|new| !std::mem::replace(&mut leaders[new as usize], true)));
@@ -108,7 +111,7 @@ fn run_in(folder: &Path, options: &DemoOptions) -> Result<DemoReport> {
     Ok(DemoReport { summary, bodies })
 }
 
-/// The cameras as 3DGS writes them: camera-to-world rotations, every camera at every frame.
+/// Returns the cameras as 3DGS writes them: camera-to-world rotations, every camera at every frame.
 fn cameras_json(rig: &Rig) -> String {
     let camera = |(id, camera): (usize, &Camera)| {
         let to_world = camera.rotation.transpose();
@@ -129,7 +132,7 @@ fn cameras_json(rig: &Rig) -> String {
 }
 
 impl DemoReport {
-    /// A table for a person.
+    /// Returns the report as a text table.
     pub fn text(&self) -> String {
         let mut out = self.summary.text(Detail::Most);
         // Writing to a String cannot fail.

@@ -1,5 +1,5 @@
-//! Checks and experiments of the program itself: the demo scene, the self-check against f64 oracles, sweeps over sizes, and
-//! precision diagrams.
+//! Checks and experiments of the program: the demo scene, the self-check against f64 oracles, sweeps over sizes, and
+//! work-precision diagrams.
 
 pub mod demo;
 pub mod demo_scene;

@@ -1,14 +1,13 @@
-//! Trade-off curves: every method at every kept fraction, and `default` at one of them with more and less time to
-//! refine, compressed as a user would and compared with the original on held-out pictures.
+//! Trade-off curves: compresses with every method at every kept fraction, and with `default` at one fraction and
+//! several numbers of refinement steps, as a user would. Compares each result with the original on held-out views.
 //!
-//! Every point is a whole run, from opening the input to a result on the disk, so that its time and
-//! memory are those of that run alone; the result is deleted once it is measured. Memory: that of
-//! `compress`, then that of `evaluate`.
+//! Every point is a whole run, from opening the input to a result on disk, so that its time and memory are those of
+//! that run alone. The result is deleted once it is measured. Memory: that of `compress`, then that of `evaluate`.
 
 use std::fs;
 use std::path::PathBuf;
 
-use super::whole_run::{WholeRun, result_name, trained};
+use super::whole_run::{WholeRun, result_name, with_training_views};
 use crate::TOOL;
 use crate::error::{Error, Result};
 use crate::evaluation::cost::Repeats;
@@ -21,40 +20,40 @@ use crate::pipeline::Target;
 use crate::report::trade_off::{PAGE, page};
 use crate::scene::{InputOptions, open_scene};
 
-/// What to sweep.
+/// Options of a sweep.
 #[derive(Debug, Clone)]
 pub struct SweepOptions {
-    /// What to read, and the cameras; of its split nothing is used.
+    /// Input and cameras; its split is ignored.
     pub input: InputOptions,
     /// Methods, in the order of the result.
     pub methods: Vec<Method>,
     /// Kept fractions, in (0, 1].
     pub fractions: Vec<f64>,
-    /// Steps of refinement to run `default` with; 0 refines nothing.
+    /// Numbers of refinement steps to run `default` with; 0: no refinement.
     pub steps: Vec<u32>,
-    /// Kept fraction of these, in (0, 1].
+    /// Kept fraction of the runs in `steps`, in (0, 1].
     pub steps_at: f64,
-    /// Times to run every point, at least 1: the median time counts.
+    /// Number of runs of every point, at least 1; the median time is reported.
     pub runs: usize,
-    /// Compare on at most this many frames, evenly; none: all.
+    /// Maximum number of frames to compare, evenly spaced; `None`: all frames.
     pub max_frames: Option<usize>,
-    /// Red, green, blue in [0, 1]; none: as `evaluate`.
+    /// Background color: red, green, blue in [0, 1]; `None`: the default of `evaluate`.
     pub background: Option<[f32; 3]>,
     /// Folder for `sweep.json`, `sweep.csv`, `knobs.csv` and the page.
     pub output: PathBuf,
-    /// Replace an earlier folder.
+    /// Policy if the folder exists.
     pub overwrite: Replace,
 }
 
-/// Runs every method at every fraction, and those that choose a size by themselves at that too; then `default` with
-/// every number of steps. Scores by the training pictures, compares by the held-out ones.
+/// Runs every method at every fraction, and methods that choose a size by themselves at that size too; then `default`
+/// with every number of steps. Scores by the training views, compares by the held-out ones.
 ///
 /// # Errors
-/// Whatever is wrong with input, cameras, fractions or output. Nothing is left behind then.
+/// Fails if the input, the cameras, the fractions or the output are invalid, or if a run fails. No files remain then.
 pub fn sweep(options: &SweepOptions) -> Result<TradeOff> {
     for (flag, fractions) in [("--fractions", &options.fractions[..]), ("--steps-at", &[options.steps_at])] {
-        if let Some(odd) = fractions.iter().find(|&&fraction| !(fraction > 0.0 && fraction <= 1.0)) {
-            return Err(Error::usage(format!("{flag}: expected numbers above 0 and at most 1, found {odd}")));
+        if let Some(invalid) = fractions.iter().find(|&&fraction| !(fraction > 0.0 && fraction <= 1.0)) {
+            return Err(Error::usage(format!("{flag}: expected numbers above 0 and at most 1, found {invalid}")));
         }
     }
     if options.input.is_stream() {
@@ -72,7 +71,7 @@ pub fn sweep(options: &SweepOptions) -> Result<TradeOff> {
     steps.sort_unstable();
     steps.dedup();
 
-    let (mut found, name) = start(options)?;
+    let (mut found, name) = prepare(options)?;
     let run = WholeRun {
         input: &options.input,
         scratch: &staged.path().join("point"),
@@ -85,29 +84,29 @@ pub fn sweep(options: &SweepOptions) -> Result<TradeOff> {
         .methods
         .iter()
         .flat_map(|&method| {
-            let own = method.chooses_size().then_some(None);
-            own.into_iter().chain(fractions.iter().copied().map(Some)).map(move |asked| (method, asked))
+            let chosen_size = method.chooses_size().then_some(None);
+            chosen_size.into_iter().chain(fractions.iter().copied().map(Some)).map(move |fraction| (method, fraction))
         })
         .collect();
     let progress = options.input.events.task("sweep", "points", (points.len() + steps.len()) as u64);
-    for (method, asked) in points {
-        if !beyond_merging(method, asked, &found) {
-            let point = measure(&run, method, asked, &method.means()?, &mut found)?;
+    for (method, fraction) in points {
+        if !exceeds_merging(method, fraction, &found) {
+            let point = measure(&run, method, fraction, &method.means()?, &mut found)?;
             found.points.push(point);
         }
         progress.advance(1);
     }
     let mut settings = Vec::with_capacity(steps.len());
     for value in steps {
-        let (method, asked) = (Method::Default, Some(options.steps_at));
-        let point = measure(&run, method, asked, &refining_by(value)?, &mut found)?;
+        let (method, fraction) = (Method::Default, Some(options.steps_at));
+        let point = measure(&run, method, fraction, &refining_by(value)?, &mut found)?;
         settings.push(Setting { value, point });
         progress.advance(1);
     }
     if !settings.is_empty() {
         found.knobs.push(EffortCurve { parameter: STEPS.to_owned(), settings });
     }
-    if let Some(least) = merged_alone(&found) {
+    if let Some(least) = merge_only_count(&found) {
         let name = Method::PaperMerge.name();
         found.notes.push(format!("{name}: merging alone leaves {least} Gaussians, so it has no smaller points"));
     }
@@ -121,15 +120,15 @@ pub fn sweep(options: &SweepOptions) -> Result<TradeOff> {
     }
     write("sweep.json", found.json())?;
     write(PAGE, page(&found))?;
-    // By this a later run knows the folder as one that it may replace.
+    // With this file a later run recognizes the folder as one that it may replace.
     write(MARKER, format!("{:#}\n", serde_json::json!({ "tool": found.tool })))?;
     staged.commit()?;
     Ok(found)
 }
 
-/// What all points share, and the name by which a result is of the input's kind.
-fn start(options: &SweepOptions) -> Result<(TradeOff, &'static str)> {
-    let scene = open_scene(&trained(&options.input))?;
+/// Returns the data that all points share, and the file name that gives a result the input's kind.
+fn prepare(options: &SweepOptions) -> Result<(TradeOff, &'static str)> {
+    let scene = open_scene(&with_training_views(&options.input))?;
     let name = result_name(&scene)?;
     let found = TradeOff {
         tool: TOOL.to_owned(),
@@ -148,32 +147,32 @@ fn start(options: &SweepOptions) -> Result<(TradeOff, &'static str)> {
     Ok((found, name))
 }
 
-/// Gaussians that merging leaves where nothing is pruned, once that point is measured.
-fn merged_alone(found: &TradeOff) -> Option<usize> {
-    let own = |point: &&TradeOffPoint| point.method == Method::PaperMerge.name() && point.asked.is_none();
-    found.points.iter().find(own).map(|point| point.count)
+/// Returns the number of Gaussians that merging leaves if nothing is pruned, once that point is measured.
+fn merge_only_count(found: &TradeOff) -> Option<usize> {
+    let is_merge_only = |point: &&TradeOffPoint| point.method == Method::PaperMerge.name() && point.asked.is_none();
+    found.points.iter().find(is_merge_only).map(|point| point.count)
 }
 
-/// Whether `method` merges only, and cannot merge that much.
-fn beyond_merging(method: Method, asked: Option<f64>, found: &TradeOff) -> bool {
-    let wanted = asked.filter(|_| method == Method::PaperMerge).map(|fraction| fraction * found.gaussians as f64);
-    wanted.zip(merged_alone(found)).is_some_and(|(wanted, least)| wanted.round() < least as f64)
+/// Returns whether `method` merges only, and cannot reach the fraction `fraction`.
+fn exceeds_merging(method: Method, fraction: Option<f64>, found: &TradeOff) -> bool {
+    let wanted = fraction.filter(|_| method == Method::PaperMerge).map(|fraction| fraction * found.gaussians as f64);
+    wanted.zip(merge_only_count(found)).is_some_and(|(wanted, least)| wanted.round() < least as f64)
 }
 
-/// One point of the sweep.
+/// Measures one point of the sweep.
 fn measure(
     run: &WholeRun<'_>,
     method: Method,
-    asked: Option<f64>,
+    fraction: Option<f64>,
     means: &MethodKind,
     found: &mut TradeOff,
 ) -> Result<TradeOffPoint> {
-    let (evaluation, cost) = run.run(means, asked.map(Target::Ratio), |result| run.compared(result))?;
+    let (evaluation, cost) = run.run(means, fraction.map(Target::Ratio), |result| run.compare(result))?;
     found.pictures = evaluation.cameras.pairs;
     let means = evaluation.loss.overall;
     Ok(TradeOffPoint {
         method: method.name().to_owned(),
-        asked,
+        asked: fraction,
         count: evaluation.count.compressed,
         bytes: evaluation.bytes.compressed,
         psnr: means.psnr,

@@ -1,4 +1,4 @@
-//! A whole run as a user starts it, from opening the input to a result on the disk, and how close its result is.
+//! A whole run as a user starts it, from opening the input to a result on disk, and the quality of its result.
 
 use std::fs;
 use std::path::Path;
@@ -15,36 +15,36 @@ use crate::pipeline::{Request, Target, compress};
 use crate::scene::pictures::PictureSet;
 use crate::scene::{InputOptions, Scene};
 
-/// What all runs that are compared with one another share.
+/// Settings shared by all runs that are compared with one another.
 #[derive(Debug, Clone)]
 pub(crate) struct WholeRun<'a> {
-    /// What to read, and the cameras; scored by the training pictures.
+    /// Input and cameras; the input is scored by the training views.
     pub(crate) input: &'a InputOptions,
-    /// Folder that does not exist, for results while they are measured.
+    /// Path of a folder that does not exist yet, for results while they are measured.
     pub(crate) scratch: &'a Path,
-    /// The result's name, which says its kind.
+    /// File name of the result, which determines its kind.
     pub(crate) name: &'a str,
-    /// How often it is run.
+    /// Number of repetitions of each run.
     pub(crate) repeats: Repeats,
-    /// Compare on at most this many frames, evenly; none: all.
+    /// Maximum number of frames to compare, evenly spaced; `None`: all frames.
     pub(crate) max_frames: Option<usize>,
-    /// Red, green, blue in [0, 1]; none: as `evaluate`.
+    /// Background color: red, green, blue in [0, 1]; `None`: the default of `evaluate`.
     pub(crate) background: Option<[f32; 3]>,
 }
 
 impl WholeRun<'_> {
-    /// Compresses by `means`, measures, and looks at the result by `look` while it is there. Gives what that saw and what
-    /// compressing took.
+    /// Compresses by `means`, measures time and memory, and calls `look` with the path of the result before it is
+    /// deleted. Returns the value of `look` and the cost of the compression.
     ///
     /// # Errors
-    /// Those of `compress` and of `look`.
+    /// Returns the errors of `compress` and of `look`.
     pub(crate) fn run<T>(
         &self,
         means: &MethodKind,
         target: Option<Target>,
         look: impl FnOnce(&Path) -> Result<T>,
     ) -> Result<(T, Cost)> {
-        let input = trained(self.input);
+        let input = with_training_views(self.input);
         let output = self.scratch.join(self.name);
         let clear = || fs::remove_dir_all(self.scratch).map_err(Error::io("remove", self.scratch));
         let create = || fs::create_dir(self.scratch).map_err(Error::io("create", self.scratch));
@@ -62,13 +62,13 @@ impl WholeRun<'_> {
         Ok((seen, cost))
     }
 
-    /// A result beside the original, on held-out pictures.
+    /// Compares a result with the original on held-out views.
     ///
     /// # Errors
-    /// Those of `evaluate`.
-    pub(crate) fn compared(&self, result: &Path) -> Result<Evaluation> {
+    /// Returns the errors of `evaluate`.
+    pub(crate) fn compare(&self, result: &Path) -> Result<Evaluation> {
         evaluate_whole(&EvaluateOptions {
-            original: trained(self.input),
+            original: with_training_views(self.input),
             compressed: result.to_owned(),
             ground_truth: None,
             part: PictureSet::HeldOut,
@@ -82,15 +82,15 @@ impl WholeRun<'_> {
     }
 }
 
-/// The name by which a result is of the kind of `scene`'s input.
+/// Returns the file name that gives a result the kind of `scene`'s input.
 ///
 /// # Errors
-/// An index of a container that cannot be read.
+/// Fails if the index of a container cannot be read.
 pub(crate) fn result_name(scene: &Scene) -> Result<&'static str> {
     Ok(if scene.input.columns()?.is_empty() { "result" } else { "result.gseq" })
 }
 
-/// The same input, scored by its training pictures.
-pub(crate) fn trained(input: &InputOptions) -> InputOptions {
+/// Returns the input, scored by its training views.
+pub(crate) fn with_training_views(input: &InputOptions) -> InputOptions {
     InputOptions { split: Some(Split::Train), ..input.clone() }
 }

@@ -1,48 +1,50 @@
-//! How far the values in a lossy file are from those that were to be written, measured on what the file holds.
+//! Error check of lossy file formats: compares the values a file will hold with the values to be written.
 //!
-//! In: pairs of what each Gaussian is drawn with, before and after. Out: the largest errors, or an error that names the
-//! Gaussian whose error is the furthest beyond its bound. What is never seen, by an opacity below 1/255, has no error.
+//! Input: pairs of original and stored attributes of each Gaussian. Output: the largest errors, or an error that names
+//! the Gaussian furthest beyond its bound. Gaussians with an opacity below 1/255 before and after are never drawn and
+//! are not checked.
 //!
-//! | quantity | bound |
+//! | quantity | maximum error |
 //! |---|---|
-//! | position | half of the Gaussian's own middle scale, or 1/100 of the scene's size |
-//! | scale | a tenth, or 1/100 of the scene's size |
+//! | position | half the median of the Gaussian's three scales, or 1/100 of the scene size if that is larger |
+//! | scale | 1/10 of its value, or 1/100 of the scene size if that is larger |
 //! | opacity, base color | 1/50 |
-//! | coefficients of harmonics above degree 0 | 1 |
+//! | SH coefficients above degree 0 | 1 |
 //!
-//! The size of the scene is the median distance of its Gaussians from their median: one that is far away does not change it.
+//! The scene size is the median distance of the Gaussians from their median position, so a single far Gaussian does not
+//! change it. Distances are maxima over the three axes.
 
 use crate::error::{Error, Result};
 use crate::model::{Column, Gaussians, color, opacity};
 
-/// Part of a Gaussian's own middle scale by which its position may be off.
-const OF_SCALE: f64 = 0.5;
-/// Part of the scene's size by which positions and scales may be off.
-const OF_SCENE: f64 = 0.01;
-/// Part of itself by which a scale may be off.
-const OF_ITSELF: f64 = 0.1;
-/// Bound of opacities and base colors, which are from 0 to 1.
-const OF_ONE: f64 = 0.02;
-/// Bound of coefficients of harmonics above degree 0, whose sum is a color.
-const OF_HARMONIC: f64 = 1.0;
-/// Opacities below this are not drawn.
-const UNSEEN: f64 = 1.0 / 255.0;
+/// Maximum error of a position, as a fraction of the median of the Gaussian's three scales.
+const MAX_POSITION_ERROR_IN_SCALES: f64 = 0.5;
+/// Maximum error of positions and scales, as a fraction of the scene size.
+const MAX_ERROR_IN_SCENE_SIZES: f64 = 0.01;
+/// Maximum error of a scale, as a fraction of its value.
+const MAX_RELATIVE_SCALE_ERROR: f64 = 0.1;
+/// Maximum error of opacities and base colors, which are in [0, 1].
+const MAX_COLOR_ERROR: f64 = 0.02;
+/// Maximum error of SH coefficients above degree 0; their sum is a color.
+const MAX_SH_ERROR: f64 = 1.0;
+/// Opacity below which a Gaussian is not drawn.
+const MIN_OPACITY: f64 = 1.0 / 255.0;
 
-/// What a Gaussian is drawn with.
+/// Attributes of one Gaussian as a renderer uses them.
 #[derive(Debug, Clone, Copy)]
 pub struct Drawn {
-    /// Scene units.
+    /// Position in scene units.
     pub position: [f64; 3],
-    /// Standard deviations, scene units.
+    /// Standard deviations along the three axes, in scene units.
     pub scale: [f64; 3],
-    /// From 0 to 1.
+    /// Opacity in [0, 1].
     pub opacity: f64,
-    /// Base color, red, green, blue.
+    /// Base color: red, green, blue.
     pub color: [f64; 3],
 }
 
 impl Drawn {
-    /// Returns what row `row` of `state` is drawn with.
+    /// Returns the attributes of row `row` of `state` after activation.
     pub fn of_state(state: &Gaussians, row: usize) -> Drawn {
         Drawn {
             position: state.position.row::<3>(row).map(f64::from),
@@ -52,6 +54,7 @@ impl Drawn {
         }
     }
 
+    /// Returns the median of the three scales.
     fn middle_scale(&self) -> f64 {
         let mut scale = self.scale;
         scale.sort_unstable_by(f64::total_cmp);
@@ -59,7 +62,7 @@ impl Drawn {
     }
 }
 
-/// Error of one quantity of one Gaussian.
+/// Error of one quantity of one Gaussian, and its bound.
 #[derive(Debug, Clone, Copy)]
 struct Excess {
     id: usize,
@@ -68,20 +71,21 @@ struct Excess {
     bound: f64,
 }
 
-/// The errors of a file so far.
+/// Errors of a file, accumulated over its Gaussians.
 #[derive(Debug)]
 pub struct Accuracy {
-    /// Median distance of the Gaussians from their median, scene units.
+    /// Scene size: median distance of the Gaussians from their median position, in scene units.
     scene: f64,
-    /// Gaussian that is furthest from the median.
+    /// Index of the Gaussian furthest from the median position.
     furthest: usize,
-    /// Largest error of a position, scene units.
+    /// Largest error of a position so far, in scene units.
     position: f64,
+    /// Error that exceeds its bound by the largest factor; `None` if all are within their bounds.
     worst: Option<Excess>,
 }
 
 impl Accuracy {
-    /// No errors yet of Gaussians at `positions`.
+    /// Starts without errors for a file of Gaussians at `positions`.
     pub fn new(positions: &Column) -> Accuracy {
         let count = positions.len();
         let axis = |axis: usize| positions.plane(axis).iter().map(|&x| f64::from(x));
@@ -95,51 +99,59 @@ impl Accuracy {
         Accuracy { scene: median(distances), furthest, position: 0.0, worst: None }
     }
 
-    /// Returns the largest error of a position so far, scene units.
-    pub fn position(&self) -> f64 {
+    /// Returns the largest error of a position so far, in scene units.
+    pub fn position_error(&self) -> f64 {
         self.position
     }
 
-    /// Adds Gaussian `id`, which was to be drawn with `wanted` and is with `found`.
+    /// Adds Gaussian `id` with its original attributes `wanted` and its stored ones `found`.
     pub fn add(&mut self, id: usize, wanted: &Drawn, found: &Drawn) {
-        if wanted.opacity < UNSEEN && found.opacity < UNSEEN {
+        if wanted.opacity < MIN_OPACITY && found.opacity < MIN_OPACITY {
             return;
         }
-        let room = OF_SCENE * self.scene;
+        let scene_bound = MAX_ERROR_IN_SCENE_SIZES * self.scene;
         let largest = |errors: [f64; 3]| {
             errors.into_iter().fold(0.0, |most: f64, x| if x > most || x.is_nan() { x } else { most })
         };
-        let apart = |a: [f64; 3], b: [f64; 3]| largest([0, 1, 2].map(|k| (a[k] - b[k]).abs()));
-        let of_position = apart(wanted.position, found.position);
-        self.position = largest([self.position, of_position, 0.0]);
+        let max_difference = |a: [f64; 3], b: [f64; 3]| largest([0, 1, 2].map(|k| (a[k] - b[k]).abs()));
+        let position_error = max_difference(wanted.position, found.position);
+        self.position = largest([self.position, position_error, 0.0]);
         let scales = [0, 1, 2].map(|k| (wanted.scale[k], (wanted.scale[k] - found.scale[k]).abs()));
-        // A screen shows no more.
-        let [before, after] = [wanted, found].map(|of| of.color.map(|c| c.clamp(0.0, 1.0)));
-        self.judge(id, "position", of_position, room.max(OF_SCALE * wanted.middle_scale()));
-        scales.into_iter().for_each(|(scale, error)| self.judge(id, "scale", error, room.max(OF_ITSELF * scale)));
-        self.judge(id, "opacity", (wanted.opacity - found.opacity).abs(), OF_ONE);
-        self.judge(id, "color", apart(before, after), OF_ONE);
+        // Screens show colors clamped to [0, 1].
+        let [before, after] = [wanted, found].map(|drawn| drawn.color.map(|c| c.clamp(0.0, 1.0)));
+        self.check_error(
+            id,
+            "position",
+            position_error,
+            scene_bound.max(MAX_POSITION_ERROR_IN_SCALES * wanted.middle_scale()),
+        );
+        scales.into_iter().for_each(|(scale, error)| {
+            self.check_error(id, "scale", error, scene_bound.max(MAX_RELATIVE_SCALE_ERROR * scale))
+        });
+        self.check_error(id, "opacity", (wanted.opacity - found.opacity).abs(), MAX_COLOR_ERROR);
+        self.check_error(id, "color", max_difference(before, after), MAX_COLOR_ERROR);
     }
 
-    /// Adds the error of a coefficient of a harmonic above degree 0 of Gaussian `id`.
-    pub fn add_harmonic(&mut self, id: usize, error: f64) {
-        self.judge(id, "harmonics", error, OF_HARMONIC);
+    /// Adds the error of one SH coefficient above degree 0 of Gaussian `id`.
+    pub fn add_sh(&mut self, id: usize, error: f64) {
+        self.check_error(id, "SH coefficient", error, MAX_SH_ERROR);
     }
 
-    fn judge(&mut self, id: usize, quantity: &'static str, error: f64, bound: f64) {
-        let excess = |of: &Excess| if of.error.is_nan() { f64::INFINITY } else { of.error / of.bound };
+    /// Compares an error with its bound and keeps it if it exceeds the bound by the largest factor so far.
+    fn check_error(&mut self, id: usize, quantity: &'static str, error: f64, bound: f64) {
+        let excess = |e: &Excess| if e.error.is_nan() { f64::INFINITY } else { e.error / e.bound };
         let now = Excess { id, quantity, error, bound };
-        // Not: greater. NaN is beyond every bound.
+        // Written as "not within" because NaN counts as beyond every bound.
         let is_within = error <= bound;
         if !is_within && self.worst.is_none_or(|worst| excess(&now) > excess(&worst)) {
             self.worst = Some(now);
         }
     }
 
-    /// Confirms that all errors are within their bounds in a file that is named by `kind`, for example "a .spz".
+    /// Checks that all errors are within their bounds. `kind` names the file in the message, for example "a .spz".
     ///
     /// # Errors
-    /// One that is not: which Gaussian, by how much, and what to do.
+    /// Fails if an error exceeds its bound. The message names the Gaussian, the error and what to do.
     pub fn check(&self, kind: &str) -> Result<()> {
         let Some(Excess { id, quantity, error, bound }) = self.worst else { return Ok(()) };
         let unit = if matches!(quantity, "position" | "scale") { " scene units" } else { "" };
@@ -151,13 +163,13 @@ impl Accuracy {
             _ => "\n  drop it (compress --drop-ids), or write a .ply or .gseq".to_owned(),
         };
         Err(Error::usage(format!(
-            "{kind} cannot hold the {quantity} of Gaussian {id} of what is written: expected an error of at most \
+            "{kind} cannot store the {quantity} of Gaussian {id} of the output accurately: expected an error of at most \
              {bound:.2e}{unit}, found {error:.2e}{why}"
         )))
     }
 }
 
-/// Median of the finite values; 0 of none.
+/// Returns the (lower) median of the finite values; 0 if there are none.
 fn median(mut values: Vec<f64>) -> f64 {
     values.retain(|value| value.is_finite());
     if values.is_empty() {
@@ -175,7 +187,7 @@ mod tests {
         Drawn { position: [x, 0.0, 0.0], scale: [scale; 3], opacity: 0.5, color: [0.5; 3] }
     }
 
-    /// Five Gaussians two apart from one another, and one far away: a median distance of 2.
+    /// Returns the accuracy of five Gaussians at distances of 2 from one another and one far away. The scene size is 2.
     fn accuracy() -> Accuracy {
         let mut positions = Column::zeros(3, 6);
         positions.plane_mut(0).copy_from_slice(&[0.0, 2.0, 4.0, 6.0, 8.0, 1e7]);
@@ -183,11 +195,11 @@ mod tests {
     }
 
     #[test]
-    fn one_that_is_far_away_does_not_widen_the_bound() {
+    fn far_gaussian_does_not_widen_the_bound() {
         let mut found = accuracy();
         found.add(1, &drawn(2.0, 1e-3), &drawn(2.019, 1e-3));
         found.check("a file").unwrap();
-        assert!((found.position() - 0.019).abs() < 1e-12);
+        assert!((found.position_error() - 0.019).abs() < 1e-12);
         found.add(2, &drawn(4.0, 1e-3), &drawn(4.5, 1e-3));
         let message = found.check("a file").unwrap_err().to_string();
         let parts =

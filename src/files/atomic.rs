@@ -1,13 +1,13 @@
-//! Outputs that appear whole or not at all.
+//! Atomic outputs: an output appears under its name either complete or not at all.
 //!
-//! An output is written in a hidden workspace beside its target ([`workspace`]). `commit` writes it through to the disk
-//! and publishes it under its name ([`publish`]); runs with the same output publish one after the other. Dropping an
-//! output without commit removes it, and [`withdraw_all`] removes everything begun when a signal ends the process. The next
-//! run with the same output repairs and removes what killed runs left ([`leftovers`]). Runs may share folders between
-//! containers and machines.
+//! An output is written in a hidden workspace beside its target ([`workspace`]). `commit` syncs it to disk and
+//! publishes it under its name ([`publish`]); runs with the same output publish one after the other. Dropping an output
+//! without `commit` removes it. [`withdraw_all`] removes all unpublished outputs when a signal ends the process. The
+//! next run with the same output repairs and removes what killed runs left behind ([`leftovers`]). Runs in different
+//! containers and on different machines may share folders.
 //!
-//! [`Replace`] says what is overwritten. Only regular files, folders and links to regular files are ever replaced;
-//! output to a character device or FIFO is written into it.
+//! [`Replace`] determines which existing outputs are overwritten. Only regular files, folders and links to regular
+//! files are ever replaced; output to a character device or FIFO is written into it.
 
 mod destination;
 mod leftovers;
@@ -23,44 +23,45 @@ use std::path::{Path, PathBuf};
 use crate::error::{Error, Result, ShowPath};
 use destination::{Destination, check_replace, destination, real_parent};
 pub use destination::{Kind, Replace};
+use leftovers::clean_up;
 pub use leftovers::remove_leftovers;
-use leftovers::tidy;
 pub use named::MARKER;
-use named::{entries, files_below, name_files, parts, present};
+use named::{add_file_list, entries, exists, files_below, split_target};
 pub use stream::is_standard_output_used;
 pub use warnings::take_warnings;
-use workspace::{SCRATCH, Workspace, named_in};
+use workspace::{SCRATCH, Workspace, user_path};
 pub use workspace::{Withdrawn, withdraw_all};
 
-/// Confirms, before any work, that an output may be written to `target` by a run that reads `inputs`. Completes or removes
-/// an output with this name that a killed run left unfinished.
+/// Checks, before any work, that a run reading `inputs` may write an output to `target`. Completes or removes an output
+/// with this name that a killed run left unfinished.
 ///
-/// Refused are: a target without a name or in a folder that does not exist; a target that is an input,
-/// contains one or lies inside one, whatever `replace` is and whatever links lead there; an existing target that `replace`
-/// does not allow to replace, except an empty folder in place of a folder; a file in place of a folder or the reverse;
-/// sockets, block devices and links to nothing.
+/// Refuses a target without a name or in a folder that does not exist; a target that is an input, contains one or lies
+/// inside one, whatever `replace` is and also through links; an existing target that `replace` does not allow to
+/// replace, except an empty folder to be replaced by a folder; a file in place of a folder or the reverse; sockets,
+/// block devices and dangling links.
 ///
 /// # Errors
-/// Each of these, as [`Error::Usage`]; a failure of the system.
+/// Fails with [`Error::Usage`] in each of these cases, and if a system call fails.
 pub fn check_target(target: &Path, kind: Kind, inputs: &[&Path], replace: Replace) -> Result<()> {
     let shown = target.shown();
     let real_parent = real_parent(target)?;
-    let (_, name) = parts(target)?;
-    // The entry itself and what it leads to: renaming over a link replaces only the link, but a user who names the
-    // input through a link does not mean that.
+    let (_, name) = split_target(target)?;
+    // Compare the entry itself and the file it links to: renaming over a link replaces only the link, but a user who
+    // names the input through a link does not want it replaced.
     let named = real_parent.join(name);
-    let meant = fs::canonicalize(target).unwrap_or_else(|_| named.clone());
+    let linked = fs::canonicalize(target).unwrap_or_else(|_| named.clone());
     for input in inputs {
         let Ok(real) = fs::canonicalize(input) else { continue };
-        if real == named || real == meant {
+        if real == named || real == linked {
             return Err(Error::usage(format!("{shown} is the input itself; give another output")));
         }
-        if real.starts_with(&named) || real.starts_with(&meant) {
+        if real.starts_with(&named) || real.starts_with(&linked) {
             let input = input.shown();
             return Err(Error::usage(format!("{shown} contains the input {input}; give another output")));
         }
-        // A PLY among frames would be another frame, a folder in a model another iteration.
-        if named.starts_with(&real) || meant.starts_with(&real) {
+        // A PLY file added to a folder of frames would become another frame, a folder added to a model another
+        // iteration.
+        if named.starts_with(&real) || linked.starts_with(&real) {
             let input = input.shown();
             return Err(Error::usage(format!("{shown} lies inside the input {input}; give another output")));
         }
@@ -68,7 +69,7 @@ pub fn check_target(target: &Path, kind: Kind, inputs: &[&Path], replace: Replac
     if kind == Kind::File && destination(target)? == Destination::Stream {
         return Ok(());
     }
-    tidy(target);
+    clean_up(target);
     check_replace(target, kind, replace)?;
     check_writable(target, &real_parent)
 }
@@ -89,10 +90,10 @@ fn check_writable(target: &Path, parent: &Path) -> Result<()> {
     }
 }
 
-/// Confirms with [`check_target`] that a file and its `companions` may be written.
+/// Checks that a file and its `companions` may be written, each as in [`check_target`].
 ///
 /// # Errors
-/// Those of [`check_target`]; a `target` that is a device or FIFO, which takes only one file.
+/// Fails like [`check_target`], and if a target is a device or FIFO, which can hold only one file.
 pub fn check_targets(target: &Path, companions: &[PathBuf], inputs: &[&Path], replace: Replace) -> Result<()> {
     for path in std::iter::once(target).chain(companions.iter().map(PathBuf::as_path)) {
         check_target(path, Kind::File, inputs, replace)?;
@@ -106,7 +107,7 @@ pub fn check_targets(target: &Path, companions: &[PathBuf], inputs: &[&Path], re
     Ok(())
 }
 
-/// A file that appears under its name at [`StagedFile::commit`], or is written into a device or FIFO then.
+/// Output file that appears under its name at [`StagedFile::commit`], or is then written into a device or FIFO.
 #[derive(Debug)]
 pub struct StagedFile {
     target: PathBuf,
@@ -117,29 +118,31 @@ pub struct StagedFile {
 }
 
 impl StagedFile {
-    /// Prepares to write `target`, which [`check_target`] has passed. The file itself is not created yet.
+    /// Prepares to write `target`, which must have passed [`check_target`]. Does not create the file yet.
     ///
     /// # Errors
-    /// A target without a name; an existing one that `replace` does not allow to replace; the system refuses.
+    /// Fails if the target has no name, if it exists and `replace` does not allow to replace it, or if a system call
+    /// fails.
     pub fn new(target: &Path, replace: Replace) -> Result<StagedFile> {
         let is_stream = destination(target)? == Destination::Stream;
         let workspace = match is_stream {
-            // Beside a device is no room.
-            true => scratch_in(&std::env::temp_dir())?,
-            false => staged(target, Kind::File, replace)?,
+            // No folder can be created beside a device.
+            true => scratch_workspace(&std::env::temp_dir())?,
+            false => output_workspace(target, Kind::File, replace)?,
         };
         Ok(StagedFile { target: target.to_owned(), content: workspace.content(), replace, is_stream, workspace })
     }
 
-    /// Path to write the file to before [`StagedFile::commit`].
+    /// Returns the path to write the file to before [`StagedFile::commit`].
     pub fn path(&self) -> &Path {
         &self.content
     }
 
-    /// Writes the file through to the disk and gives it its name, in place of an earlier output if that is allowed.
+    /// Syncs the file to disk and publishes it under its name, replacing an earlier output if that is allowed.
     ///
     /// # Errors
-    /// Nothing was written; the target appeared meanwhile; the system refuses. The target is then as it was.
+    /// Fails if nothing was written, if a file that may not be replaced appeared meanwhile, or if a system call fails.
+    /// The target is then unchanged.
     pub fn commit(self) -> Result<()> {
         if self.is_stream {
             return stream::copy(&self.content, &self.target);
@@ -149,7 +152,7 @@ impl StagedFile {
     }
 }
 
-/// A file and its companions beside it, which appear together at [`StagedFiles::commit`].
+/// Output file with companion files beside it, all published together at [`StagedFiles::commit`].
 #[derive(Debug)]
 pub struct StagedFiles {
     file: StagedFile,
@@ -157,11 +160,11 @@ pub struct StagedFiles {
 }
 
 impl StagedFiles {
-    /// Prepares to write `target` and its `companions`, which [`check_targets`] has passed. The names of the companions
-    /// begin with that of `target`, and the first companion is the summary.
+    /// Prepares to write `target` and its `companions`, which must have passed [`check_targets`]. The names of the
+    /// companions start with that of `target`, and the first companion is the summary.
     ///
     /// # Errors
-    /// Those of [`StagedFile::new`] for each of them.
+    /// Fails like [`StagedFile::new`] for each of the files.
     pub fn new(target: &Path, companions: Vec<PathBuf>, replace: Replace) -> Result<StagedFiles> {
         let file = StagedFile::new(target, replace)?;
         for companion in &companions {
@@ -170,37 +173,37 @@ impl StagedFiles {
         Ok(StagedFiles { file, companions })
     }
 
-    /// Path to write the file to before [`StagedFiles::commit`].
+    /// Returns the path to write the file to before [`StagedFiles::commit`].
     pub fn path(&self) -> &Path {
         self.file.path()
     }
 
-    /// Path to write the companion with this index to.
+    /// Returns the path to write companion `index` to.
     pub fn companion(&self, index: usize) -> PathBuf {
-        self.file.workspace.folder.join(companion_content(index))
+        self.file.workspace.folder.join(companion_name(index))
     }
 
-    /// Lists all files in the summary, writes them through to the disk and publishes them: the summary first, so that the
-    /// others are known as results from the start, the file itself last.
+    /// Lists all files in the summary, syncs them to disk and publishes them. The summary comes first, so that the
+    /// others are known as results from the start; the file itself comes last.
     ///
-    /// Runs with the same output publish one after the other, so files of different runs are never mixed. After a kill in
-    /// between the next run with this output publishes the remaining files.
+    /// Runs with the same output publish one after the other, so files of different runs are never mixed. If the
+    /// process is killed in between, the next run with this output publishes the remaining files.
     ///
     /// # Errors
-    /// A summary that is no JSON object; those of [`StagedFile::commit`] for each.
+    /// Fails if the summary is not a JSON object, and like [`StagedFile::commit`] for each file.
     pub fn commit(self) -> Result<()> {
         let StagedFiles { file, companions } = &self;
         let names = companions.iter().chain([&file.target]);
-        let names = names.map(|path| Ok(parts(path)?.1.to_string_lossy().into_owned()));
+        let names = names.map(|path| Ok(split_target(path)?.1.to_string_lossy().into_owned()));
         let mut names = names.collect::<Result<Vec<String>>>()?;
         names.sort();
         if !companions.is_empty() {
-            name_files(&self.companion(0), &names)?;
+            add_file_list(&self.companion(0), &names)?;
         }
         let mut files: Vec<(String, &Path)> = Vec::new();
         for (index, target) in companions.iter().enumerate() {
             sync(&self.companion(index))?;
-            files.push((companion_content(index), target));
+            files.push((companion_name(index), target));
         }
         sync(file.path())?;
         files.push((workspace::CONTENT.to_owned(), &file.target));
@@ -208,11 +211,12 @@ impl StagedFiles {
     }
 }
 
-fn companion_content(index: usize) -> String {
+/// Returns the name of companion `index` in the workspace.
+fn companion_name(index: usize) -> String {
     format!("companion-{index}")
 }
 
-/// A folder that appears under its name at [`StagedFolder::commit`].
+/// Output folder that appears under its name at [`StagedFolder::commit`].
 #[derive(Debug)]
 pub struct StagedFolder {
     target: PathBuf,
@@ -222,56 +226,57 @@ pub struct StagedFolder {
 }
 
 impl StagedFolder {
-    /// Creates an empty folder for `target`, which [`check_target`] has passed.
+    /// Creates an empty folder for `target`, which must have passed [`check_target`].
     ///
     /// # Errors
-    /// A target without a name; an existing one that `replace` does not allow to replace; the system refuses.
+    /// Fails if the target has no name, if it exists and `replace` does not allow to replace it, or if a system call
+    /// fails.
     pub fn new(target: &Path, replace: Replace) -> Result<StagedFolder> {
-        let workspace = staged(target, Kind::Folder, replace)?;
+        let workspace = output_workspace(target, Kind::Folder, replace)?;
         let content = workspace.content();
         fs::create_dir(&content).map_err(Error::io("create", &content))?;
         Ok(StagedFolder { target: target.to_owned(), content, replace, workspace })
     }
 
-    /// Folder to write into before [`StagedFolder::commit`].
+    /// Returns the folder to write into before [`StagedFolder::commit`].
     pub fn path(&self) -> &Path {
         &self.content
     }
 
-    /// Lists the files in the folder's summary, if it has one, writes everything through to the disk and publishes it.
+    /// Lists the files in the summary of the folder, if it has one, syncs everything to disk and publishes the folder.
     ///
-    /// An earlier output is moved aside, replaced, then deleted, and files in it that are not its own are moved into the new
-    /// one. A run that is killed in between leaves the earlier or the new folder whole; the foreign files are in it or in the
-    /// hidden workspace, from where the next run with this output moves them.
+    /// An earlier output is moved aside, replaced, then deleted. Files in it that do not belong to it are moved into
+    /// the new folder. If the run is killed in between, either the earlier or the new folder is complete; the foreign
+    /// files are in it or in the hidden workspace, from where the next run with this output moves them.
     ///
     /// # Errors
-    /// A summary that is no JSON object; the target appeared meanwhile and may not be replaced; the system refuses.
-    /// The target is then as it was.
+    /// Fails if the summary is not a JSON object, if the target appeared meanwhile and may not be replaced, or if a
+    /// system call fails. The target is then unchanged.
     pub fn commit(self) -> Result<()> {
         let summary = self.content.join(MARKER);
-        if present(&summary) {
-            name_files(&summary, &files_below(&self.content)?)?;
+        if exists(&summary) {
+            add_file_list(&summary, &files_below(&self.content)?)?;
         }
         sync_tree(&self.content)?;
         publish::publish_folder(&self.workspace, &self.target, self.replace)
     }
 }
 
-/// Creates the workspace of an output. Leftovers of killed runs with this output are repaired and removed first.
-fn staged(target: &Path, kind: Kind, replace: Replace) -> Result<Workspace> {
-    tidy(target);
+/// Creates the workspace of an output after repairing and removing leftovers of killed runs with this output.
+fn output_workspace(target: &Path, kind: Kind, replace: Replace) -> Result<Workspace> {
+    clean_up(target);
     check_replace(target, kind, replace)?;
     Workspace::beside(target)
 }
 
-/// Creates a workspace for scratch files in `folder`. Scratch files of killed runs are removed first.
-fn scratch_in(folder: &Path) -> Result<Workspace> {
+/// Creates a workspace for scratch files in `folder` after removing scratch files of killed runs.
+fn scratch_workspace(folder: &Path) -> Result<Workspace> {
     let target = folder.join(SCRATCH);
-    tidy(&target);
+    clean_up(&target);
     Workspace::beside(&target)
 }
 
-/// A file for as long as a run lasts, for whoever needs a path: removed when this is dropped.
+/// Temporary file with a path, removed when this value is dropped.
 #[derive(Debug)]
 pub struct ScratchFile {
     content: PathBuf,
@@ -279,43 +284,43 @@ pub struct ScratchFile {
 }
 
 impl ScratchFile {
-    /// A name in `folder` that no other file has. The file itself is not created yet.
+    /// Reserves an unused path in `folder`. Does not create the file yet.
     ///
     /// # Errors
-    /// A folder that does not exist; the system refuses.
+    /// Fails if the folder does not exist or a system call fails.
     pub fn new(folder: &Path) -> Result<ScratchFile> {
-        let workspace = scratch_in(folder)?;
+        let workspace = scratch_workspace(folder)?;
         Ok(ScratchFile { content: workspace.content(), _workspace: workspace })
     }
 
-    /// Where to write it.
+    /// Returns the path to write the file to.
     pub fn path(&self) -> &Path {
         &self.content
     }
 }
 
-/// A folder for as long as a run lasts: removed when this is dropped.
+/// Temporary folder, removed when this value is dropped.
 #[derive(Debug)]
 pub struct ScratchFolder(ScratchFile);
 
 impl ScratchFolder {
-    /// Creates an empty folder in `folder`.
+    /// Creates an empty temporary folder in `folder`.
     ///
     /// # Errors
-    /// A folder that does not exist; the system refuses.
+    /// Fails if the folder does not exist or a system call fails.
     pub fn new(folder: &Path) -> Result<ScratchFolder> {
         let scratch = ScratchFile::new(folder)?;
         fs::create_dir(scratch.path()).map_err(Error::io("create", scratch.path()))?;
         Ok(ScratchFolder(scratch))
     }
 
-    /// The folder to write into.
+    /// Returns the folder to write into.
     pub fn path(&self) -> &Path {
         self.0.path()
     }
 }
 
-/// The same failure of the system, of the file that a person asked for where it is one that it grows in meanwhile.
+/// Replaces the path of a hidden workspace in a system error by the output path that the user gave.
 pub fn as_named(error: Error) -> Error {
     let (action, path, source) = match error {
         Error::Io { action, path, source } | Error::Container(gseq::Error::Io { action, path, source }) => {
@@ -323,18 +328,19 @@ pub fn as_named(error: Error) -> Error {
         }
         error => return error,
     };
-    match named_in(&path) {
+    match user_path(&path) {
         Some((path, true)) => Error::Io { action: "write a scratch file in", path, source },
         Some((path, false)) => Error::Io { action, path, source },
         None => Error::Io { action, path, source },
     }
 }
 
-/// Writes a file through to the disk.
+/// Syncs a file to disk.
 fn sync(path: &Path) -> Result<()> {
     splat_platform::sync_file(path).map_err(Error::io("sync", path))
 }
 
+/// Syncs all files and folders below `folder` to disk.
 fn sync_tree(folder: &Path) -> Result<()> {
     for path in entries(folder)?.iter().map(|entry| folder.join(entry)) {
         if path.is_dir() { sync_tree(&path)? } else { sync(&path)? }

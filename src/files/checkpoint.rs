@@ -1,10 +1,11 @@
-//! PyTorch checkpoints: whatever `torch.save` wrote, with its tensors where they lie.
+//! PyTorch checkpoints as written by `torch.save`.
 //!
-//! Input: a path. Output: the tree of the pickle, and the values of tensors asked for. Nothing in the pickle is executed.
-//! Memory: the list of files, the tree, and one storage at a time, each checked against the [`ReadLimit`] before it is
-//! allocated. A tensor is `torch._utils._rebuild_tensor_v2(storage, offset,
-//! size, stride, …)`, or a parameter made of one; its storage is an entry of the archive, and storages may be shared. On which
-//! device one lay is no matter here.
+//! Input: a path. Output: the object tree of the pickle, and the values of requested tensors. Nothing in the pickle is
+//! executed. Memory: the list of files, the tree and one storage at a time; each is checked against the [`ReadLimit`]
+//! before it is allocated.
+//!
+//! A tensor is `torch._utils._rebuild_tensor_v2(storage, offset, size, stride, …)`, or a parameter made of one. Its
+//! storage is an entry of the zip archive and may be shared by several tensors. The device of a storage is ignored.
 
 pub(crate) mod write;
 
@@ -20,21 +21,21 @@ use zip::{CompressionMethod, ZipArchive};
 use super::pickle::Wrong;
 pub(crate) use super::pickle::{MAX_DEPTH, Node, NodeId, Pickle};
 use super::shared_file::SharedFile;
-use super::zip_directory::announced;
+use super::zip_directory::declared_directory;
 use crate::error::{Error, Result, quoted};
 use crate::limits::ReadLimit;
 
-/// Maximum number of bytes of a pickle: that of ten thousand tensors has about one million.
+/// Maximum size of a pickle in bytes. A pickle of ten thousand tensors has about one million.
 const MAX_PICKLE: u64 = 1 << 23;
-/// Maximum number of files of an archive.
+/// Maximum number of files in an archive.
 const MAX_ENTRIES: u64 = 1 << 16;
-/// Bytes that the list of files takes for each of them, beside three times its own bytes.
+/// Memory in bytes that the list of files takes per file, in addition to three times its size in the archive.
 const ENTRY_BYTES: u64 = 640;
-/// A view may repeat its storage (stride 0), so a small file can declare any number of values. No trained model means more
-/// than so many times what it stores.
+/// Maximum number of values that tensors may have per stored value. A view may repeat its storage (stride 0), so a
+/// small file can declare any number of values; no trained model needs more than this.
 const MAX_EXPANSION: usize = 4;
 
-/// An open checkpoint.
+/// Open checkpoint.
 #[derive(Debug)]
 pub(crate) struct Checkpoint {
     path: PathBuf,
@@ -42,24 +43,25 @@ pub(crate) struct Checkpoint {
     file: SharedFile,
     archive: ZipArchive<SharedFile>,
     pickle: Pickle,
-    /// Place of the pickle among the entries.
-    pickle_at: usize,
-    /// By key the place of a storage among the entries, and its bytes.
+    /// Index of the pickle among the entries of the archive.
+    pickle_index: usize,
+    /// Storages by key: index of the entry in the archive, and size in bytes.
     storages: HashMap<String, (usize, usize)>,
 }
 
-/// A type of the values of a tensor.
+/// Type of the values of a tensor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum ValueType {
     F16,
     BF16,
     F32,
     F64,
-    /// Whole numbers, or truth values, of so many bytes.
+    /// Integers, booleans or complex numbers: name of the type and bytes per value.
     Other(&'static str, usize),
 }
 
 impl ValueType {
+    /// Returns the value type of a PyTorch storage class; `None` if it is unknown.
     fn from_global(global: &str) -> Option<ValueType> {
         Some(match global {
             "torch.HalfStorage" => ValueType::F16,
@@ -78,7 +80,7 @@ impl ValueType {
         })
     }
 
-    /// As PyTorch calls it.
+    /// Returns the name of the type in PyTorch.
     pub(crate) fn name(self) -> &'static str {
         match self {
             ValueType::F16 => "float16",
@@ -89,7 +91,7 @@ impl ValueType {
         }
     }
 
-    /// Bytes of a value.
+    /// Returns the number of bytes per value.
     pub(crate) fn bytes(self) -> usize {
         match self {
             ValueType::F16 | ValueType::BF16 => 2,
@@ -99,12 +101,12 @@ impl ValueType {
         }
     }
 
-    /// Whether it is a floating-point type.
+    /// Returns whether this is a floating-point type.
     pub(crate) fn is_float(self) -> bool {
         !matches!(self, ValueType::Other(..))
     }
 
-    /// The value in `stored`, of a floating-point type.
+    /// Decodes one stored floating-point value. Returns NaN for other types.
     fn decode(self, stored: &[u8]) -> f32 {
         match (self, stored) {
             (ValueType::F16, &[a, b]) => f16::from_le_bytes([a, b]).to_f32(),
@@ -115,7 +117,7 @@ impl ValueType {
         }
     }
 
-    /// Stores `value`; a type that is no floating-point one takes zeros.
+    /// Encodes `value` into `stored`; writes zeros for types that are not floating-point.
     pub(crate) fn encode(self, value: f32, stored: &mut [u8]) {
         match self {
             ValueType::F16 => stored.copy_from_slice(&f16::from_f32(value).to_le_bytes()),
@@ -127,12 +129,12 @@ impl ValueType {
     }
 }
 
-/// A view of a storage: element `i` of its `shape` is value `offset + Σ i·stride`.
+/// View of a storage: the element with indices `i` is value `offset + Σ i·stride` of the storage.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct TensorView {
-    /// The node that makes it: of a parameter the tensor inside.
+    /// Node that builds the tensor; for a parameter the node of its tensor.
     pub(crate) id: NodeId,
-    /// What names its storage.
+    /// Key of its storage.
     pub(crate) storage: String,
     pub(crate) kind: ValueType,
     pub(crate) shape: Vec<usize>,
@@ -141,10 +143,10 @@ pub(crate) struct TensorView {
     pub(crate) places: Places,
 }
 
-/// Where in the pickle numbers of a tensor stand.
+/// Byte ranges in the pickle of the numbers that describe a tensor.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Places {
-    /// How many values its storage has.
+    /// Number of values of its storage.
     pub(crate) numel: Range<usize>,
     pub(crate) offset: Range<usize>,
     pub(crate) shape: Vec<Range<usize>>,
@@ -152,18 +154,18 @@ pub(crate) struct Places {
 }
 
 impl TensorView {
-    /// Its type and shape, for a person.
+    /// Returns type and shape for messages.
     pub(crate) fn describe(&self) -> String {
         let shape = &self.shape;
         format!("{} {shape:?}", self.kind.name())
     }
 
-    /// Number of elements; none where that is no number.
+    /// Returns the number of elements; `None` if it overflows.
     pub(crate) fn len(&self) -> Option<usize> {
         self.shape.iter().try_fold(1usize, |product, &length| product.checked_mul(length))
     }
 
-    /// Calls `take` with the place in the storage of every element, the last index fastest.
+    /// Calls `take` with the storage index of every element, the last axis fastest.
     pub(crate) fn each(&self, mut take: impl FnMut(usize)) {
         if self.shape.contains(&0) {
             return;
@@ -191,24 +193,24 @@ impl Checkpoint {
     /// Opens the checkpoint at `path` within `memory`.
     ///
     /// # Errors
-    /// A file that is no zip archive of stored entries, or is cut short; a pickle that cannot be read; more memory than
-    /// allowed.
+    /// Fails if the file is not a zip archive of uncompressed entries or is cut short, if its pickle cannot be read, or
+    /// if it needs more memory than allowed.
     pub(crate) fn open(path: &Path, memory: ReadLimit) -> Result<Checkpoint> {
         let file = SharedFile::open(path)?;
         let wrong = |place: &str, found: String| {
             Error::input(path, place, "a checkpoint as torch.save writes it", found).hint(
-                "if the file was copied, copy it again; one of PyTorch before 1.6 has to be loaded and saved anew",
+                "if the file was copied, copy it again; if PyTorch before 1.6 saved it, load it and save it again",
             )
         };
         let broken = |error: zip::result::ZipError| wrong(LIST, error.to_string());
-        let directory = announced(&mut file.clone()).map_err(|error| wrong(LIST, error.to_string()))?;
+        let directory = declared_directory(&mut file.clone()).map_err(|error| wrong(LIST, error.to_string()))?;
         if directory.entries > MAX_ENTRIES {
             return Err(wrong(LIST, format!("{} files", directory.entries)));
         }
         let listed = 3 * directory.bytes.min(file.len()) + ENTRY_BYTES * directory.entries;
         memory.check(path, LIST, &format!("the names of {} files", directory.entries), listed)?;
         let mut archive = ZipArchive::new(file.clone()).map_err(broken)?;
-        let (mut storages, mut pickle_at) = (HashMap::new(), None);
+        let (mut storages, mut pickle_index) = (HashMap::new(), None);
         for index in 0..archive.len() {
             let entry = archive.by_index(index).map_err(broken)?;
             let at = |found: &str| wrong(&format!("file {}", quoted(entry.name())), found.to_owned());
@@ -216,7 +218,7 @@ impl Checkpoint {
                 return Err(Error::input(
                     path,
                     format!("file {}", quoted(entry.name())),
-                    "a file that is stored as it is, as torch.save stores it",
+                    "an uncompressed file, as torch.save writes it",
                     "a compressed one",
                 )
                 .hint("load the checkpoint with torch.load and save it again with torch.save"));
@@ -224,7 +226,7 @@ impl Checkpoint {
             if entry.data_start().checked_add(entry.size()).is_none_or(|end| end > file.len()) {
                 return Err(at("cut short"));
             }
-            match inside(entry.name()) {
+            match without_first_folder(entry.name()) {
                 PICKLE if entry.size() > MAX_PICKLE => {
                     let place = entry.name().to_owned();
                     return Err(Error::input(
@@ -234,10 +236,10 @@ impl Checkpoint {
                         format!("{} bytes", entry.size()),
                     ));
                 }
-                PICKLE if pickle_at.is_some() => return Err(at("a second one")),
-                PICKLE => pickle_at = Some((index, entry.size())),
-                "byteorder" if starts_big(&file, entry.data_start()) => {
-                    return Err(wrong("byteorder", "values of which the highest byte comes first".into()));
+                PICKLE if pickle_index.is_some() => return Err(at("a second pickle")),
+                PICKLE => pickle_index = Some((index, entry.size())),
+                "byteorder" if is_big_endian_marker(&file, entry.data_start()) => {
+                    return Err(wrong("byteorder", "big-endian values".into()));
                 }
                 other => {
                     if let Some(key) = other.strip_prefix("data/") {
@@ -246,11 +248,11 @@ impl Checkpoint {
                 }
             }
         }
-        let (pickle_at, bytes) = pickle_at.ok_or_else(|| wrong(LIST, format!("no {PICKLE}")))?;
+        let (pickle_index, bytes) = pickle_index.ok_or_else(|| wrong(LIST, format!("no {PICKLE}")))?;
         memory.check(path, PICKLE, "the list of files and the pickle", listed + bytes)?;
-        // An eighth is left to the allocator: what was freed before does not fit what is asked for now.
+        // Keep an eighth for the allocator: memory that was freed before may not fit new requests.
         let left = (memory.bytes() - listed - bytes) / 8 * 7;
-        let bytes = bytes_of(&mut archive, &file, pickle_at).map_err(|error| wrong(PICKLE, error.to_string()))?;
+        let bytes = read_entry(&mut archive, &file, pickle_index).map_err(|error| wrong(PICKLE, error.to_string()))?;
         let pickle = Pickle::read(&bytes, left).map_err(|error| match error {
             Wrong::Malformed(at, found) => wrong(&format!("{PICKLE}, byte {at}"), found),
             Wrong::TooMuch(at, expected, found) => Error::input(path, format!("{PICKLE}, byte {at}"), expected, found)
@@ -264,30 +266,30 @@ impl Checkpoint {
                 })
             }
         })?;
-        Ok(Checkpoint { path: path.to_owned(), memory, file, archive, pickle, pickle_at, storages })
+        Ok(Checkpoint { path: path.to_owned(), memory, file, archive, pickle, pickle_index, storages })
     }
 
-    /// Confirms that reading `what` at `place` may take `bytes` of memory.
+    /// Checks that reading `what` at `place` may take `bytes` of memory.
     pub(crate) fn allow(&self, place: &str, what: &str, bytes: u64) -> Result<()> {
         self.memory.check(&self.path, place, what, bytes)
     }
 
-    /// The tree.
+    /// Returns the object tree.
     pub(crate) fn pickle(&self) -> &Pickle {
         &self.pickle
     }
 
-    /// That what stands at `place` is something else than was expected.
+    /// Builds the error for unexpected content at `place`.
     pub(crate) fn wrong(&self, place: &str, expected: impl Into<String>, found: impl Into<String>) -> Error {
         Error::input(&self.path, place, expected, found)
     }
 
-    /// What a node is, for a person.
+    /// Describes a node for messages.
     pub(crate) fn describe(&self, id: NodeId) -> String {
         self.tensor(id).map_or_else(|| self.pickle.describe(id), |tensor| format!("a tensor, {}", tensor.describe()))
     }
 
-    /// The tensor at a node: itself, or what a parameter is made of.
+    /// Returns the tensor at a node: the node itself, or the tensor of a parameter.
     pub(crate) fn tensor(&self, id: NodeId) -> Option<TensorView> {
         match self.pickle.call(id)? {
             ("torch._utils._rebuild_parameter" | "torch._utils._rebuild_parameter_with_state", [tensor, ..]) => {
@@ -297,6 +299,7 @@ impl Checkpoint {
         }
     }
 
+    /// Returns the tensor that the node itself builds; `None` for other nodes.
     fn plain_tensor(&self, id: NodeId) -> Option<TensorView> {
         let (name, arguments) = self.pickle.call(id)?;
         let [storage, offset, size, stride, ..] = *arguments else { return None };
@@ -320,11 +323,12 @@ impl Checkpoint {
         })
     }
 
-    /// Every tensor, each once.
+    /// Returns every tensor once.
     pub(crate) fn tensors(&self) -> impl Iterator<Item = TensorView> {
         self.pickle.ids().filter_map(|id| self.plain_tensor(id))
     }
 
+    /// Returns a non-negative integer and its byte range in the pickle.
     fn number(&self, id: NodeId) -> Option<(usize, Range<usize>)> {
         match self.pickle.node(id) {
             Node::Int(value, at) => Some((usize::try_from(*value).ok()?, at.start as usize..at.end as usize)),
@@ -332,14 +336,15 @@ impl Checkpoint {
         }
     }
 
+    /// Returns the integers of a tuple or list and their byte ranges in the pickle.
     fn numbers(&self, id: NodeId) -> Option<(Vec<usize>, Vec<Range<usize>>)> {
         self.pickle.elements(id)?.iter().map(|&id| self.number(id)).collect()
     }
 
-    /// The floating-point tensor at a node, which `place` names.
+    /// Returns the floating-point tensor at a node; `place` names it in messages.
     ///
     /// # Errors
-    /// Something else there; a storage that is not there or has fewer values.
+    /// Fails if the node is something else, or if its storage is missing or too short.
     pub(crate) fn float_tensor(&self, id: NodeId, place: &str) -> Result<TensorView> {
         let wrong = |expected: &str, found: String| self.wrong(place, expected, found);
         let tensor = self.tensor(id).filter(|tensor| tensor.kind.is_float());
@@ -348,7 +353,8 @@ impl Checkpoint {
         Ok(tensor)
     }
 
-    /// Confirms that the storage has every element of `tensor`, and that these are not many more than it has values.
+    /// Checks that the storage holds every element of `tensor`, and that the tensor has at most 4 ([`MAX_EXPANSION`])
+    /// elements per stored value.
     pub(crate) fn check(&self, tensor: &TensorView) -> std::result::Result<(), String> {
         let values = self.storages.get(&tensor.storage).map_or(0, |&(_, bytes)| bytes / tensor.kind.bytes());
         self.check_extent(tensor)?;
@@ -358,32 +364,32 @@ impl Checkpoint {
         }
     }
 
-    /// Confirms that the storage has every element of `tensor`.
+    /// Checks that the storage holds every element of `tensor`.
     pub(crate) fn check_extent(&self, tensor: &TensorView) -> std::result::Result<(), String> {
         let Some(&(_, bytes)) = self.storages.get(&tensor.storage) else {
             return Err(format!("no file data/{}", tensor.storage));
         };
         let values = bytes / tensor.kind.bytes();
-        let said = || format!("{}, and {values} values in data/{}", tensor.describe(), tensor.storage);
-        let len = tensor.len().ok_or_else(said)?;
+        let too_short = || format!("{}, and {values} values in data/{}", tensor.describe(), tensor.storage);
+        let len = tensor.len().ok_or_else(too_short)?;
         let last = tensor.shape.iter().zip(&tensor.stride).try_fold(tensor.offset, |last, (&length, &stride)| {
             last.checked_add(length.saturating_sub(1).checked_mul(stride)?)
         });
         match last {
             Some(last) if len == 0 || last < values => Ok(()),
-            _ => Err(said()),
+            _ => Err(too_short()),
         }
     }
 
-    /// Most values that the tensors of a storage may mean together.
+    /// Returns the maximum number of elements that all tensors of a storage may have together.
     pub(crate) fn most_values(&self, key: &str, kind: ValueType) -> usize {
         self.storages.get(key).map_or(0, |&(_, bytes)| (bytes / kind.bytes()).saturating_mul(MAX_EXPANSION))
     }
 
-    /// The stored bytes of a storage.
+    /// Reads the bytes of a storage.
     ///
     /// # Errors
-    /// A storage that is not there, or is not as it was written.
+    /// Fails if the storage is missing or damaged.
     pub(crate) fn storage(&self, key: &str) -> Result<Vec<u8>> {
         let place = format!("data/{key}");
         let wrong = |found: String| {
@@ -392,13 +398,13 @@ impl Checkpoint {
         };
         let &(index, bytes) = self.storages.get(key).ok_or_else(|| wrong("no such file".into()))?;
         self.allow(&place, "its values", bytes as u64)?;
-        bytes_of(&mut self.archive.clone(), &self.file, index).map_err(|error| wrong(error.to_string()))
+        read_entry(&mut self.archive.clone(), &self.file, index).map_err(|error| wrong(error.to_string()))
     }
 
-    /// The elements of a floating-point tensor, which `place` names, as f32, the last index fastest.
+    /// Reads the elements of a floating-point tensor as f32, the last axis fastest; `place` names it in messages.
     ///
     /// # Errors
-    /// Values that are not as they were written, or no numbers.
+    /// Fails if values are damaged or not finite, or need more memory than allowed.
     pub(crate) fn floats(&self, tensor: &TensorView, place: &str) -> Result<Vec<f32>> {
         let values = self.values(tensor, place)?;
         match values.iter().position(|value| !value.is_finite()) {
@@ -410,10 +416,11 @@ impl Checkpoint {
         }
     }
 
-    /// The elements of a floating-point tensor, which `place` names, as f32, the last index fastest; not checked to be finite.
+    /// Reads the elements of a floating-point tensor as f32, the last axis fastest, without checking that they are
+    /// finite; `place` names it in messages.
     ///
     /// # Errors
-    /// Values that are not as they were written; more memory than allowed.
+    /// Fails if values are damaged or need more memory than allowed.
     pub(crate) fn values(&self, tensor: &TensorView, place: &str) -> Result<Vec<f32>> {
         let stored = self.storages.get(&tensor.storage).map_or(0, |&(_, bytes)| bytes as u64);
         let (bytes, len) = (tensor.kind.bytes(), tensor.len().unwrap_or(0));
@@ -424,10 +431,10 @@ impl Checkpoint {
         Ok(values)
     }
 
-    /// Every file of the archive in order: its name, what it is, its bytes.
+    /// Calls `take` with the name, kind and bytes of every file of the archive in order.
     ///
     /// # Errors
-    /// Those of `take`; a file that is not as it was written.
+    /// Fails if a file is damaged or `take` fails.
     pub(crate) fn files(&self, mut take: impl FnMut(&str, CheckpointFile<'_>, Vec<u8>) -> Result<()>) -> Result<()> {
         let mut archive = self.archive.clone();
         for index in 0..archive.len() {
@@ -435,9 +442,9 @@ impl Checkpoint {
                 self.wrong(&format!("file {index}"), "its bytes as they were written", error.to_string())
             };
             let name = archive.by_index(index).map_err(|error| broken(&error))?.name().to_owned();
-            let bytes = bytes_of(&mut archive, &self.file, index).map_err(|error| broken(&error))?;
-            let what = match inside(&name).strip_prefix("data/") {
-                _ if index == self.pickle_at => CheckpointFile::Pickle,
+            let bytes = read_entry(&mut archive, &self.file, index).map_err(|error| broken(&error))?;
+            let what = match without_first_folder(&name).strip_prefix("data/") {
+                _ if index == self.pickle_index => CheckpointFile::Pickle,
                 Some(key) => CheckpointFile::Storage(key),
                 None => CheckpointFile::Other,
             };
@@ -447,36 +454,37 @@ impl Checkpoint {
     }
 }
 
-/// A file of a checkpoint.
+/// Kind of a file in a checkpoint.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum CheckpointFile<'a> {
-    /// The tree.
+    /// Pickle of the object tree.
     Pickle,
-    /// The storage of that key.
+    /// Storage with this key.
     Storage(&'a str),
-    /// Another one.
+    /// Other file.
     Other,
 }
 
-/// What the tree's file is called.
+/// Name of the pickle in the archive.
 const PICKLE: &str = "data.pkl";
 
-/// The name without the folder, which is called as the file was or `archive`.
-fn inside(name: &str) -> &str {
+/// Returns `name` without its first folder, which PyTorch names after the file or `archive`.
+fn without_first_folder(name: &str) -> &str {
     name.split_once('/').map_or(name, |(_, rest)| rest)
 }
 
-/// What the list of the archive's files is called in messages.
+/// Name of the archive's list of files in messages.
 const LIST: &str = "list of files";
 
-/// Whether the file has the text "big" at `at`.
-fn starts_big(file: &SharedFile, at: u64) -> bool {
+/// Returns whether the file has the text "big" at `at`.
+fn is_big_endian_marker(file: &SharedFile, at: u64) -> bool {
     let (mut file, mut text) = (file.clone(), [0; 3]);
     file.seek(SeekFrom::Start(at)).and_then(|_| file.read_exact(&mut text)).is_ok() && &text == b"big"
 }
 
-/// All bytes of a stored entry, checked against its checksum. PyTorch writes 0 for a checksum that it did not compute.
-fn bytes_of(archive: &mut ZipArchive<SharedFile>, file: &SharedFile, index: usize) -> std::io::Result<Vec<u8>> {
+/// Reads all bytes of an uncompressed entry and checks its checksum. PyTorch writes 0 as checksum if it did not compute
+/// one.
+fn read_entry(archive: &mut ZipArchive<SharedFile>, file: &SharedFile, index: usize) -> std::io::Result<Vec<u8>> {
     let (start, size, expected) = {
         let entry = archive.by_index(index)?;
         (entry.data_start(), entry.size(), entry.crc32())
@@ -492,7 +500,7 @@ fn bytes_of(archive: &mut ZipArchive<SharedFile>, file: &SharedFile, index: usiz
     sum.update(&bytes);
     match expected == 0 || sum.sum() == expected {
         true => Ok(bytes),
-        false => Err(std::io::Error::other("other bytes than its checksum is of")),
+        false => Err(std::io::Error::other("bytes that do not match their checksum")),
     }
 }
 

@@ -1,20 +1,20 @@
 //! A `gseq` container as a source of frames.
 //!
-//! In: the file. Out: the state of any Gaussians at any frame. Memory: what a reader keeps is that of `TileReader`,
-//! what is held for all readers that of `HeldTiles`, and each thread that decodes has one `Scratch`.
+//! Input: the file. Output: the frame state of any Gaussians at any frame. Memory: each reader keeps what `TileReader`
+//! describes, all readers together what `HeldTiles` describes, and each decoding thread has one `Scratch`.
 //!
-//! Raw tiles are used where they lie in the map, packed ones are decoded straight from there. Pages that were touched
-//! count as resident until they are released, so a reader releases what it used of a frame block when it enters another.
-//! Where it may keep less than a frame block, positioned reads stay: releasing frame by frame costs more than their
-//! copy. Raw frames into the caller's state (`cargo bench --bench scan`, `raw_frames`; two threads on two cores of an
-//! EPYC that others kept busy, so compare them with one another): 1.5 GB/s released by frame block, 0.6 frame by frame, 1.4
-//! by positioned reads, 2.3 left mapped.
+//! Raw tiles are read in place from the map; compressed tiles are decoded directly from it. Touched pages count as
+//! resident until they are released, so a reader releases the pages of a frame block when it enters another one. If it
+//! may keep less than a frame block, it uses positioned reads, because releasing page by page per frame costs more than
+//! the copy. Throughput of reading raw frames into the caller's buffers (`cargo bench --bench scan`, `raw_frames`; two
+//! threads on two cores of a busy EPYC, so compare the figures only with one another): 1.5 GB/s with release per frame
+//! block, 0.6 with release per frame, 1.4 with positioned reads, 2.3 if pages stay mapped.
 //!
-//! A file that lies in memory is read block by block, and the disk works ahead by advice: when a reader that decodes
-//! whole frame blocks enters one, the system is told of the next. One that does not is scanned in stages
-//! ([`FrameSource::ahead`]). On the same machine, blocks and stages: from a cold page cache 95 and 71 ms (raw), 222 and
-//! 232 (packed); from a disk of 300 MB/s, simulated, 158 and 162, 216 and 206; from a warm one 46 and 45, 152 and 223,
-//! as a packed scan waits for no disk, but its stages for one another.
+//! A file that is in the page cache is read block by block, and the system reads ahead on advice: when a reader that
+//! decodes whole frame blocks enters one, it announces the next one. A file that is not in the page cache is scanned in
+//! stages ([`FrameSource::ahead`]). Times on the same machine for blocks and stages: cold page cache 95 and 71 ms
+//! (raw), 222 and 232 ms (compressed); simulated disk of 300 MB/s 158 and 162, 216 and 206; warm page cache 46 and 45,
+//! 152 and 223. In the last case a compressed scan never waits for the disk, but its stages wait for one another.
 
 mod held;
 mod store;
@@ -28,8 +28,8 @@ use crate::error::Result;
 use crate::model::{Columns, SequenceInfo};
 use crate::source::{BlockReader, FrameSource, Ids, Prefetch, Reads};
 
-/// Places of the file that are asked about to know whether the system holds it in memory.
-const SAMPLES: u64 = 64;
+/// Number of offsets of the file that are tested to find out whether it is in the page cache.
+const CACHE_SAMPLES: u64 = 64;
 
 impl FrameSource for Container {
     fn info(&self) -> &SequenceInfo {
@@ -45,9 +45,9 @@ impl FrameSource for Container {
         Reads { bytes: read.bytes, tiles: read.tiles, states: self.states.get() }
     }
 
-    /// Not for a file that lies in memory: see the figures at the top of this module.
+    /// Returns `None` if the file is in the page cache; the figures at the top of this module give the reason.
     fn ahead(&self) -> Option<&dyn Prefetch> {
-        match self.reader.is_cached(SAMPLES) {
+        match self.reader.is_cached(CACHE_SAMPLES) {
             Some(true) => None,
             _ => Some(self),
         }
@@ -64,12 +64,14 @@ impl Prefetch for Container {
             return;
         }
         let layout = self.reader.layout();
-        let block = |id: usize, of: u32| (id / of as usize) as u32;
-        let of = layout.gaussian_block;
+        let block = |id: usize, block_len: u32| (id / block_len as usize) as u32;
+        let gaussians_per_block = layout.gaussian_block;
         for frame_block in block(frames.start, layout.frame_block)..=block(frames.end - 1, layout.frame_block) {
-            for gaussian_block in block(gaussians.start, of)..=block(gaussians.end - 1, of) {
+            for gaussian_block in
+                block(gaussians.start, gaussians_per_block)..=block(gaussians.end - 1, gaussians_per_block)
+            {
                 let tiles = || self.unheld(want, gaussian_block, frame_block);
-                // All at once, then waiting for one after the other.
+                // Request all tiles first, then wait for each.
                 self.reader.expect(tiles());
                 self.reader.fetch(tiles());
             }

@@ -1,27 +1,27 @@
-//! Tables as CSV: a line of names, then one line per row; what does not exist is empty.
+//! CSV tables: a header line of names, then one line per row. A missing value is an empty field.
 //!
-//! Spreadsheets take a field that begins with one of `= + - @`, a tab or a carriage return for a formula and run it. Such a
-//! text gets an apostrophe in front, by which they know it as text; numbers stay as they are.
+//! Spreadsheets execute a field that begins with one of `= + - @`, a tab or a carriage return as a formula. Such text
+//! gets an apostrophe in front, which marks it as text; numbers are unchanged.
 
 use std::fmt::Display;
 
-/// A value; what does not exist is empty.
+/// Formats a value; `None` becomes an empty field.
 pub(crate) fn known(value: Option<impl Display>) -> String {
     value.map_or(String::new(), |value| value.to_string())
 }
 
-/// Returns `field` so that no spreadsheet runs it.
+/// Returns `field`, with an apostrophe in front if a spreadsheet would execute it as a formula.
 fn without_formula(field: String) -> String {
-    // Spreadsheets skip blanks, and take the wide forms of East Asian input for the plain ones.
+    // Spreadsheets skip leading spaces and treat the full-width East Asian forms like the plain ones.
     let first = field.chars().find(|&c| c != ' ');
     let runs = matches!(first, Some('=' | '+' | '-' | '@' | '\t' | '\r' | '\n' | '＝' | '＋' | '－' | '＠'));
     if runs && field.parse::<f64>().is_err() { format!("'{field}") } else { field }
 }
 
-/// The text of a table; a field that holds what parts fields is quoted, as RFC 4180 wants it.
+/// Returns a table as CSV text. Fields with delimiters are quoted according to RFC 4180.
 ///
 /// # Panics
-/// If a row has not as many fields as there are names.
+/// Panics if a row does not have as many fields as there are names.
 pub(crate) fn table(names: &[impl AsRef<[u8]>], rows: impl IntoIterator<Item = Vec<String>>) -> String {
     let mut out = csv::Writer::from_writer(Vec::new());
     out.write_record(names).expect("memory takes what is written");
@@ -36,7 +36,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn texts_are_no_formulas_and_numbers_stay_numbers() {
+    fn formulas_are_escaped_and_numbers_unchanged() {
         let row =
             ["=1+1", "+cmd", "-2+3", "@SUM(A1)", "\tx", "\rx", " =1", "＝1", "-1.5", "+3", "-inf", "-1e-7", "a=b", ""];
         let text = table(&row.map(|_| "n"), [row.map(str::to_owned).to_vec()]);

@@ -1,18 +1,18 @@
-//! Rows of a file that are not as its format says, and what its reader did about them.
+//! Statistics of the rows of a file that violate its format, and of how its reader treated them.
 
 /// Number of row ids that a note lists per defect.
-const LISTED: usize = 5;
-/// Fraction of a file's rows above which leaving rows out is the first thing said about the file.
-const LOUD: f64 = 0.01;
+const LISTED_ROWS: usize = 5;
+/// Fraction of dropped rows above which the total becomes the first note about the file.
+const TOTALS_FIRST_FRACTION: f64 = 0.01;
 
-/// What a reader did about the defective rows of a file.
+/// Counts of defective rows of a file and of the reader's treatment of them.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Defects {
-    /// Rows of the file, without padding.
+    /// Number of rows of the file, without padding.
     pub rows: usize,
-    /// Rows with at least one defect.
+    /// Number of rows with at least one defect.
     pub defective: usize,
-    /// Rows left out, each counted once.
+    /// Number of dropped rows, each counted once.
     pub dropped: usize,
     /// One entry per kind of defect that was found. A row with several defects counts in several entries.
     pub kinds: Vec<DefectCount>,
@@ -21,15 +21,15 @@ pub struct Defects {
 /// Rows with one kind of defect.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct DefectCount {
-    /// Kind of the defect, such as "zero quaternion".
+    /// Name of the defect, such as "zero quaternion".
     pub what: String,
-    /// Whether such rows are left out; else they are kept, as `why` says.
+    /// Whether these rows are dropped; otherwise they are kept as described by `why`.
     pub dropped: bool,
-    /// Why such rows are treated so, and what to do about it.
+    /// Reason for the treatment, and advice for the user.
     pub why: String,
     /// Number of rows.
     pub rows: usize,
-    /// Numbers of the first few rows.
+    /// Ids of the first few rows.
     pub first: Vec<u32>,
 }
 
@@ -39,7 +39,7 @@ impl Defects {
         Defects { rows, ..Defects::default() }
     }
 
-    /// Counts the defects `found` of row `row`, each with its name, whether it drops the row, and why.
+    /// Counts row `row` with its defects `found`: each has a name, whether it drops the row, and the reason.
     pub fn add(&mut self, row: u32, found: &[(&str, bool, &str)]) {
         self.defective += usize::from(!found.is_empty());
         self.dropped += usize::from(found.iter().any(|&(_, dropped, _)| dropped));
@@ -51,7 +51,7 @@ impl Defects {
             });
             let kind = &mut self.kinds[place];
             kind.rows += 1;
-            if kind.first.len() < LISTED {
+            if kind.first.len() < LISTED_ROWS {
                 kind.first.push(row);
             }
         }
@@ -62,13 +62,14 @@ impl Defects {
         self.defective == 0
     }
 
-    /// Returns one note per kind of defect, and one with the totals, which is the first where many rows are left out.
+    /// Returns one note per kind of defect and one with the totals. The totals come first if more than 1% of the rows
+    /// were dropped, otherwise last.
     pub fn notes(&self) -> Vec<String> {
         if self.is_empty() {
             return Vec::new();
         }
         let percent = |rows: usize| 100.0 * rows as f64 / self.rows.max(1) as f64;
-        let of_kind = |kind: &DefectCount| {
+        let note = |kind: &DefectCount| {
             let first: Vec<String> = kind.first.iter().map(u32::to_string).collect();
             let more = if kind.rows > first.len() { ", ..." } else { "" };
             format!(
@@ -82,7 +83,7 @@ impl Defects {
                 first.join(", "),
             )
         };
-        let mut notes: Vec<String> = self.kinds.iter().map(of_kind).collect();
+        let mut notes: Vec<String> = self.kinds.iter().map(note).collect();
         let total = format!(
             "{} of {} rows have defects: {} ({:.2}%) left out, {} repaired",
             self.defective,
@@ -91,8 +92,8 @@ impl Defects {
             percent(self.dropped),
             self.defective - self.dropped
         );
-        let is_loud = self.dropped as f64 > LOUD * self.rows as f64;
-        notes.insert(if is_loud { 0 } else { notes.len() }, total);
+        let is_totals_first = self.dropped as f64 > TOTALS_FIRST_FRACTION * self.rows as f64;
+        notes.insert(if is_totals_first { 0 } else { notes.len() }, total);
         notes
     }
 }

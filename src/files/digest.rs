@@ -1,4 +1,4 @@
-//! Files into a hash, piece by piece: a file's length is no matter of memory.
+//! Hashing of files in chunks, so that the memory does not depend on their length.
 
 use std::fs::File;
 use std::io::Read;
@@ -9,21 +9,21 @@ use xxhash_rust::xxh3::Xxh3;
 use super::open::open_file;
 use crate::error::{Error, Result};
 
-/// Bytes read at a time.
-const PIECE: usize = 1 << 18;
+/// Number of bytes read at a time.
+const CHUNK_BYTES: usize = 1 << 18;
 
 /// Adds the bytes of the file at `path` to `hash`.
 pub(crate) fn hash_file(path: &Path, hash: &mut Xxh3) -> Result<()> {
     hash_rest(&mut open_file(path)?, path, hash)
 }
 
-/// Adds the bytes of `file`, which is at `path`, from where it is to its end.
+/// Adds the bytes of `file`, which was opened from `path`, from its current position to its end.
 pub(crate) fn hash_rest(file: &mut File, path: &Path, hash: &mut Xxh3) -> Result<()> {
-    let mut piece = vec![0; PIECE];
+    let mut chunk = vec![0; CHUNK_BYTES];
     loop {
-        match file.read(&mut piece).map_err(Error::io("read", path))? {
+        match file.read(&mut chunk).map_err(Error::io("read", path))? {
             0 => return Ok(()),
-            read => hash.update(&piece[..read]),
+            read => hash.update(&chunk[..read]),
         }
     }
 }

@@ -1,8 +1,8 @@
-//! A photographed or rendered picture from a PNG file.
+//! Reader of photographs and renders in PNG files.
 //!
-//! In: a PNG of any color type and depth, and the size it must have. Out: an [`Image`] in [0, 1], with
-//! transparency over a background. Memory: the decoded rows beside the result; the size is checked
-//! before either is allocated.
+//! Input: a PNG of any color type and bit depth, and the size it must have. Output: an [`Image`] with values in [0, 1],
+//! transparent pixels blended over a background. Memory: the decoded rows and the result; the size is checked before
+//! either is allocated.
 
 pub mod write;
 
@@ -15,18 +15,18 @@ use super::open::open_file;
 use crate::error::{Error, Result};
 use crate::render::Image;
 
-/// Reads the PNG at `path`, which must be `width` × `height` pixels.
+/// Reads the PNG at `path`, which must have `width` × `height` pixels.
 ///
-/// Gray is repeated into the three channels. Where the picture has transparency, it is laid over
-/// `background`: c·a + background·(1 − a), as the D-NeRF loaders do.
+/// Gray is repeated into the three channels. Transparent pixels are blended over `background`: c·a + background·(1 −
+/// a), as the D-NeRF loaders do.
 ///
 /// # Errors
-/// A file that is no PNG, is damaged, or has another size.
+/// Fails if the file is not a PNG, is damaged, or has another size.
 pub fn read_png(path: &Path, (width, height): (u32, u32), background: [f32; 3]) -> Result<Image> {
     let file = open_file(path)?;
     let mut decoder = Decoder::new(BufReader::new(file));
     decoder.set_transformations(Transformations::EXPAND);
-    // Texts and color profiles are not used, and may decompress to any length.
+    // Text chunks and color profiles are not used and could decompress to any length.
     decoder.set_ignore_text_chunk(true);
     decoder.set_ignore_iccp_chunk(true);
     let mut reader = decoder.read_info().map_err(malformed(path))?;
@@ -34,10 +34,10 @@ pub fn read_png(path: &Path, (width, height): (u32, u32), background: [f32; 3]) 
     if found != (width, height) {
         let found = format!("{} x {}", found.0, found.1);
         return Err(Error::input(path, "", format!("{width} x {height} pixels, as its camera has"), found)
-            .hint("give pictures of the cameras' size, or the cameras of these pictures"));
+            .hint("give images of the cameras' size, or the cameras of these images"));
     }
     let (color, depth) = reader.output_color_type();
-    // None only where the size overflows, which the cameras' limits exclude.
+    // The size is `None` only on overflow, which the limits on cameras exclude.
     let mut bytes = vec![0; reader.output_buffer_size().unwrap_or(0)];
     reader.next_frame(&mut bytes).map_err(malformed(path))?;
     let values: Vec<f32> = match depth {
@@ -53,24 +53,25 @@ pub fn read_png(path: &Path, (width, height): (u32, u32), background: [f32; 3]) 
         ColorType::Grayscale => values.iter().flat_map(|&gray| [gray; 3]).collect(),
         ColorType::GrayscaleAlpha => values.chunks_exact(2).flat_map(|p| over([p[0]; 3], p[1])).collect(),
         ColorType::Rgba => values.chunks_exact(4).flat_map(|p| over([p[0], p[1], p[2]], p[3])).collect(),
-        // A palette arrives expanded.
+        // Palettes are already expanded by the decoder.
         ColorType::Rgb | ColorType::Indexed => values,
     };
     Ok(Image { width, height, data })
 }
 
-/// Reads the size of the PNG or JPEG at `path` in pixels, or `None` if it cannot be read.
+/// Returns the size in pixels of the PNG or JPEG at `path`, or `None` if it cannot be read.
 pub(crate) fn measure(path: &Path) -> Option<(u32, u32)> {
     let size = imagesize::reader_size(BufReader::new(open_file(path).ok()?)).ok()?;
     Some((u32::try_from(size.width).ok()?, u32::try_from(size.height).ok()?))
 }
 
+/// Returns a closure that turns decoding errors of the file at `path` into errors of this crate.
 fn malformed(path: &Path) -> impl Fn(DecodingError) -> Error {
     move |error| match error {
         DecodingError::IoError(source) if source.kind() != std::io::ErrorKind::UnexpectedEof => {
             Error::Io { action: "read", path: path.to_owned(), source }
         }
-        other => Error::input(path, "", "a PNG picture", other.to_string()),
+        other => Error::input(path, "", "a PNG image", other.to_string()),
     }
 }
 
@@ -78,7 +79,7 @@ fn malformed(path: &Path) -> impl Fn(DecodingError) -> Error {
 mod tests {
     use super::*;
 
-    /// A PNG of 2 × 1 pixels.
+    /// Writes a PNG of 2 × 1 pixels.
     fn written(color: ColorType, depth: BitDepth, bytes: &[u8], palette: Option<&[u8]>) -> tempfile::NamedTempFile {
         let file = tempfile::NamedTempFile::new().unwrap();
         let mut encoder = png::Encoder::new(file.reopen().unwrap(), 2, 1);
@@ -94,25 +95,25 @@ mod tests {
     }
 
     #[test]
-    fn every_color_type_gives_the_same_picture() {
+    fn color_types_decode_to_equal_values() {
         let expected = [1.0, 0.0, 0.0, 0.2, 0.2, 0.2].map(|v: f32| v);
         let wide: Vec<u8> = [65535u16, 0, 0, 13107, 13107, 13107].iter().flat_map(|v| v.to_be_bytes()).collect();
-        let pictures = [
+        let images = [
             written(ColorType::Rgb, BitDepth::Eight, &[255, 0, 0, 51, 51, 51], None),
             written(ColorType::Rgb, BitDepth::Sixteen, &wide, None),
             written(ColorType::Rgba, BitDepth::Eight, &[255, 0, 0, 255, 51, 51, 51, 255], None),
             written(ColorType::Indexed, BitDepth::One, &[0b1000_0000], Some(&[51, 51, 51, 255, 0, 0])),
         ];
-        for (i, file) in pictures.iter().enumerate() {
+        for (i, file) in images.iter().enumerate() {
             let got = read_png(file.path(), (2, 1), [0.5; 3]).unwrap();
-            assert_eq!(got.data, expected, "picture {i}");
+            assert_eq!(got.data, expected, "image {i}");
         }
         let gray = written(ColorType::Grayscale, BitDepth::Eight, &[255, 51], None);
         assert_eq!(read_png(gray.path(), (2, 1), [0.5; 3]).unwrap().data, [1.0, 1.0, 1.0, 0.2, 0.2, 0.2]);
     }
 
     #[test]
-    fn what_is_transparent_shows_the_background() {
+    fn transparent_pixels_show_the_background() {
         let file = written(ColorType::Rgba, BitDepth::Eight, &[255, 0, 0, 0, 255, 0, 0, 51], None);
         let got = read_png(file.path(), (2, 1), [0.0, 0.5, 1.0]).unwrap();
         for (got, expected) in got.data.iter().zip([0.0, 0.5, 1.0, 0.2, 0.4, 0.8]) {
@@ -123,7 +124,7 @@ mod tests {
     }
 
     #[test]
-    fn another_size_damage_and_other_files_are_named() {
+    fn wrong_size_damage_and_other_files_are_refused() {
         let file = written(ColorType::Rgb, BitDepth::Eight, &[255, 0, 0, 51, 51, 51], None);
         let message = |path: &Path, size| read_png(path, size, [0.0; 3]).unwrap_err().to_string();
         let text = message(file.path(), (3, 1));
@@ -132,9 +133,9 @@ mod tests {
         for cut in 0..whole.len() - 12 {
             std::fs::write(file.path(), &whole[..cut]).unwrap();
             let text = message(file.path(), (2, 1));
-            assert!(text.contains("expected a PNG picture"), "cut at {cut}: {text}");
+            assert!(text.contains("expected a PNG image"), "cut at {cut}: {text}");
         }
         std::fs::write(file.path(), b"\xff\xd8\xff\xe0 a JPEG begins like this").unwrap();
-        assert!(message(file.path(), (2, 1)).contains("a PNG picture"));
+        assert!(message(file.path(), (2, 1)).contains("a PNG image"));
     }
 }

@@ -1,4 +1,4 @@
-//! Readers of bytes in memory, for the fuzz targets: no file is written for any of the millions of inputs.
+//! Readers of bytes in memory for the fuzz targets, which run millions of inputs and must not write files.
 
 use std::path::Path;
 
@@ -8,7 +8,8 @@ use super::json::{Stopped, read_from};
 use super::pickle::Pickle;
 use crate::error::Result;
 
-/// Reads a pickle within `memory` bytes, and describes each of its values; returns how many there are.
+/// Reads a pickle within `memory` bytes and describes each of its values. Returns the number of values, or `None` if it
+/// is malformed.
 pub fn pickle(bytes: &[u8], memory: u64) -> Option<usize> {
     let pickle = Pickle::read(bytes, memory).ok()?;
     let described: usize = pickle.ids().map(|id| pickle.describe(id).len().min(1)).sum();
@@ -16,10 +17,11 @@ pub fn pickle(bytes: &[u8], memory: u64) -> Option<usize> {
     Some(described)
 }
 
-/// Reads JSON as a camera file is read: what lies around its pictures, and each of these; returns how many there are.
+/// Reads JSON like a camera file: the values outside the frames, and each frame. Returns the number of frames and other
+/// values found.
 ///
 /// # Errors
-/// What is no JSON, or beyond the limits.
+/// Fails if the text is not JSON or exceeds the limits.
 pub fn cameras_json(bytes: &[u8]) -> Result<usize> {
     let path = Path::new("cameras.json");
     let keep = Keep { wanted: &["frames", "w2c", "transform_matrix"], elements: MAX_ELEMENTS };

@@ -1,8 +1,8 @@
-//! JSON files, read as streams.
+//! Streaming reader of JSON files.
 //!
-//! Input: the path of a file of any length. Output: what a [`DeserializeSeed`] makes of it. Memory: a buffer of 64 KiB, one
-//! text, and what the seed keeps. A text, a number or a nesting that no camera file has is refused before the parser sees
-//! it, since the parser keeps the text that it reads in memory.
+//! Input: the path of a file of any length. Output: the value built by a [`DeserializeSeed`]. Memory: a buffer of 64
+//! KiB, one string, and what the seed keeps. Strings, numbers and nesting beyond what a camera file contains are
+//! refused before the parser sees them, because the parser keeps the string it reads in memory.
 
 mod checked;
 pub(crate) mod lists;
@@ -19,25 +19,25 @@ use serde_json::error::Category;
 
 use super::open::{open_file, read_small};
 use crate::error::{Error, Result};
-use checked::Checked;
+use checked::CheckedReader;
 
-/// Holds the error of a seed while the parser unwinds: the parser's own error has no room for it.
+/// Error of a seed, kept here while the parser unwinds because the parser's own error type cannot hold it.
 #[derive(Debug, Default)]
 pub(crate) struct Stopped(RefCell<Option<Error>>);
 
 impl Stopped {
-    /// Keeps `error`, and returns the parser's error that ends the reading.
+    /// Stores `error` and returns the parser error that ends the reading.
     pub(crate) fn by<E: serde::de::Error>(&self, error: Error) -> E {
         *self.0.borrow_mut() = Some(error);
         E::custom("stopped")
     }
 }
 
-/// Reads the JSON document in the file at `path` with `seed`, whose own errors are left in `stopped`.
+/// Reads the JSON document in the file at `path` with `seed`, which leaves its own errors in `stopped`.
 ///
 /// # Errors
-/// Those of the seed; a file that cannot be read; text that is no UTF-8 or no JSON, with the place; texts, numbers or
-/// nesting beyond the limits.
+/// Fails if the seed fails, the file cannot be read, the text is not UTF-8 or not JSON (the message names the place),
+/// or a string, number or nesting exceeds the limits.
 pub(crate) fn read<T, S: for<'de> DeserializeSeed<'de, Value = T>>(
     path: &Path,
     stopped: &Stopped,
@@ -46,17 +46,17 @@ pub(crate) fn read<T, S: for<'de> DeserializeSeed<'de, Value = T>>(
     read_from(open_file(path)?, path, stopped, seed)
 }
 
-/// Reads the JSON document that `file` holds, called `path` in messages, as [`read`] does.
+/// Reads the JSON document in `file` as [`read`] does; messages name it `path`.
 ///
 /// # Errors
-/// Those of [`read`].
+/// Fails like [`read`].
 pub(crate) fn read_from<T, S: for<'de> DeserializeSeed<'de, Value = T>>(
     file: impl Read,
     path: &Path,
     stopped: &Stopped,
     seed: S,
 ) -> Result<T> {
-    let mut text = Checked::new(file, path);
+    let mut text = CheckedReader::new(file, path);
     let mut parser = serde_json::Deserializer::from_reader(&mut text);
     let read = seed.deserialize(&mut parser).and_then(|value| parser.end().map(|()| value));
     read.map_err(|error| {
@@ -78,18 +78,16 @@ pub(crate) fn read_from<T, S: for<'de> DeserializeSeed<'de, Value = T>>(
             .iter()
             .any(|word| (0..3).any(|at| around.get(at..).is_some_and(|rest| rest.starts_with(word.as_bytes()))));
         match is_number {
-            true => {
-                refused.hint("NaN and Infinity are no JSON: if a pose holds them, take the picture out of the file")
-            }
+            true => refused.hint("NaN and Infinity are not JSON: if a pose holds them, remove that image from the file"),
             false => refused,
         }
     })
 }
 
-/// Reads the whole JSON document in the file at `path`, which must hold at most `most_bytes`.
+/// Reads the whole JSON document in the file at `path`, which may hold at most `most_bytes`.
 ///
 /// # Errors
-/// Those of [`read_small`] and of [`read`].
+/// Fails like [`read_small`] and [`read`].
 pub(crate) fn read_json(path: &Path, most_bytes: u64) -> Result<Value> {
     let bytes = read_small(path, most_bytes, "JSON")?;
     read_from(&bytes[..], path, &Stopped::default(), PhantomData::<Value>)
@@ -106,12 +104,12 @@ mod tests {
     }
 
     #[test]
-    fn hints_fit_what_is_wrong() {
+    fn hints_match_the_error() {
         for (bytes, expected, absent) in [
             (&b"{\"frames\": [{\"a"[..], "cut short", "NaN"),
             (b"", "an empty file", "NaN"),
             (b" \n", "an empty file", "NaN"),
-            (b"{\"a\": NaN}", "NaN and Infinity are no JSON", "cut short"),
+            (b"{\"a\": NaN}", "NaN and Infinity are not JSON", "cut short"),
             (b"{\"a\": NaN}", "line 1, column 7", "cut short"),
             (b"{\"a\": -Infinity}", "line 1, column 8", "cut short"),
             (b"{\"a\": \"caf\xe9\"}", "Latin-1", "NaN"),
@@ -127,21 +125,21 @@ mod tests {
     }
 
     #[test]
-    fn a_byte_order_mark_of_utf_8_is_passed_over() {
+    fn utf_8_byte_order_mark_is_skipped() {
         let read = |bytes: &[u8]| read_from(bytes, Path::new("a"), &Stopped::default(), PhantomData::<Value>);
         assert_eq!(read(b"\xef\xbb\xbf{\"a\": 1}").unwrap()["a"], 1);
         assert!(refused(b"\xef\xbb\xbf\"\xe9").contains("byte 4"));
     }
 
     #[test]
-    fn values_are_those_of_a_parser_of_whole_texts() {
+    fn values_equal_those_of_serde_json() {
         let text = r#" {"a\n\u00e9\ud83d\ude00": [1, -2.5e3, true, null, "\"[{\\", {}], "größe": [[[]]], "b": 18446744073709551615} "#;
         let read = read_from(text.as_bytes(), Path::new("a"), &Stopped::default(), PhantomData::<Value>).unwrap();
         assert_eq!(read, serde_json::from_str::<Value>(text).unwrap());
     }
 
     #[test]
-    fn long_texts_numbers_and_deep_nesting_are_refused_even_where_they_are_ignored() {
+    fn values_beyond_limits_are_refused_even_if_ignored() {
         let text = format!("{{\"a\": \"{}\"}}", "x".repeat(2 << 20));
         let escapes = format!("\"{}\"", "\\\"".repeat(1 << 20));
         let key = format!("{{\"{}\": 1}}", "k".repeat(2 << 20));

@@ -1,7 +1,7 @@
-//! Files mapped into memory: the only module of this crate that maps.
+//! Memory-mapped files. No other module of this crate maps files.
 //!
-//! In: a path. Out: its bytes as a slice. Memory: mapped pages count as memory of this process until they are released,
-//! so readers report what they touched ([`FileMap::touched`]) and at most some 2 MiB of a map stay resident.
+//! Input: a path. Output: the bytes as a slice. Mapped pages count as memory of this process until they are released,
+//! so readers report the ranges they read ([`FileMap::touched`]), and about 2 MiB of a map stay resident at most.
 
 use std::fs::File;
 use std::ops::{Deref, Range};
@@ -14,19 +14,19 @@ use splat_platform::{FileIdentity, FileStatus, release_pages};
 use super::open::open_file;
 use crate::error::{Error, Result};
 
-/// Bytes of a map that may be resident before its pages are released. The call that releases them takes some 2 µs.
-const RESIDENT: usize = 2 << 20;
-/// Bytes about a touched page that the system may map with it, as Linux does.
-const AROUND: usize = 1 << 16;
+/// Number of bytes of a map that may be resident before its pages are released. Releasing takes about 2 µs.
+const MAX_RESIDENT_BYTES: usize = 2 << 20;
+/// Bytes around a touched page that the system may map together with it (Linux: fault-around of 64 KiB).
+const FAULT_AROUND_BYTES: usize = 1 << 16;
 
-/// A whole file, or a part of a scratch file, as bytes, read-only. No file descriptor stays open.
+/// Read-only map of a whole file, or of a part of a scratch file. Keeps no file descriptor open.
 #[derive(Debug)]
 pub(crate) struct FileMap {
     path: PathBuf,
-    /// None for a scratch file, which nobody else can reach.
+    /// Identity of the file; `None` for a scratch file, which no other process can reach.
     identity: Option<FileIdentity>,
     map: Mmap,
-    /// Bytes touched since the pages were last released, and the end of the last touched range.
+    /// Number of bytes touched since the last release, and end of the last touched range.
     resident: AtomicUsize,
     last_end: AtomicUsize,
 }
@@ -35,38 +35,39 @@ impl FileMap {
     /// Maps the file at `path`.
     ///
     /// # Errors
-    /// A file that is not regular, or cannot be opened or mapped.
+    /// Fails if the file is not regular or cannot be opened or mapped.
     pub(crate) fn open(path: &Path) -> Result<FileMap> {
         let file = open_file(path)?;
         let identity = FileStatus::from_file(&file).map_err(Error::io("read the size of", path))?.identity;
-        // SAFETY: the map is read-only and private to this value. The bytes must not change while it
-        // lives: the user promises not to write to a model that is being read, and this program never
-        // writes in place (outputs are renamed over, which leaves a mapped file's pages alone).
-        // Shrinking, the one change that would end in SIGBUS, is looked for by `check`.
+        // SAFETY: the map is read-only and private to this value. The bytes must not change while the map lives. The
+        // user must not write to a model that is being read; this program never writes in place (outputs are renamed
+        // over existing files, which leaves the pages of a mapped file unchanged). Shrinking, the one change that would
+        // end in SIGBUS, is detected by `check`.
         let map = unsafe { Mmap::map(&file) }.map_err(Error::io("map", path))?;
         Ok(FileMap::new(path, Some(identity), map))
     }
 
-    /// Maps `range` of a scratch file without a name, which holds data of the file at `path`.
+    /// Maps `range` of an unnamed scratch file that holds data of the file at `path`.
     ///
     /// # Errors
-    /// A file that cannot be mapped.
+    /// Fails if the file cannot be mapped.
     pub(crate) fn from_scratch(file: &File, range: Range<u64>, path: &Path) -> Result<FileMap> {
         let mut options = MmapOptions::new();
         options.offset(range.start).len((range.end - range.start) as usize);
         // SAFETY: the map is read-only. The file has no name, so only this process reaches it, and its writer only
-        // appends: the bytes of `range` were written before and stay as they are.
+        // appends: the bytes of `range` were written before and do not change.
         let map = unsafe { options.map(file) }.map_err(Error::io("map the scratch file of", path))?;
         Ok(FileMap::new(path, None, map))
     }
 
+    /// Wraps a map without touched pages.
     fn new(path: &Path, identity: Option<FileIdentity>, map: Mmap) -> FileMap {
         let (resident, last_end) = (AtomicUsize::new(0), AtomicUsize::new(0));
         FileMap { path: path.to_owned(), identity, map, resident, last_end }
     }
 
-    /// Confirms that the file has not been cut short since it was mapped; call before each block
-    /// that is read. A file that was replaced or removed meanwhile is fine: the map keeps the old one.
+    /// Checks that the file has not been cut short since it was mapped; to be called before each block is read. A file
+    /// that was replaced or removed meanwhile is fine, because the map keeps the old one.
     pub(crate) fn check(&self) -> Result<()> {
         let Some(identity) = &self.identity else { return Ok(()) };
         match FileStatus::from_path(&self.path) {
@@ -81,18 +82,18 @@ impl FileMap {
         }
     }
 
-    /// Records that the bytes of `range` were or will be read, and releases the pages of the map once some 2 MiB of them
-    /// may be resident. Slices of the map stay valid: their pages are read from the file again.
+    /// Records that the bytes of `range` were or will be read, and releases the pages of the map once about 2 MiB of
+    /// them may be resident. Slices of the map stay valid: their pages are read from the file again.
     pub(crate) fn touched(&self, range: Range<usize>) {
-        let gap = self.last_end.swap(range.end, Ordering::Relaxed).abs_diff(range.start).min(AROUND);
+        let gap = self.last_end.swap(range.end, Ordering::Relaxed).abs_diff(range.start).min(FAULT_AROUND_BYTES);
         let more = gap + range.len();
-        if self.resident.fetch_add(more, Ordering::Relaxed) + more > RESIDENT {
+        if self.resident.fetch_add(more, Ordering::Relaxed) + more > MAX_RESIDENT_BYTES {
             self.resident.store(0, Ordering::Relaxed);
             self.release();
         }
     }
 
-    /// Calls `each` with the bytes of `range` in pieces of at most 1 MiB.
+    /// Calls `each` with the bytes of `range` in chunks of at most 1 MiB.
     pub(crate) fn pieces<E>(
         &self,
         range: Range<usize>,
@@ -106,9 +107,10 @@ impl FileMap {
         Ok(())
     }
 
-    /// Gives the pages of the map back to the system.
+    /// Releases the pages of the map.
     fn release(&self) {
-        // SAFETY: the map is that of a file; a scratch file keeps its bytes, too.
+        // SAFETY: the map is backed by a file, so released pages are read from it again; this holds for scratch files
+        // too.
         unsafe { release_pages(&self.map, 0..self.map.len()) };
     }
 }
@@ -127,7 +129,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_file_cut_short_under_the_map_is_an_error_not_a_signal() {
+    fn shrinking_mapped_file_is_an_error() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a");
         fs::write(&path, vec![7; 10_000]).unwrap();
@@ -140,7 +142,7 @@ mod tests {
 
     #[cfg(unix)]
     #[test]
-    fn a_file_replaced_or_removed_under_the_map_reads_on() {
+    fn replaced_or_removed_file_stays_readable() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a");
         fs::write(&path, vec![7; 10_000]).unwrap();

@@ -1,5 +1,5 @@
-//! File formats, the reader of each beside its writer: PLY, NumPy and PyTorch files, `.spz`, `.splatv`, containers, frame
-//! streams, cameras, images; and [`atomic`], by which every output appears whole or not at all.
+//! File formats, each reader beside its writer (PLY, NumPy and PyTorch files, `.spz`, `.splatv`, containers, frame
+//! streams, cameras, images), and [`atomic`], through which every output is written.
 
 pub mod accuracy;
 pub mod atomic;

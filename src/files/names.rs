@@ -1,36 +1,37 @@
-//! Names of files as outputs record them. Outputs are published, so they hold no folder of the user's machine: an input
-//! is recorded by its last name, and a file that a recipe needs again by its path from the recipe's folder.
+//! Names of files as recorded in outputs. Outputs are published, so they contain no folder of the user's machine: an
+//! input is recorded by its last name, and a file that a recipe needs again by its path relative to the recipe.
 
 use std::fs;
 use std::path::{Component, Path, PathBuf};
 
 use crate::error::ShowPath;
 
-/// Number of folders from the root that a recipe and the files it names must have in common, unless all lie below the
-/// working directory: of `/home/a/small` and `/home/b/data` a relative path would tell the name `b`.
-const SHARED: usize = 2;
+/// Number of leading folders that a recipe and the files it names must have in common, unless all are below the working
+/// directory. With fewer, a relative path could reveal a name: from `/home/a/small` to `/home/b/data` it would contain
+/// `b`.
+const MIN_SHARED_FOLDERS: usize = 2;
 
-/// Returns the last name of `path`: that of the folder itself for `.` and paths that end in `..`.
+/// Returns the last name of `path`; for `.` and paths ending in `..` the name of the folder itself.
 pub fn name_of(path: &Path) -> String {
     let name = |path: &Path| path.file_name().map(|name| name.to_string_lossy().into_owned());
     name(path).or_else(|| name(&fs::canonicalize(path).ok()?)).unwrap_or_else(|| path.to_string_lossy().into_owned())
 }
 
-/// Returns [`name_of`] `path` as a message shows it.
+/// Returns [`name_of`] `path`, escaped for display.
 pub fn shown_name(path: &Path) -> String {
     Path::new(&name_of(path)).shown().to_string()
 }
 
-/// Returns `path` as `folder`, which need not exist yet, finds it: relative to `folder`, or its last name alone if the
-/// two are too far apart ([`SHARED`]). Separators are `/` on every system.
+/// Returns `path` relative to `folder`, which need not exist yet, or only its last name if the two are too far apart
+/// ([`MIN_SHARED_FOLDERS`]). Separators are `/` on every system.
 pub fn from_folder(path: &Path, folder: &Path) -> PathBuf {
     let found = (|| {
-        let (path, folder) = (real(path)?, real(folder)?);
+        let (path, folder) = (real_path(path)?, real_path(folder)?);
         let shared = path.components().zip(folder.components()).take_while(|(a, b)| a == b).count();
         let is_near = |common: &Path| {
             let names = common.components().filter(|part| matches!(part, Component::Normal(_))).count();
             let here = std::env::current_dir().ok().and_then(|here| fs::canonicalize(here).ok());
-            names >= SHARED || names > 0 && here.is_some_and(|here| common.starts_with(here))
+            names >= MIN_SHARED_FOLDERS || names > 0 && here.is_some_and(|here| common.starts_with(here))
         };
         if !is_near(&path.components().take(shared).collect::<PathBuf>()) {
             return None;
@@ -43,13 +44,13 @@ pub fn from_folder(path: &Path, folder: &Path) -> PathBuf {
     found.map_or_else(|| name_of(path).into(), PathBuf::from)
 }
 
-/// Returns the absolute path of `path`, in which the folders above the last name have no links and no `..`.
-fn real(path: &Path) -> Option<PathBuf> {
+/// Returns `path` as an absolute path whose folders contain no links and no `..`.
+fn real_path(path: &Path) -> Option<PathBuf> {
     let absolute = std::path::absolute(path).ok()?;
     match (absolute.parent(), absolute.file_name()) {
         (Some(parent), Some(name)) => {
-            // A folder that is not there yet lies below one that is.
-            let parent = fs::canonicalize(parent).ok().or_else(|| real(parent))?;
+            // A folder that does not exist yet lies below one that does.
+            let parent = fs::canonicalize(parent).ok().or_else(|| real_path(parent))?;
             Some(parent.join(name))
         }
         (Some(_), None) => fs::canonicalize(&absolute).ok(),
@@ -70,7 +71,7 @@ mod tests {
     }
 
     #[test]
-    fn a_path_from_a_folder_finds_the_file() {
+    fn relative_path_finds_the_file() {
         let top = tempfile::tempdir().unwrap();
         let top = top.path().join("place");
         fs::create_dir_all(top.join("data")).unwrap();
@@ -87,7 +88,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_far_away_is_named_by_its_last_name() {
+    fn distant_file_is_named_by_its_last_name() {
         for (path, folder) in [("/secret/client/data", "/elsewhere/small"), ("/home/b/data", "/home/a/small")] {
             assert_eq!(from_folder(Path::new(path), Path::new(folder)), Path::new("data"));
         }

@@ -1,38 +1,40 @@
-//! What has to be checked of a NumPy array before a reader believes its header.
+//! Checks of the header of a NumPy array that must pass before a reader may parse it.
 
-/// Longest header. Those of arrays of numbers have 118 bytes, or 54 more for every axis.
-const LONGEST: u64 = 4096;
-/// Bytes of a file that hold its header, if that is not too long.
-pub(crate) const HEAD: u64 = LONGEST + 12;
-/// Most digits of a shape: the product of its lengths stays below 2⁶³.
-const MOST_DIGITS: usize = 18;
-/// Deepest brackets: a shape within the dictionary, and one more.
-const DEEPEST: usize = 3;
+/// Maximum length of a header in bytes. Headers of arrays of numbers have 118 bytes, or 54 more for every axis.
+const MAX_HEADER_BYTES: u64 = 4096;
+/// Number of bytes of a file that contain its header, if its length is legal.
+pub(crate) const HEAD: u64 = MAX_HEADER_BYTES + 12;
+/// Maximum number of digits in a shape, so that the product of its lengths stays below 2⁶³.
+const MAX_SHAPE_DIGITS: usize = 18;
+/// Maximum bracket depth: a shape within the dictionary, and one more.
+const MAX_BRACKET_DEPTH: usize = 3;
 
-/// Whether a file of `bytes`, which begins with `head` ([`HEAD`] of them or all), has a header that a reader can be given: it
-/// makes room for the length that is announced, up to 4 GiB, before it looks, its time doubles with every open bracket, and
-/// it multiplies the lengths of a shape whatever they are.
+/// Returns whether the header of an array file of `bytes` bytes may be passed to the parser. `head` holds the first
+/// [`HEAD`] bytes, or all.
+///
+/// The parser itself is unsafe for forged headers: it allocates the declared length (up to 4 GiB) before reading, its
+/// time doubles with every open bracket, and it multiplies the lengths of a shape without a check.
 pub(crate) fn header_is_sound(head: &[u8], bytes: u64) -> bool {
     let start = if head.get(6) == Some(&1) { 10 } else { 12 };
     let Some(digits) = head.get(8..start) else { return false };
     let length = digits.iter().rev().fold(0, |sum, &digit| sum << 8 | u64::from(digit));
-    if length > LONGEST || start as u64 + length > bytes {
+    if length > MAX_HEADER_BYTES || start as u64 + length > bytes {
         return false;
     }
     let Some(text) = head.get(start..start + length as usize) else { return false };
     let mut depth = 0usize;
-    digits_of_shape(text) <= MOST_DIGITS
+    digits_of_shape(text) <= MAX_SHAPE_DIGITS
         && text.iter().all(|byte| {
             match byte {
                 b'{' | b'[' | b'(' => depth += 1,
                 b'}' | b']' | b')' => depth = depth.saturating_sub(1),
                 _ => {}
             }
-            depth <= DEEPEST
+            depth <= MAX_BRACKET_DEPTH
         })
 }
 
-/// Digits of the first tuple of lengths; a header without one has none.
+/// Returns the number of digits in the first tuple of lengths; 0 if the header has none.
 fn digits_of_shape(text: &[u8]) -> usize {
     const KEY: &[u8] = b"'shape'";
     let Some(at) = text.windows(KEY.len()).position(|some| some == KEY) else { return 0 };
@@ -53,7 +55,7 @@ mod tests {
     }
 
     #[test]
-    fn a_header_longer_than_its_file_or_than_any_is_not_sound() {
+    fn too_long_headers_are_not_sound() {
         let text = "{'descr': '<f8', 'fortran_order': False, 'shape': (1, 17), }";
         for version in [1, 2, 3] {
             let sound = |length: u32| {
@@ -68,7 +70,7 @@ mod tests {
     }
 
     #[test]
-    fn lengths_whose_product_overflows_are_not_sound() {
+    fn overflowing_shapes_are_not_sound() {
         let sound = |shape: &str| {
             let text = format!("{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}");
             header_is_sound(&file(1, text.len() as u32, &text), 1000)
@@ -78,7 +80,7 @@ mod tests {
     }
 
     #[test]
-    fn brackets_deeper_than_an_array_has_are_not_sound() {
+    fn deep_brackets_are_not_sound() {
         let sound = |text: &str| header_is_sound(&file(1, text.len() as u32, text), 1000);
         assert!(sound("{'descr': [('x', '<f4'), ('y', '<f4')], 'shape': (1,)}"));
         assert!(!sound("{{[[") && !sound("]]]]{{{{"));

@@ -1,7 +1,8 @@
-//! numpy's `.npz` archives, of which arrays are read where they lie.
+//! NumPy `.npz` archives, whose arrays are read in place from a map where possible.
 //!
-//! In: a path. Out: the shape of every array, and values of those asked for. Memory: 2 MiB of a map of the file. An array
-//! that is compressed or not f32 is decoded once, into a scratch file without a name that is mapped in its place.
+//! Input: a path. Output: the shape of every array, and the values of requested arrays. Memory: at most about 2 MiB of
+//! the mapped file. An array that is compressed or not f32 is decoded once into an unnamed scratch file, which is then
+//! mapped instead.
 
 pub(crate) mod write;
 
@@ -19,21 +20,22 @@ use zip::read::ZipFile;
 use super::map::FileMap;
 use super::npy::{HEAD, header_is_sound};
 use super::open::open_file;
-use super::zip_directory::{Announced, announced};
+use super::zip_directory::{DeclaredDirectory, declared_directory};
 use crate::error::{Error, Result};
 
-/// Most arrays of an archive.
+/// Maximum number of arrays in an archive.
 const MAX_ARRAYS: usize = 4096;
-/// Maximum number of bytes of the list of files at the end of an archive.
+/// Maximum size in bytes of the list of files at the end of an archive.
 const MAX_LIST: u64 = 4 << 20;
-/// Bytes of decoded arrays that each byte of an archive may stand for, beside [`SCRATCH`]. Trained models have 1 to 2.
+/// Maximum number of bytes of decoded arrays per byte of the archive, in addition to [`BASE_SCRATCH_BYTES`]. Trained
+/// models have 1 to 2.
 const SCRATCH_PER_BYTE: u64 = 64;
-/// Bytes of decoded arrays that any archive may have.
-const SCRATCH: u64 = 64 << 20;
-/// Most bytes that DEFLATE packs into one.
-const MOST_PER_BYTE: u64 = 1032;
+/// Number of bytes of decoded arrays that any archive may have.
+const BASE_SCRATCH_BYTES: u64 = 64 << 20;
+/// Maximum compression factor of DEFLATE.
+const MAX_DEFLATE_FACTOR: u64 = 1032;
 
-/// An open archive.
+/// Open archive.
 #[derive(Debug)]
 pub(crate) struct Npz {
     path: PathBuf,
@@ -41,42 +43,43 @@ pub(crate) struct Npz {
     entries: Vec<NpzArray>,
 }
 
-/// An array of an archive.
+/// Array of an archive.
 #[derive(Debug, Clone)]
 pub(crate) struct NpzArray {
-    /// Without `.npy`.
+    /// Name of the array, without `.npy`.
     pub(crate) name: String,
-    /// Length of every axis, the slowest first.
+    /// Length of every axis, the slowest axis first.
     pub(crate) shape: Vec<usize>,
-    /// How its values are stored; none: not as floating-point numbers in C order.
+    /// Floating-point type of the values; `None` for other types and for Fortran order.
     pub(crate) float: Option<Float>,
-    /// Type of its values, as numpy spells it.
+    /// Type of the values in NumPy's notation.
     pub(crate) descr: String,
-    /// Whether its first axis is the fastest.
+    /// Whether the first axis is the fastest (Fortran order).
     pub(crate) is_fortran: bool,
-    /// Whether it is compressed.
+    /// Whether the array is compressed.
     pub(crate) is_compressed: bool,
-    /// Bytes in the archive.
+    /// Size in the archive, in bytes.
     stored: u64,
-    /// Place in the archive.
+    /// Index in the archive.
     index: usize,
-    /// Bytes of its header, and where in the file its values begin if it is not compressed.
+    /// Length of the header in bytes, and offset of the values in the file if they are not compressed.
     header: usize,
     start: usize,
 }
 
-/// A type of floating-point numbers.
+/// Floating-point type of stored values.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Float {
-    /// 2, 4 or 8.
+    /// Number of bytes per value: 2, 4 or 8.
     pub(crate) bytes: usize,
     big_endian: bool,
 }
 
 impl Float {
-    /// Four bytes, the lowest first.
+    /// Little-endian float32.
     const F32: Float = Float { bytes: 4, big_endian: false };
 
+    /// Returns the type of an array if it holds floating-point numbers in C order.
     fn from_header(header: &NpyHeader) -> Option<Float> {
         let DType::Plain(plain) = header.dtype() else { return None };
         let bytes = plain.num_bytes().filter(|bytes| [2, 4, 8].contains(bytes))?;
@@ -84,7 +87,7 @@ impl Float {
         is_float.then_some(Float { bytes, big_endian: plain.endianness() == Endianness::Big })
     }
 
-    /// The value in `stored`, of as many bytes as it takes.
+    /// Decodes the value in `stored`, which must have [`Float::bytes`] bytes.
     pub(crate) fn decode(self, stored: &[u8]) -> f32 {
         let mut bytes = [0; 8];
         bytes[..self.bytes].copy_from_slice(stored);
@@ -99,7 +102,7 @@ impl Float {
         }
     }
 
-    /// Stores `value`.
+    /// Encodes `value` into `stored`, which must have [`Float::bytes`] bytes.
     pub(crate) fn encode(self, value: f32, stored: &mut [u8]) {
         match self.bytes {
             2 => stored.copy_from_slice(&f16::from_f32(value).to_le_bytes()),
@@ -113,7 +116,7 @@ impl Float {
 }
 
 impl NpzArray {
-    /// Number of values.
+    /// Returns the number of values.
     pub(crate) fn len(&self) -> usize {
         self.shape.iter().product()
     }
@@ -123,8 +126,8 @@ impl Npz {
     /// Opens the archive at `path` and reads the headers of its arrays.
     ///
     /// # Errors
-    /// A file that is no archive, or is cut short; an array with a header that says nothing, or whose values are not all
-    /// there.
+    /// Fails if the file is not an archive or is cut short, if a header is malformed, or if values of an array are
+    /// missing.
     pub(crate) fn open(path: &Path) -> Result<Npz> {
         let map = FileMap::open(path)?;
         let wrong = |place: String, found: String| {
@@ -147,7 +150,7 @@ impl Npz {
             let bytes = entry.float.map(|float| entry.len() * float.bytes);
             if bytes.is_some_and(|bytes| (entry.header + bytes) as u64 != file.size())
                 || entry.stored > map.len() as u64
-                || file.size() > entry.stored.saturating_mul(MOST_PER_BYTE).saturating_add(64)
+                || file.size() > entry.stored.saturating_mul(MAX_DEFLATE_FACTOR).saturating_add(64)
                 || !entry.is_compressed && entry.start as u64 + (file.size() - entry.header as u64) > map.len() as u64
             {
                 return Err(wrong(name, {
@@ -161,28 +164,28 @@ impl Npz {
         Ok(Npz { path: path.to_owned(), map: Arc::new(map), entries })
     }
 
-    /// Where it is.
+    /// Returns the path of the file.
     pub(crate) fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Its arrays, in the file's order.
+    /// Returns the arrays in the order of the file.
     pub(crate) fn entries(&self) -> &[NpzArray] {
         &self.entries
     }
 
-    /// The array called `name`.
+    /// Returns the array called `name`, or `None`.
     pub(crate) fn entry(&self, name: &str) -> Option<&NpzArray> {
         self.entries.iter().find(|entry| entry.name == name)
     }
 
-    /// Confirms that the arrays called `names` are there, hold floating-point numbers in C order, and decode to no more
-    /// scratch bytes than an archive of this length may have. Nothing is decoded.
+    /// Checks that the arrays called `names` exist, hold floating-point numbers in C order, and need no more scratch
+    /// bytes than an archive of this length may have. Decodes nothing.
     ///
     /// # Errors
-    /// One of these does not hold; the error names the array.
+    /// Fails if one of these conditions does not hold; the message names the array.
     pub(crate) fn check_floats(&self, names: &[&str]) -> Result<()> {
-        let most = SCRATCH + SCRATCH_PER_BYTE * self.map.len() as u64;
+        let most = BASE_SCRATCH_BYTES + SCRATCH_PER_BYTE * self.map.len() as u64;
         let mut decoded = 0u64;
         for name in names {
             let (entry, float) = self.float(name)?;
@@ -198,24 +201,26 @@ impl Npz {
         Ok(())
     }
 
-    /// The array called `name` and the type of its values.
+    /// Returns the array called `name` and the type of its values. Fails if it is missing or not floating-point in C
+    /// order.
     fn float(&self, name: &str) -> Result<(&NpzArray, Float)> {
         let Some(entry) = self.entry(name) else {
             let names: Vec<&str> = self.entries.iter().map(|entry| entry.name.as_str()).collect();
             return Err(Error::input(&self.path, name, "an array of this name", names.join(", ")));
         };
         let Some(float) = entry.float else {
-            let found = format!("{} in another order or type", entry.descr);
+            let found = format!("{}, another type or Fortran order", entry.descr);
             return Err(Error::input(&self.path, name, "float16, float32 or float64 in C order", found));
         };
         Ok((entry, float))
     }
 
-    /// The values of the array called `name`, decoded into a file in `scratch` where they cannot be read where they lie.
+    /// Returns the values of the array called `name`. If they cannot be read in place, decodes them into a file in the
+    /// folder `scratch`.
     ///
     /// # Errors
-    /// An array that is not there or holds no floating-point numbers in C order; one that does not decode; a scratch file
-    /// that cannot be written.
+    /// Fails if the array is missing, holds no floating-point numbers in C order or cannot be decoded, or if the
+    /// scratch file cannot be written.
     pub(crate) fn floats(&self, name: &str, scratch: &Path) -> Result<Floats> {
         let (entry, float) = self.float(name)?;
         if entry.is_in_place(float) {
@@ -224,17 +229,17 @@ impl Npz {
         let file = tempfile::tempfile_in(scratch).map_err(Error::io("create a scratch file in", scratch))?;
         let failed = |error| Error::io("write a scratch file in", scratch)(error);
         let mut out = BufWriter::new(&file);
-        let mut piece = vec![0; entry.len().min(1 << 16) * float.bytes];
+        let mut chunk = vec![0; entry.len().min(1 << 16) * float.bytes];
         let mut left = entry.len() * float.bytes;
         self.read(entry, |values| {
             while left > 0 {
-                let piece = &mut piece[..left.min(1 << 16)];
-                values.read_exact(piece).map_err(|error| self.damaged(entry, &error))?;
-                for stored in piece.chunks_exact(float.bytes) {
+                let chunk = &mut chunk[..left.min(1 << 16)];
+                values.read_exact(chunk).map_err(|error| self.damaged(entry, &error))?;
+                for stored in chunk.chunks_exact(float.bytes) {
                     let value = float.decode(stored).to_le_bytes();
                     out.write_all(&value).map_err(failed)?;
                 }
-                left -= piece.len();
+                left -= chunk.len();
             }
             out.flush().map_err(failed)
         })?;
@@ -243,10 +248,10 @@ impl Npz {
         Ok(Floats { map: Arc::new(map), start: 0, len: entry.len() })
     }
 
-    /// Has `take` read the stored values of `entry` from first to last.
+    /// Calls `take` with a reader of the stored values of `entry`.
     ///
     /// # Errors
-    /// Those of `take`; a file cut short since it was opened.
+    /// Fails if `take` fails or the file was cut short since it was opened.
     pub(crate) fn read(&self, entry: &NpzArray, take: impl FnOnce(&mut dyn Read) -> Result<()>) -> Result<()> {
         self.map.check()?;
         let mut archive = open_zip(&self.path)?.map_err(|found| self.damaged(entry, &found))?;
@@ -256,34 +261,36 @@ impl Npz {
         take(&mut file)
     }
 
-    /// That the values of `entry` are not as they were written.
+    /// Builds the error for damaged values of `entry`.
     pub(crate) fn damaged(&self, entry: &NpzArray, error: &dyn std::fmt::Display) -> Error {
         Error::input(&self.path, &entry.name, "the values as they were written", error.to_string())
     }
 }
 
-/// Opens the zip archive at `path`. The inner error says what was found in it.
+/// Opens the zip archive at `path`. The inner error says what is wrong with its content.
 fn open_zip(path: &Path) -> Result<std::result::Result<ZipArchive<BufReader<File>>, String>> {
     let mut file = open_file(path)?;
-    let directory = match announced(&mut file) {
+    let directory = match declared_directory(&mut file) {
         Ok(directory) => directory,
         Err(error) => return Ok(Err(error.to_string())),
     };
     if directory.entries > MAX_ARRAYS as u64 || directory.bytes > MAX_LIST {
-        let Announced { entries, bytes } = directory;
+        let DeclaredDirectory { entries, bytes } = directory;
         return Ok(Err(format!(
-            "{entries} files in a list of {bytes} bytes, where at most {MAX_ARRAYS} files and {MAX_LIST} bytes can be"
+            "{entries} files in a list of {bytes} bytes, more than the limits of {MAX_ARRAYS} files and {MAX_LIST} bytes"
         )));
     }
     Ok(ZipArchive::new(BufReader::new(file)).map_err(|error| error.to_string()))
 }
 
 impl NpzArray {
-    /// Whether values of type `float` can be read where they lie.
+    /// Returns whether the values, which have the type `float`, can be read in place.
     fn is_in_place(&self, float: Float) -> bool {
         !self.is_compressed && float == Float::F32
     }
 
+    /// Reads the header of the array in `file`, which is entry `index` of the archive. The error text says what was
+    /// found.
     fn read(file: &mut ZipFile<'_>, index: usize, name: String) -> std::result::Result<NpzArray, String> {
         let is_compressed = file.compression() != zip::CompressionMethod::Stored;
         let start = file.data_start();
@@ -310,7 +317,7 @@ impl NpzArray {
     }
 }
 
-/// Values of an array, f32, in its order.
+/// Values of an array as f32, in the order of the array.
 #[derive(Debug, Clone)]
 pub(crate) struct Floats {
     map: Arc<FileMap>,
@@ -319,7 +326,7 @@ pub(crate) struct Floats {
 }
 
 impl Floats {
-    /// Confirms that they are still there; call before a block of them is read.
+    /// Checks that the file has not been cut short; to be called before each block is read.
     pub(crate) fn check(&self) -> Result<()> {
         self.map.check()
     }
@@ -329,10 +336,10 @@ impl Floats {
         self.map.touched(self.start + 4 * range.start..self.start + 4 * range.end);
     }
 
-    /// The values from `first` on.
+    /// Returns `W` values starting at index `first`.
     ///
     /// # Panics
-    /// If there are not `W`.
+    /// Panics if there are fewer than `W`.
     pub(crate) fn row<const W: usize>(&self, first: usize) -> [f32; W] {
         assert!(first + W <= self.len, "values {first} to {} of {}", first + W, self.len);
         let (stored, _) = self.map[self.start + 4 * first..][..4 * W].as_chunks::<4>();

@@ -1,7 +1,7 @@
-//! The one way to open an input file: regular files only.
+//! Opening of input files. Only regular files are opened.
 //!
 //! Opening a named pipe waits for its writer, a device such as `/dev/zero` never ends, and reading one may have side
-//! effects. Every reader of a file that a user names opens it here.
+//! effects. Every reader of a file that a user names opens it with [`open_file`].
 
 use std::fs::{self, File, FileType};
 use std::io::{self, Read};
@@ -11,25 +11,25 @@ use splat_platform::{FileKind, open_without_waiting};
 
 use crate::error::{Error, Result};
 
-/// Opens the regular file at `path`, which may be a link to one, for reading.
+/// Opens the regular file at `path`, or the regular file it links to, for reading.
 ///
 /// # Errors
-/// Nothing there; a folder, named pipe, socket or device, which is not opened.
+/// Fails if nothing is there, and for folders, named pipes, sockets and devices, which are not opened.
 pub(crate) fn open_file(path: &Path) -> Result<File> {
-    // Checked before opening, because opening a device may have side effects, and after it, because the file may have
-    // been replaced between the two.
+    // Check before opening, because opening a device may have side effects, and after it, because the file may have
+    // been replaced in between.
     check_regular(path, fs::metadata(path).map_err(Error::io("open", path))?.file_type())?;
-    // A named pipe that takes the place of the file must not be waited for.
+    // Do not wait if a named pipe has replaced the file.
     let file = open_without_waiting(path).map_err(Error::io("open", path))?;
     check_regular(path, file.metadata().map_err(Error::io("open", path))?.file_type())?;
     Ok(file)
 }
 
-/// Reads the whole file at `path`, which must be regular and hold at most `most_bytes`. `what` names its content in the
-/// message, as in "a configuration".
+/// Reads the whole file at `path`, which must be regular and hold at most `most_bytes`. `what` names its content in
+/// messages, as in "a configuration".
 ///
 /// # Errors
-/// Those of [`open_file`]; a larger file, of which nothing is read; a failed read.
+/// Fails like [`open_file`], if the file is larger (nothing of it is read then), or if reading fails.
 pub(crate) fn read_small(path: &Path, most_bytes: u64, what: &str) -> Result<Vec<u8>> {
     let file = open_file(path)?;
     let length = file.metadata().map_err(Error::io("read the size of", path))?.len();
@@ -41,7 +41,7 @@ pub(crate) fn read_small(path: &Path, most_bytes: u64, what: &str) -> Result<Vec
         return Err(larger(format!("{length} bytes")));
     }
     let mut bytes = Vec::with_capacity(length as usize);
-    // Some file systems report a length of 0 for files that have content, and the file may grow.
+    // Some file systems report a length of 0 for files with content, and the file may grow.
     file.take(most_bytes.saturating_add(1)).read_to_end(&mut bytes).map_err(Error::io("read", path))?;
     if bytes.len() as u64 > most_bytes {
         return Err(larger("more".to_owned()));
@@ -49,7 +49,7 @@ pub(crate) fn read_small(path: &Path, most_bytes: u64, what: &str) -> Result<Vec
     Ok(bytes)
 }
 
-/// Refuses a file of another kind than a regular one.
+/// Fails if a file is not a regular one.
 fn check_regular(path: &Path, found: FileType) -> Result<()> {
     let kind = match FileKind::from_type(found) {
         FileKind::File => return Ok(()),

@@ -1,16 +1,16 @@
-//! Content security policies of the pages this program writes: a browser runs the scripts named by their digests and
-//! nothing else, whatever text from a file is in the page, and asks no network for anything.
+//! Content security policies of the HTML pages this program writes. The browser runs only scripts named by their
+//! digests and makes no network request, whatever text from a file is in the page.
 
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use sha2::{Digest, Sha256};
 
-/// Returns the source expression of the inline script or style `content`: all bytes between its tags.
+/// Returns the source expression of an inline script or style; `content` is all bytes between its tags.
 pub fn digest_of(content: &str) -> String {
     format!("'sha256-{}'", STANDARD.encode(Sha256::digest(content)))
 }
 
-/// Returns the `<meta>` element of a policy that allows nothing but `directives`, each of a name and its sources.
+/// Returns the `<meta>` element of a policy that allows only `directives`, each with a name and its sources.
 pub fn policy(directives: &[(&str, &[String])]) -> String {
     let mut content = "default-src 'none'; base-uri 'none'; form-action 'none'".to_owned();
     for (name, sources) in directives.iter().filter(|(_, sources)| !sources.is_empty()) {
@@ -24,8 +24,8 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_digest_is_that_of_the_specification() {
-        // The example of "Content Security Policy Level 3", section 8.3.
+    fn digest_matches_the_specification() {
+        // Example from "Content Security Policy Level 3", section 8.3.
         assert_eq!(digest_of("doSomething();"), "'sha256-RFWPLDbv2BY+rCkDzsE+0fr8ylGr2R2faWMhq4lfEQc='");
     }
 

@@ -1,11 +1,13 @@
-//! Pickles as data: what a pickle builds, and where in its bytes every number stands, so that some of them can be written
-//! anew and all else stays as it was. Nothing is ever executed: what a pickle would call is a name here.
+//! Pickles as data: the object tree that a pickle builds, and the byte range of every integer, so that some integers
+//! can be replaced while all other content stays unchanged. Nothing is executed: functions and classes that a pickle
+//! would call are only names.
 //!
-//! Input: the bytes of a pickle of protocol 2 to 5, as `torch.save` writes them. Output: nodes that refer to each other by
-//! number. A shared value is one node, and nothing here recurses, so cycles are harmless. Source: CPython's `pickletools`.
+//! Input: the bytes of a pickle of protocol 2 to 5, as written by `torch.save`. Output: nodes that refer to each other
+//! by number. A shared value is one node, and no code here recurses, so cycles are harmless. Source: CPython's
+//! `pickletools`.
 //!
-//! Memory: every allocation is counted before it is made (`read.rs`). The number of instructions, the nesting depth and the
-//! counted bytes are limited, whatever the pickle says of itself.
+//! Memory: every allocation is counted before it is made (`read.rs`). The number of instructions, the nesting depth and
+//! the counted bytes are limited, whatever the pickle declares.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -20,74 +22,74 @@ use read::PickleMachine;
 
 /// Maximum nesting depth of containers. Checkpoints of trained models reach about 10.
 pub(crate) const MAX_DEPTH: u8 = 100;
-/// Maximum memory in bytes, whatever the caller allows. Ten thousand tensors take about 30 MB.
+/// Maximum memory in bytes, whatever the caller allows. A pickle of ten thousand tensors takes about 30 MB.
 const MAX_MEMORY: u64 = 128 << 20;
 
-/// A place in [`Pickle`].
+/// Index of a node in [`Pickle`].
 pub(crate) type NodeId = u32;
 
-/// A value of a pickle.
+/// Node of the object tree.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum Node {
-    /// `None`.
+    /// The value `None`.
     None,
-    /// `True`, `False`.
+    /// A boolean.
     Bool(bool),
-    /// A whole number, and its bytes in the pickle.
+    /// An integer, and its byte range in the pickle.
     Int(i64, Range<u32>),
-    /// A number.
+    /// A floating-point number.
     Float(f64),
-    /// A text.
+    /// A string.
     Text(Box<str>),
-    /// Bytes, or a number of more than eight; nobody asks which.
+    /// Bytes, or an integer of more than eight bytes. No reader needs the value.
     Opaque,
-    /// Something of a module.
+    /// A function or class of a module, by its full name.
     Global(Box<str>),
-    /// A tuple.
+    /// Elements of a tuple.
     Tuple(Vec<NodeId>),
-    /// A list or a set.
+    /// Elements of a list or a set.
     List(Vec<NodeId>),
-    /// A dict: keys and values, in order.
+    /// Keys and values of a dict, in order.
     Dict(Vec<(NodeId, NodeId)>),
-    /// What calling `callee` with `arguments` would give, and the items that are then set in it.
+    /// Result of calling `callee` with `arguments`, and the items set in it afterwards.
     Called { callee: NodeId, arguments: NodeId, items: Vec<(NodeId, NodeId)> },
-    /// Something that lies outside, by what names it.
+    /// An object outside the pickle (persistent id); the node that identifies it.
     Outside(NodeId),
 }
 
-/// A pickle that was read.
+/// Object tree of a pickle.
 #[derive(Debug)]
 pub(crate) struct Pickle {
     nodes: Vec<Node>,
     root: NodeId,
-    /// Where instructions say how many bytes follow.
+    /// Byte ranges of the instructions that announce the length of the following bytes.
     frames: Vec<Range<usize>>,
 }
 
-/// Why a pickle cannot be read.
+/// Reason why a pickle cannot be read.
 #[derive(Debug, PartialEq)]
 pub(crate) enum Wrong {
-    /// Malformed or not supported: the byte, and what was found there.
+    /// Malformed or unsupported content: its byte offset, and a description of it.
     Malformed(usize, String),
-    /// Beyond a fixed limit: the byte, what was expected, and what was found.
+    /// Content beyond a fixed limit: its byte offset, the limit, and a description of what was found.
     TooMuch(usize, String, String),
-    /// Reading takes more than the allowed memory: the byte, and how many bytes it takes up to there.
+    /// More memory than allowed: the byte offset, and the number of bytes of memory needed up to there.
     Memory(usize, u64),
 }
 
 impl Wrong {
-    /// Malformed at byte `at`.
+    /// Builds the error for malformed content at byte `at`.
     fn at(at: usize, found: impl Into<String>) -> Wrong {
         Wrong::Malformed(at, found.into())
     }
 }
 
 impl Pickle {
-    /// Reads `bytes` within `memory` bytes of memory, beside `bytes` themselves.
+    /// Reads the pickle in `bytes` with at most `memory` bytes of memory, not counting `bytes` themselves.
     ///
     /// # Errors
-    /// Bytes that end too early, use values that do not exist, or contain an instruction that no tensors need; more
-    /// instructions, depth or memory than the limits.
+    /// Fails if the bytes end too early, refer to values that do not exist, or contain an instruction that no tensor
+    /// needs, or if instructions, depth or memory exceed their limits.
     pub(crate) fn read(bytes: &[u8], memory: u64) -> Result<Pickle, Wrong> {
         if u32::try_from(bytes.len()).is_err() {
             return Err(Wrong::TooMuch(0, "a pickle below 4 GiB".into(), format!("{} bytes", bytes.len())));
@@ -95,22 +97,22 @@ impl Pickle {
         PickleMachine::new(bytes, memory.min(MAX_MEMORY)).read()
     }
 
-    /// The whole.
+    /// Returns the node of the whole value.
     pub(crate) fn root(&self) -> NodeId {
         self.root
     }
 
-    /// The node at a place.
+    /// Returns node `id`.
     pub(crate) fn node(&self, id: NodeId) -> &Node {
         &self.nodes[id as usize]
     }
 
-    /// Every node, by number.
+    /// Returns the ids of all nodes.
     pub(crate) fn ids(&self) -> std::ops::Range<NodeId> {
         0..self.nodes.len() as NodeId
     }
 
-    /// Keys and values, in order, of a dict or of an ordered one.
+    /// Returns keys and values of a dict or an `OrderedDict`, in order; `None` for other nodes.
     pub(crate) fn pairs(&self, id: NodeId) -> Option<&[(NodeId, NodeId)]> {
         match self.node(id) {
             Node::Dict(items) => Some(items),
@@ -122,18 +124,19 @@ impl Pickle {
         }
     }
 
-    /// Keys that are texts, and their values, of a dict or of an ordered one.
+    /// Returns the string keys and their values of a dict or an `OrderedDict`; `None` for other nodes.
     pub(crate) fn items(&self, id: NodeId) -> Option<impl Iterator<Item = (&str, NodeId)>> {
         let named = |&(key, value): &(NodeId, NodeId)| Some((self.text(key)?, value));
         Some(self.pairs(id)?.iter().filter_map(named))
     }
 
-    /// What a dict has under a text; the last one, as in Python, if it was set more than once.
+    /// Returns the value of a dict under a string key. If the key was set more than once, the last value counts, as in
+    /// Python.
     pub(crate) fn item(&self, id: NodeId, key: &str) -> Option<NodeId> {
         self.items(id)?.filter(|(name, _)| *name == key).last().map(|(_, value)| value)
     }
 
-    /// The elements of a tuple or a list.
+    /// Returns the elements of a tuple or a list; `None` for other nodes.
     pub(crate) fn elements(&self, id: NodeId) -> Option<&[NodeId]> {
         match self.node(id) {
             Node::Tuple(elements) | Node::List(elements) => Some(elements),
@@ -141,7 +144,7 @@ impl Pickle {
         }
     }
 
-    /// A text.
+    /// Returns a string; `None` for other nodes.
     pub(crate) fn text(&self, id: NodeId) -> Option<&str> {
         match self.node(id) {
             Node::Text(text) => Some(text),
@@ -149,7 +152,7 @@ impl Pickle {
         }
     }
 
-    /// A whole number.
+    /// Returns an integer; `None` for other nodes.
     pub(crate) fn int(&self, id: NodeId) -> Option<i64> {
         match self.node(id) {
             Node::Int(value, _) => Some(*value),
@@ -157,7 +160,7 @@ impl Pickle {
         }
     }
 
-    /// Name and arguments of what would be called.
+    /// Returns name and arguments of a call; `None` for other nodes.
     pub(crate) fn call(&self, id: NodeId) -> Option<(&str, &[NodeId])> {
         let Node::Called { callee, arguments, .. } = self.node(id) else { return None };
         match self.node(*callee) {
@@ -166,7 +169,7 @@ impl Pickle {
         }
     }
 
-    /// What a node is, for a person.
+    /// Describes a node for messages.
     pub(crate) fn describe(&self, id: NodeId) -> String {
         const MOST: usize = 12;
         match self.node(id) {
@@ -192,8 +195,9 @@ impl Pickle {
         }
     }
 
-    /// `bytes`, those that this was read from, with other whole numbers in the places that `numbers` names. What says how
-    /// many bytes follow is left out: no reader needs it.
+    /// Returns the pickle with some integers replaced. `bytes` are the bytes this was read from; `numbers` maps byte
+    /// ranges of integers to their new values. Instructions that announce lengths are left out, as readers do not need
+    /// them.
     pub(crate) fn with_numbers(&self, bytes: &[u8], numbers: &BTreeMap<(usize, usize), u64>) -> Vec<u8> {
         let mut edits: Vec<(Range<usize>, Vec<u8>)> =
             numbers.iter().map(|(&(start, end), &number)| (start..end, int(number))).collect();
@@ -210,13 +214,13 @@ impl Pickle {
     }
 }
 
-/// The instruction that gives `value`.
+/// Encodes the instruction that pushes `value`.
 fn int(value: u64) -> Vec<u8> {
     match value {
         0..=0xff => vec![b'K', value as u8],
         0x100..=0xffff => [&[b'M'][..], &(value as u16).to_le_bytes()].concat(),
         0x1_0000..=0x7fff_ffff => [&[b'J'][..], &(value as u32).to_le_bytes()].concat(),
-        // Nine bytes, of which the last has no sign.
+        // Long integer of nine bytes; the last byte is 0, so the number is not negative.
         _ => [&[0x8a, 9][..], &value.to_le_bytes(), &[0]].concat(),
     }
 }

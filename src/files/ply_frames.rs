@@ -1,9 +1,9 @@
-//! Files of frames: which they are, and what all of them have in common.
+//! PLY files of a sequence, one per frame: their order and their common properties.
 //!
-//! In: a folder with one PLY file per frame, or a single file. Out: their paths in order, the number of Gaussians in each,
-//! and each open when it is asked for. Memory: path and number of every frame; a frame's file is mapped only while it is
-//! read, so thousands of frames need neither thousands of maps nor of file descriptors. Text files are converted once, when
-//! they are opened, into one scratch file.
+//! Input: a folder with one PLY file per frame, or a single file. Output: their paths in order, the number of Gaussians
+//! in each, and each file opened on request. Memory: path and count of every frame. A file is mapped only while it is
+//! read, so thousands of frames need neither thousands of maps nor of file descriptors. Text files are converted once,
+//! when they are opened, into a shared scratch file.
 
 use std::cmp::Ordering;
 use std::ffi::OsStr;
@@ -24,46 +24,47 @@ pub struct PlyFrames {
     counts: Vec<u32>,
     properties: Vec<Property>,
     sh_degree: usize,
-    /// Converted rows of each text file.
+    /// Converted rows of each text file; `None` for binary files.
     texts: Vec<Option<TextRows>>,
     memory: ReadLimit,
 }
 
 impl PlyFrames {
-    /// All `.ply` files of `folder` but the hidden ones, in natural order (`frame_2` before `frame_10`).
+    /// Opens all `.ply` files of `folder` except hidden ones, in natural order (`frame_2` before `frame_10`).
     ///
     /// # Errors
-    /// A gap in the frames' numbers, or an entry called like a frame that is no file; a folder without PLY files; a file
-    /// [`Ply::open`] refuses; frames that differ in their properties.
+    /// Fails if the numbers of the frames have a gap, if an entry is named like a frame but is not a file, if the
+    /// folder has no PLY files, if [`Ply::open`] fails for a file, or if frames differ in their properties.
     pub fn open(folder: &Path, options: &PlyOptions) -> Result<PlyFrames> {
-        let (frames, others) = frames_of(folder)?;
+        let (frames, others) = list_frames(folder)?;
         if let Some(other) = others.first() {
             let found = if other.is_dir() { "a folder" } else { "a link to nothing" };
-            return Err(Error::input(other, "", "a PLY file, as its name says", found).hint(ALLOW_GAPS));
+            return Err(Error::input(other, "", "a PLY file, as its name says", found).hint(ALLOW_GAPS_HINT));
         }
         if let Some((missing, before, after)) = first_gap(&frames) {
             let found = format!("{before}, then {after}");
-            return Err(Error::input(folder, "", format!("a frame {missing}"), found).hint(ALLOW_GAPS));
+            return Err(Error::input(folder, "", format!("a frame {missing}"), found).hint(ALLOW_GAPS_HINT));
         }
         Self::from_paths(folder, frames, options)
     }
 
-    /// [`PlyFrames::open`] of the files that are there, whatever is missing between them.
+    /// Opens a folder like [`PlyFrames::open`], but accepts missing frames.
     ///
     /// # Errors
-    /// Those of [`PlyFrames::open`] but gaps.
+    /// Fails like [`PlyFrames::open`], except for gaps and entries that are not files.
     pub fn open_with_gaps(folder: &Path, options: &PlyOptions) -> Result<PlyFrames> {
-        Self::from_paths(folder, frames_of(folder)?.0, options)
+        Self::from_paths(folder, list_frames(folder)?.0, options)
     }
 
-    /// One PLY file as the only frame.
+    /// Opens one PLY file as the only frame.
     ///
     /// # Errors
-    /// A file [`Ply::open`] refuses.
+    /// Fails like [`Ply::open`].
     pub fn single(path: &Path, options: &PlyOptions) -> Result<PlyFrames> {
         Self::from_paths(path, vec![path.to_owned()], options)
     }
 
+    /// Opens the files at `paths`; `origin` names the sequence in messages.
     fn from_paths(origin: &Path, paths: Vec<PathBuf>, options: &PlyOptions) -> Result<PlyFrames> {
         let Some(first_path) = paths.first() else {
             return Err(Error::input(origin, "", "a folder with one .ply file per frame", "no .ply file in it"));
@@ -87,35 +88,35 @@ impl PlyFrames {
         Ok(PlyFrames { paths, counts, properties, sh_degree, texts, memory })
     }
 
-    /// The files, in frame order.
+    /// Returns the paths of the files in frame order.
     pub fn paths(&self) -> &[PathBuf] {
         &self.paths
     }
 
-    /// Gaussians in each.
+    /// Returns the number of Gaussians in each frame.
     pub fn counts(&self) -> &[u32] {
         &self.counts
     }
 
-    /// Degree of the spherical harmonics of all, 0 to 3.
+    /// Returns the SH degree of all frames, 0 to 3.
     pub fn sh_degree(&self) -> usize {
         self.sh_degree
     }
 
-    /// The first frame with another number of Gaussians than frame 0.
+    /// Returns the first frame whose number of Gaussians differs from frame 0, or `None`.
     pub fn other_count(&self) -> Option<usize> {
         self.counts.iter().position(|count| *count != self.counts[0])
     }
 
-    /// Even times, one per frame: frame i of T has time i / T.
+    /// Returns evenly spaced times, one per frame: frame i of T has time i / T.
     pub fn times(&self) -> Vec<f64> {
         (0..self.paths.len()).map(|i| i as f64 / self.paths.len() as f64).collect()
     }
 
-    /// The file of one frame, open.
+    /// Opens the file of one frame.
     ///
     /// # Errors
-    /// A frame beyond the last; a file that no longer is what it was when the frames were opened.
+    /// Fails if there is no such frame, or if the file has changed since the frames were opened.
     pub fn frame(&self, frame: usize) -> Result<Ply> {
         let Some(path) = self.paths.get(frame) else {
             return Err(Error::internal(format!(
@@ -134,15 +135,15 @@ impl PlyFrames {
         Ok(ply)
     }
 
-    /// XXH3-128 over names and bytes of all files in frame order. Reads everything once. Folders do not enter it: a
-    /// sequence that was moved keeps its digest.
+    /// Returns the XXH3-128 hash over names and bytes of all files in frame order. Reads all files once. Folder names
+    /// are not included, so a sequence that was moved keeps its digest.
     ///
     /// # Errors
-    /// A file that cannot be read.
+    /// Fails if a file cannot be read.
     pub fn digest(&self) -> Result<u128> {
         let mut hash = Xxh3::new();
         for path in &self.paths {
-            // Lengths in front, so that no byte can pass from a name to a content or between files.
+            // Hash lengths first, so that different splits into names and contents give different hashes.
             let name = file_name(path).as_encoded_bytes();
             hash.update(&(name.len() as u64).to_le_bytes());
             hash.update(name);
@@ -154,19 +155,20 @@ impl PlyFrames {
     }
 }
 
+/// Returns the last name of `path`.
 fn file_name(path: &Path) -> &OsStr {
     path.file_name().unwrap_or_default()
 }
 
-/// What a sequence that is refused can be read with all the same.
-const ALLOW_GAPS: &str = "--allow-gaps takes the frames that are there as the whole sequence";
+/// Hint for a refused sequence.
+const ALLOW_GAPS_HINT: &str = "--allow-gaps reads the existing frames as the whole sequence";
 
-/// The files of a folder's frames in natural order, and what is called like one and is no file.
-fn frames_of(folder: &Path) -> Result<(Vec<PathBuf>, Vec<PathBuf>)> {
+/// Returns the files of a folder's frames in natural order, and entries that are named like frames but are not files.
+fn list_frames(folder: &Path) -> Result<(Vec<PathBuf>, Vec<PathBuf>)> {
     let mut found = Vec::new();
     for entry in fs::read_dir(folder).map_err(Error::io("list", folder))? {
         let path = entry.map_err(Error::io("list", folder))?.path();
-        if is_called_frame(&path) {
+        if is_named_like_frame(&path) {
             found.push(path);
         }
     }
@@ -174,8 +176,8 @@ fn frames_of(folder: &Path) -> Result<(Vec<PathBuf>, Vec<PathBuf>)> {
     Ok(found.into_iter().partition(|path| path.is_file()))
 }
 
-/// The name of the first frame that is missing, with its neighbors', where names differ in one number alone: of those
-/// that follow each other by the least step it is the one that would be next.
+/// Finds the first gap in the frame numbers, if the file names differ in one number only. A gap is a step larger than
+/// the smallest step. Returns the expected name of the missing frame and the names before and after the gap.
 fn first_gap(frames: &[PathBuf]) -> Option<(String, String, String)> {
     let parts = |path: &PathBuf| -> Option<(String, u64, String, usize)> {
         let name = file_name(path).to_str()?;
@@ -198,17 +200,20 @@ fn first_gap(frames: &[PathBuf]) -> Option<(String, String, String)> {
     Some((missing, name(at), name(at + 1)))
 }
 
-/// Hidden files are left out: a file manager's `._frame_1.ply` is no frame.
-fn is_called_frame(path: &Path) -> bool {
+/// Returns whether a file is named like a frame. Hidden files are excluded: a file manager's `._frame_1.ply` is not a
+/// frame.
+fn is_named_like_frame(path: &Path) -> bool {
     path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("ply"))
         && !file_name(path).as_encoded_bytes().starts_with(b".")
 }
 
-/// Numbers by value, then bytes: names equal to the natural comparison (`a 1`, `a1`) have an order too.
+/// Compares names with numbers by value, then by bytes, so that names equal in the natural comparison (`a 1`, `a1`)
+/// have a fixed order.
 fn natural_order(a: &OsStr, b: &OsStr) -> Ordering {
     natord::compare(&a.to_string_lossy(), &b.to_string_lossy()).then_with(|| a.cmp(b))
 }
 
+/// Checks that a frame has the same properties as the first frame.
 fn check_properties(ply: &Ply, properties: &[Property], first: &Path) -> Result<()> {
     if ply.properties() == properties {
         return Ok(());

@@ -1,6 +1,6 @@
 //! A dynamic scene as one PLY file per frame.
 //!
-//! In: PLY files with the same Gaussians in the same order. Out: a [`FrameSource`]. Memory: that of [`PlyFrames`].
+//! Input: PLY files with the same Gaussians in the same order. Output: a [`FrameSource`]. Memory: as in [`PlyFrames`].
 
 use std::ops::Range;
 use std::path::{Path, PathBuf};
@@ -11,7 +11,7 @@ use crate::error::{Error, Result, ShowPath};
 use crate::model::{Columns, Gaussians, SequenceInfo};
 use crate::source::{BlockReader, Count, FrameSource, Ids, Reads};
 
-/// A sequence of PLY files.
+/// PLY files of the same Gaussians, one per frame.
 #[derive(Debug)]
 pub struct PlySequence {
     frames: PlyFrames,
@@ -22,26 +22,27 @@ pub struct PlySequence {
 }
 
 impl PlySequence {
-    /// [`PlyFrames::open`], of the same Gaussians in every frame.
+    /// Opens a folder like [`PlyFrames::open`] and requires the same Gaussians in every frame.
     ///
     /// # Errors
-    /// Those of [`PlyFrames::open`] and [`PlySequence::new`].
+    /// Fails like [`PlyFrames::open`] and [`PlySequence::new`].
     pub fn open(folder: &Path) -> Result<PlySequence> {
         Self::new(PlyFrames::open(folder, &PlyOptions::default())?)
     }
 
-    /// One PLY file as a sequence of one frame, in which nothing varies.
+    /// Opens one PLY file as a sequence of one frame, in which no attribute varies.
     ///
     /// # Errors
-    /// Those of [`PlyFrames::single`].
+    /// Fails like [`PlyFrames::single`].
     pub fn single(path: &Path, options: &PlyOptions) -> Result<PlySequence> {
         Self::new(PlyFrames::single(path, options)?)
     }
 
-    /// Frames that hold the same Gaussians in the same order. Frame i of T has time i / T; all columns vary when T > 1.
+    /// Builds a sequence from frames with the same Gaussians in the same order. Frame i of T has time i / T; all
+    /// attributes vary if T > 1.
     ///
     /// # Errors
-    /// Frames that differ in their number of Gaussians.
+    /// Fails if frames differ in their number of Gaussians.
     pub fn new(frames: PlyFrames) -> Result<PlySequence> {
         if let Some(other) = frames.other_count() {
             let counts = frames.counts();
@@ -60,43 +61,43 @@ impl PlySequence {
         Ok(PlySequence { frames, info, note: None, bytes, states })
     }
 
-    /// The same, with something that a person should know of them.
+    /// Adds a note for the user about these files.
     pub fn with_note(self, note: String) -> PlySequence {
         PlySequence { note: Some(note), ..self }
     }
 
-    /// What a person should know of them, if anything.
+    /// Returns the note for the user, if there is one.
     pub fn note(&self) -> Option<&str> {
         self.note.as_deref()
     }
 
-    /// The same frames at other times, one per frame.
+    /// Replaces the times of the frames; there must be one per frame.
     ///
     /// # Errors
-    /// A number of times other than T; times that are not finite or not strictly increasing, naming the
-    /// frames.
+    /// Fails if the number of times is not T, or if times are not finite or not strictly increasing; the message names
+    /// the frames.
     pub fn with_times(mut self, times: Vec<f64>) -> Result<PlySequence> {
         self.info = self.info.with_times(times)?;
         Ok(self)
     }
 
-    /// The files, in frame order.
+    /// Returns the paths of the files in frame order.
     pub fn paths(&self) -> &[PathBuf] {
         self.frames.paths()
     }
 
-    /// The file of one frame, open.
+    /// Opens the file of one frame.
     ///
     /// # Errors
-    /// Those of [`PlyFrames::frame`].
+    /// Fails like [`PlyFrames::frame`].
     pub fn frame(&self, frame: usize) -> Result<Ply> {
         self.frames.frame(frame)
     }
 
-    /// [`PlyFrames::digest`] as 32 hexadecimal digits.
+    /// Returns [`PlyFrames::digest`] as 32 hexadecimal digits.
     ///
     /// # Errors
-    /// A file that cannot be read.
+    /// Fails if a file cannot be read.
     pub fn digest(&self) -> Result<String> {
         Ok(format!("{:032x}", self.frames.digest()?))
     }
@@ -117,7 +118,7 @@ impl FrameSource for PlySequence {
     }
 }
 
-/// Some Gaussians of a sequence of PLY files.
+/// Reader of some Gaussians of a sequence of PLY files.
 struct PlyBlock<'a> {
     sequence: &'a PlySequence,
     ids: OwnedIds,
@@ -132,13 +133,14 @@ impl BlockReader for PlyBlock<'_> {
     }
 }
 
-/// [`Ids`] that outlive the call they came with.
+/// Owned copy of [`Ids`].
 enum OwnedIds {
     Range(Range<usize>),
     List(Vec<u32>),
 }
 
 impl OwnedIds {
+    /// Copies the ids.
     fn from_ids(ids: Ids<'_>) -> OwnedIds {
         match ids {
             Ids::Range(range) => OwnedIds::Range(range),
@@ -146,6 +148,7 @@ impl OwnedIds {
         }
     }
 
+    /// Returns the ids as [`Ids`].
     fn borrow(&self) -> Ids<'_> {
         match self {
             OwnedIds::Range(range) => Ids::Range(range.clone()),

@@ -1,4 +1,4 @@
-//! Python literals as text: numbers, strings, lists, tuples, dictionaries, True, False, None.
+//! Parser of Python literals: numbers, strings, lists, tuples, dictionaries, True, False, None.
 
 use std::fmt;
 use std::ops::Range;
@@ -6,10 +6,10 @@ use std::path::Path;
 
 use crate::error::{Error, quoted};
 
-/// Nesting beyond this is refused: each level is a stack frame.
+/// Maximum nesting depth. Each level takes a stack frame.
 const MAX_DEPTH: usize = 32;
 
-/// A literal, or text that is none.
+/// Literal, or text that is not one.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum Literal {
     None,
@@ -17,10 +17,10 @@ pub(crate) enum Literal {
     Int(i64),
     Float(f64),
     Str(String),
-    /// A list or a tuple.
+    /// Elements of a list or a tuple.
     Sequence(Vec<Literal>),
     Dict(Vec<(Literal, Literal)>),
-    /// Balanced text that is no literal: `device(type='cuda')`, `PosixPath('x')`.
+    /// Text with balanced brackets that is not a literal, such as `device(type='cuda')` or `PosixPath('x')`.
     Opaque(String),
 }
 
@@ -40,16 +40,16 @@ impl fmt::Display for Literal {
     }
 }
 
-/// An argument of a call.
+/// Keyword argument of a call.
 #[derive(Debug)]
 pub(crate) struct Argument {
     pub(crate) name: String,
     pub(crate) value: Literal,
-    /// Where its value stands in the text.
+    /// Byte range of the value in the text.
     pub(crate) place: Range<usize>,
 }
 
-/// Where parsing stopped.
+/// Byte at which parsing stopped, and the token that was expected there.
 #[derive(Debug, PartialEq)]
 pub(crate) struct ParseError {
     byte: usize,
@@ -57,7 +57,7 @@ pub(crate) struct ParseError {
 }
 
 impl ParseError {
-    /// The error as one of the file `path`, whose text is `text`.
+    /// Converts the error into one about the file `path`, whose content is `text`.
     pub(crate) fn in_file(self, path: &Path, text: &str) -> Error {
         let before = &text[..self.byte];
         let line = 1 + before.matches('\n').count();
@@ -73,10 +73,10 @@ impl ParseError {
 
 type Parsed<T> = std::result::Result<T, ParseError>;
 
-/// Parses `name(key=value, …)` into its arguments in order.
+/// Parses `name(key=value, …)` and returns its arguments in order.
 pub(crate) fn parse_call(text: &str, name: &'static str) -> Parsed<Vec<Argument>> {
     let mut parser = Parser { text, at: 0 };
-    parser.space();
+    parser.skip_space();
     if !parser.take(name) {
         return Err(parser.error("Namespace(…)"));
     }
@@ -88,7 +88,7 @@ pub(crate) fn parse_call(text: &str, name: &'static str) -> Parsed<Vec<Argument>
             return Err(parser.error("a key or `)`"));
         }
         parser.expect("=", "`=`")?;
-        parser.space();
+        parser.skip_space();
         let start = parser.at;
         let value = parser.value(0)?;
         let place = start..start + text[start..parser.at].trim_end().len();
@@ -97,29 +97,33 @@ pub(crate) fn parse_call(text: &str, name: &'static str) -> Parsed<Vec<Argument>
             return Err(parser.error("`,` or `)`"));
         }
     }
-    parser.space();
+    parser.skip_space();
     if parser.rest().is_empty() { Ok(keys) } else { Err(parser.error("nothing after the closing `)`")) }
 }
 
 struct Parser<'a> {
     text: &'a str,
-    /// Always at a character boundary.
+    /// Byte offset of the next character; always at a character boundary.
     at: usize,
 }
 
 impl<'a> Parser<'a> {
+    /// Returns the text that has not been parsed yet.
     fn rest(&self) -> &'a str {
         &self.text[self.at..]
     }
 
+    /// Builds an error at the current position.
     fn error(&self, expected: &'static str) -> ParseError {
         ParseError { byte: self.at, expected }
     }
 
-    fn space(&mut self) {
+    /// Skips white space.
+    fn skip_space(&mut self) {
         self.at = self.text.len() - self.rest().trim_start().len();
     }
 
+    /// Skips `token` if it comes next, and returns whether it did.
     fn take(&mut self, token: &str) -> bool {
         let found = self.rest().starts_with(token);
         if found {
@@ -128,34 +132,36 @@ impl<'a> Parser<'a> {
         found
     }
 
+    /// Skips white space, then `token` if it comes next, and returns whether it did.
     fn take_token(&mut self, token: &str) -> bool {
-        self.space();
+        self.skip_space();
         self.take(token)
     }
 
+    /// Skips white space and `token`. Fails if another token comes next.
     fn expect(&mut self, token: &str, expected: &'static str) -> Parsed<()> {
         if self.take_token(token) { Ok(()) } else { Err(self.error(expected)) }
     }
 
-    /// The longest run of characters that names, keywords and numbers are made of.
+    /// Takes the longest run of characters that occur in names, keywords and numbers.
     fn word(&mut self) -> &'a str {
-        self.space();
+        self.skip_space();
         let rest = self.rest();
         let end = rest.find(|c: char| !(c.is_alphanumeric() || "_.+-".contains(c))).unwrap_or(rest.len());
         self.at += end;
         &rest[..end]
     }
 
-    /// A literal that ends at a separator, else the balanced text up to there.
+    /// Parses a literal that ends at a separator; other text becomes [`Literal::Opaque`] up to the next separator.
     fn value(&mut self, depth: usize) -> Parsed<Literal> {
-        self.space();
+        self.skip_space();
         let start = self.at;
         if depth > MAX_DEPTH {
             return Err(self.error("at most 32 levels of nesting"));
         }
         match self.literal(depth) {
             Ok(Some(literal)) if self.at_separator() => Ok(literal),
-            // An inner error is kept: going on as opaque text would hide where it is.
+            // Return inner errors: continuing as opaque text would hide their place.
             Err(error) => Err(error),
             Ok(_) => {
                 self.at = start;
@@ -168,11 +174,13 @@ impl<'a> Parser<'a> {
         }
     }
 
+    /// Skips white space and returns whether a separator, a closing bracket or the end comes next.
     fn at_separator(&mut self) -> bool {
-        self.space();
+        self.skip_space();
         matches!(self.rest().chars().next(), None | Some(',' | ')' | ']' | '}' | ':'))
     }
 
+    /// Parses a literal; returns `None` if the next token does not begin one.
     fn literal(&mut self, depth: usize) -> Parsed<Option<Literal>> {
         Ok(match self.rest().chars().next() {
             Some('\'' | '"') => Some(Literal::Str(self.string()?)),
@@ -188,6 +196,7 @@ impl<'a> Parser<'a> {
         })
     }
 
+    /// Parses the elements of a list or tuple up to the bracket `close`.
     fn sequence(&mut self, close: &str, depth: usize) -> Parsed<Vec<Literal>> {
         self.at += 1;
         let mut items = Vec::new();
@@ -200,7 +209,7 @@ impl<'a> Parser<'a> {
         Ok(items)
     }
 
-    /// None for a set, which is no literal this program reads.
+    /// Parses a dictionary; returns `None` for a set, which is not supported.
     fn dict(&mut self, depth: usize) -> Parsed<Option<Literal>> {
         self.at += 1;
         let mut entries = Vec::new();
@@ -221,6 +230,7 @@ impl<'a> Parser<'a> {
         Ok(Some(Literal::Dict(entries)))
     }
 
+    /// Parses a string with its escape sequences.
     fn string(&mut self) -> Parsed<String> {
         let open = self.at;
         let unterminated = ParseError { byte: open, expected: "a string with a closing quote" };
@@ -258,7 +268,7 @@ impl<'a> Parser<'a> {
                     value.push(c);
                     0
                 }
-                // Python keeps an unknown escape as it is written.
+                // Python keeps unknown escape sequences unchanged.
                 Some((_, c)) => {
                     value.extend(['\\', c]);
                     0
@@ -271,14 +281,14 @@ impl<'a> Parser<'a> {
                     let Some(digit) = digit else { return Err(bad) };
                     code = code << 4 | digit;
                 }
-                // A lone surrogate (a path that was not UTF-8) has no char.
+                // A lone surrogate, from a path that was not UTF-8, is not a char.
                 value.push(char::from_u32(code).unwrap_or(char::REPLACEMENT_CHARACTER));
             }
         }
         Err(unterminated)
     }
 
-    /// Moves to the next `,`, `:`, `=` or closing bracket that belongs to the enclosing construct.
+    /// Skips to the next `,`, `:`, `=` or closing bracket of the enclosing construct.
     fn skip_balanced(&mut self) -> Parsed<()> {
         let mut open = Vec::new();
         while let Some(c) = self.rest().chars().next() {
@@ -295,7 +305,7 @@ impl<'a> Parser<'a> {
                     Some(close) if close == c => {}
                     Some(_) => return Err(self.error("brackets that match")),
                 },
-                // `=` would be the next key after a forgotten comma: skipping it would lose that key.
+                // Stop at `=`: it belongs to the next key after a missing comma, and skipping it would lose that key.
                 ',' | ':' | '=' if open.is_empty() => return Ok(()),
                 _ => {}
             }
@@ -305,7 +315,7 @@ impl<'a> Parser<'a> {
     }
 }
 
-/// An integer or a float as Python prints it; an integer beyond i64 becomes a float.
+/// Parses an integer or a float as Python prints it. An integer beyond i64 becomes a float.
 fn number(word: &str) -> Option<Literal> {
     let digits = word.trim_start_matches(['+', '-']);
     if matches!(digits, "inf" | "nan") {

@@ -1,4 +1,4 @@
-//! A file that several readers share, each at its own place.
+//! An open file shared by several readers, each with its own position.
 
 use std::fs::File;
 use std::io::{Error as IoError, ErrorKind, Read, Result as IoResult, Seek, SeekFrom};
@@ -8,18 +8,18 @@ use std::sync::{Arc, Mutex, PoisonError};
 use super::open::open_file;
 use crate::error::{Error, Result};
 
-/// Bytes that a reader keeps of the file: the headers of zip archives are read in pieces of two and four bytes.
-const BUFFER: usize = 512;
+/// Size of a reader's buffer in bytes. Zip readers read headers in parts of two and four bytes.
+const BUFFER_BYTES: usize = 512;
 
-/// A reader of an open file. Clones read the same file independently. Nothing is mapped, so that what was read once does
+/// Reader of an open file. Clones read the same file independently. The file is not mapped, so bytes that were read do
 /// not count as memory of the process.
 #[derive(Debug, Clone)]
 pub(crate) struct SharedFile {
     file: Arc<Mutex<File>>,
     len: u64,
     at: u64,
-    buffer: [u8; BUFFER],
-    /// Where in the file the buffer begins, and how many bytes it holds.
+    buffer: [u8; BUFFER_BYTES],
+    /// Offset in the file of the buffer, and number of bytes it holds.
     buffered: (u64, usize),
 }
 
@@ -27,19 +27,20 @@ impl SharedFile {
     /// Opens the file at `path`.
     ///
     /// # Errors
-    /// A file that cannot be opened.
+    /// Fails if the file cannot be opened.
     pub(crate) fn open(path: &Path) -> Result<SharedFile> {
         let file = open_file(path)?;
         let len = file.metadata().map_err(Error::io("read the size of", path))?.len();
         let file = Arc::new(Mutex::new(file));
-        Ok(SharedFile { file, len, at: 0, buffer: [0; BUFFER], buffered: (0, 0) })
+        Ok(SharedFile { file, len, at: 0, buffer: [0; BUFFER_BYTES], buffered: (0, 0) })
     }
 
-    /// Number of bytes when the file was opened.
+    /// Returns the length of the file in bytes at opening.
     pub(crate) fn len(&self) -> u64 {
         self.len
     }
 
+    /// Reads bytes at offset `at` of the file into `out` and returns their number.
     fn read_from(&self, at: u64, out: &mut [u8]) -> IoResult<usize> {
         let mut file = self.file.lock().unwrap_or_else(PoisonError::into_inner);
         file.seek(SeekFrom::Start(at))?;
@@ -49,7 +50,7 @@ impl SharedFile {
 
 impl Read for SharedFile {
     fn read(&mut self, out: &mut [u8]) -> IoResult<usize> {
-        if out.len() >= BUFFER {
+        if out.len() >= BUFFER_BYTES {
             let count = self.read_from(self.at, out)?;
             self.at += count as u64;
             return Ok(count);
@@ -57,7 +58,7 @@ impl Read for SharedFile {
         let (start, held) = self.buffered;
         let is_held = self.at >= start && self.at < start + held as u64;
         if !is_held {
-            let mut buffer = [0; BUFFER];
+            let mut buffer = [0; BUFFER_BYTES];
             let count = self.read_from(self.at, &mut buffer)?;
             self.buffer = buffer;
             self.buffered = (self.at, count);
@@ -88,7 +89,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn clones_read_the_same_bytes_at_their_own_places() {
+    fn clones_read_at_independent_positions() {
         let file = tempfile::NamedTempFile::new().unwrap();
         let bytes: Vec<u8> = (0..3000u32).map(|k| (k * k) as u8).collect();
         std::fs::write(file.path(), &bytes).unwrap();

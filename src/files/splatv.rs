@@ -1,8 +1,8 @@
-//! `.splatv`: Gaussians on cubic paths with windows in time, as splaTV and WebGS read them.
+//! `.splatv` files: Gaussians with cubic trajectories and Gaussian windows in time, as read by splaTV and WebGS.
 //!
-//! u32 [`MAGIC`], u32 length of a JSON text, that text, the texture it describes; all little-endian. The text is a list whose
-//! entry of type `splat` has `size` (bytes of the texture), `texwidth`, `texheight` and `cameras`. The texture holds
-//! [`ROW_BYTES`] per Gaussian ([`SplatvGaussian`]), then zeros. Source: antmatter15/splaTV.
+//! Layout, little-endian: u32 [`MAGIC`], u32 length of a JSON text, the text, the texture it describes. The text is a
+//! list; its entry of type `splat` has `size` (bytes of the texture), `texwidth`, `texheight` and `cameras`. The
+//! texture holds [`ROW_BYTES`] per Gaussian ([`SplatvGaussian`]), then zeros. Source: antmatter15/splaTV.
 
 pub mod rows;
 pub mod write;
@@ -16,45 +16,46 @@ use serde_json::Value;
 use super::map::FileMap;
 use crate::error::{Error, Result, quoted};
 
-/// First word of a file.
+/// First word of every file.
 pub const MAGIC: u32 = 0x674b;
-/// Texels of a row of the texture.
+/// Number of texels per row of the texture.
 pub const TEXELS: usize = 4096;
-/// Bytes of a Gaussian, of four texels.
+/// Number of bytes per Gaussian: four texels.
 pub const ROW_BYTES: usize = 64;
-/// Bytes of a texel: four words.
+/// Number of bytes per texel: four words.
 const TEXEL_BYTES: usize = 16;
-/// Longest JSON text: some 3000 cameras. Its values take up to 30 times as much memory.
-const MOST_TEXT: usize = 1 << 20;
-/// Words of a Gaussian.
+/// Maximum length of the JSON text in bytes: about 3000 cameras. Its parsed values take up to 30 times as much memory.
+const MAX_TEXT_BYTES: usize = 1 << 20;
+/// Number of 32-bit words per Gaussian.
 pub const WORDS: usize = 16;
 
-/// A Gaussian whose position is a cubic of the time since its center, whose quaternion is linear in it, and whose opacity is
-/// multiplied by exp(−((t − center)/width)²).
+/// Gaussian whose position is a cubic polynomial of dt = time − center and whose quaternion is linear in dt. Its
+/// opacity is multiplied by exp(−(dt/width)²).
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct SplatvGaussian {
-    /// Where it is at its center, scene units.
+    /// Position at dt = 0, in scene units.
     pub position: [f32; 3],
-    /// Coefficients of dt, dt², dt³, each of x, y, z.
+    /// Coefficients of dt, dt², dt³; x, y, z of each.
     pub motion: [f32; 9],
-    /// wxyz of any length.
+    /// Quaternion wxyz of any length at dt = 0.
     pub rotation: [f32; 4],
-    /// What is added to `rotation` per unit of time.
+    /// Change of `rotation` per unit of time.
     pub omega: [f32; 4],
-    /// Standard deviations, scene units.
+    /// Standard deviations along the three axes, in scene units.
     pub scale: [f32; 3],
-    /// Color from all sides, in [0, 1]; in f64, for bytes are cut, not rounded, so that the last digit can tell.
+    /// View-independent color in [0, 1]. f64, because the writer truncates to bytes instead of rounding, so the last
+    /// digit matters.
     pub rgb: [f64; 3],
-    /// In [0, 1].
+    /// Opacity at dt = 0, in [0, 1].
     pub opacity: f64,
-    /// Unit of time.
+    /// Time at which the opacity is highest.
     pub center: f32,
-    /// √2 × the standard deviation in time.
+    /// Width of the window in time: √2 × its standard deviation.
     pub width: f32,
 }
 
 impl SplatvGaussian {
-    /// The Gaussian that `words` hold.
+    /// Decodes a Gaussian from its words.
     pub fn of_words(words: &[u32; WORDS]) -> SplatvGaussian {
         let half = |at: usize, high: usize| f16::from_bits((words[at] >> (16 * high)) as u16).to_f32();
         let halves = |first: usize, k: usize| half(first + k / 2, k % 2);
@@ -73,7 +74,7 @@ impl SplatvGaussian {
     }
 }
 
-/// Number of bytes of `texture` up to the last one that is not zero.
+/// Returns the number of bytes of `texture` up to the last nonzero one.
 fn used_bytes(map: &FileMap, texture: Range<usize>) -> usize {
     let mut end = texture.end;
     while end > texture.start {
@@ -87,15 +88,15 @@ fn used_bytes(map: &FileMap, texture: Range<usize>) -> usize {
     0
 }
 
-/// An open file.
+/// Open `.splatv` file.
 #[derive(Debug)]
 pub struct Splatv {
     path: PathBuf,
     map: FileMap,
-    /// Where the texture begins.
+    /// Offset of the texture in the file.
     start: usize,
     count: usize,
-    /// Rows that the texture would hold, where the data ends before it does.
+    /// Number of rows that the texture should have, if the file ends before that.
     declared: Option<usize>,
     cameras: Value,
 }
@@ -104,8 +105,8 @@ impl Splatv {
     /// Opens the file at `path`. Rows of zeros at the end are padding, which some converters leave out.
     ///
     /// # Errors
-    /// Another magic; a text that is no list with an entry of type `splat`; sizes that contradict each other; data that end
-    /// within a Gaussian.
+    /// Fails if the magic differs, if the text is not a list with an entry of type `splat`, if sizes contradict each
+    /// other, or if the data end within a Gaussian.
     pub fn open(path: &Path) -> Result<Splatv> {
         let map = FileMap::open(path)?;
         let cut = |expected: String| {
@@ -121,8 +122,8 @@ impl Splatv {
             return Err(Error::input(path, "byte 0", format!("the magic {MAGIC:#06x}"), format!("{magic:#06x}")));
         }
         let start = 8 + word(4)? as usize;
-        if start > MOST_TEXT && map.len() >= start {
-            let expected = format!("a text of at most {MOST_TEXT} bytes");
+        if start > MAX_TEXT_BYTES && map.len() >= start {
+            let expected = format!("a text of at most {MAX_TEXT_BYTES} bytes");
             return Err(Error::input(path, "byte 4", expected, format!("{} bytes", start - 8)));
         }
         let text = map.get(8..start).ok_or_else(|| cut(format!("{start} bytes up to the end of its text")))?;
@@ -162,38 +163,38 @@ impl Splatv {
         Ok(Splatv { path: path.to_owned(), start, count, declared, cameras, map })
     }
 
-    /// The file.
+    /// Returns the path of the file.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// N, the number of Gaussians.
+    /// Returns N, the number of Gaussians.
     pub fn count(&self) -> usize {
         self.count
     }
 
-    /// Returns a note about data that end before the texture does.
+    /// Returns a note if the file ends before its texture does.
     pub fn note(&self) -> Option<String> {
         let (declared, rows) = (self.declared?, (self.map.len() - self.start) / ROW_BYTES);
-        Some(format!("{rows} rows of {declared} declared: the file is not padded to whole rows of its texture"))
+        Some(format!("{rows} rows of {declared} declared: the file ends before its texture is complete"))
     }
 
-    /// Its cameras, as they stand in it.
+    /// Returns the cameras as JSON, unchanged from the file.
     pub fn cameras(&self) -> &Value {
         &self.cameras
     }
 
-    /// The words of Gaussian `i`.
+    /// Returns the words of Gaussian `i`.
     pub fn words(&self, i: usize) -> [u32; WORDS] {
         self.map.touched(self.start + i * ROW_BYTES..self.start + (i + 1) * ROW_BYTES);
         let row = &self.map[self.start + i * ROW_BYTES..][..ROW_BYTES];
         std::array::from_fn(|k| u32::from_le_bytes(std::array::from_fn(|b| row[4 * k + b])))
     }
 
-    /// Confirms that the file still has its bytes.
+    /// Checks that the file has not been cut short since it was opened.
     ///
     /// # Errors
-    /// A file cut short since it was opened.
+    /// Fails if the file is shorter than at opening.
     pub fn check(&self) -> Result<()> {
         self.map.check()
     }

@@ -1,16 +1,17 @@
-//! A still scene as a `.spz`, version 3 of the format (nianticlabs/spz, `load-spz.cc`): a header of 16 bytes and one array
-//! after the other, all compressed by gzip.
+//! Writer of still scenes as `.spz`, version 3 of the format (nianticlabs/spz, `load-spz.cc`): a header of 16 bytes and
+//! the arrays below one after the other, all compressed by gzip.
 //!
-//! | array | bytes a Gaussian | value |
+//! | array | bytes per Gaussian | value |
 //! |---|---|---|
 //! | positions | 9 | 24-bit signed, in units of 2^−(fractional bits); axes right, up, back |
 //! | opacities | 1 | 255·α |
 //! | colors | 3 | 255·(.15·f_dc + ½) |
 //! | scales | 3 | 16·(ln s + 10) |
-//! | rotations | 4 | which of x, y, z, w is largest, 2 bits, and of the others sign and 9 bits of 511·√2·value |
-//! | harmonics | 3·((d + 1)² − 1) | 128·c + 128, to the nearest of 5 bits in the first band and of 4 in the others |
+//! | rotations | 4 | 2 bits: index of the largest of x, y, z, w; then sign and 9 bits of 511·√2·value each |
+//! | SH coefficients | 3·((d + 1)² − 1) | 128·c + 128, rounded to 5 bits in degree 1 and to 4 bits above |
 //!
-//! The maintained crate for the format would bring an asynchronous runtime with it; the format is these lines.
+//! The maintained crate for this format depends on an asynchronous runtime; the format itself needs only the lines
+//! below.
 
 use std::fs::File;
 use std::io::{BufWriter, Write};
@@ -24,31 +25,34 @@ use crate::model::{Gaussians, color, opacity};
 
 const MAGIC: u32 = 0x5053_474e;
 const VERSION: u32 = 3;
-/// Largest number that a position's 24 bits hold.
-const MOST: f64 = 8_388_607.0;
-/// Bits below the point, at most: finer ones are noise of f32.
-const MOST_BITS: i32 = 20;
-/// Signs of the harmonics above degree 0 once y and z point the other way.
-const TURNED: [f32; 15] = [-1., -1., 1., -1., 1., 1., -1., 1., -1., 1., -1., -1., 1., -1., 1.];
+/// Largest magnitude of a position in units of the last bit (24 bits, signed).
+const MAX_FIXED: f64 = 8_388_607.0;
+/// Maximum number of fractional bits of positions; finer bits are noise of f32.
+const MAX_FRACTION_BITS: i32 = 20;
+/// Signs of the SH coefficients above degree 0 after the y and z axes are reversed.
+const AXIS_SIGNS: [f32; 15] = [-1., -1., 1., -1., 1., 1., -1., 1., -1., 1., -1., -1., 1., -1., 1.];
 
-/// Writes `state`; returns the largest error of a position in the file, in scene units.
+/// Writes `state` to `path`. Returns the largest error of a position in the file, in scene units.
 ///
 /// # Errors
-/// A position that is not finite; values that the file holds only with errors beyond the bounds of
-/// [`accuracy`](super::accuracy); more Gaussians than the format counts; a failed write.
+/// Fails if a position is not finite, if stored values would exceed the error bounds of [`accuracy`](super::accuracy),
+/// if there are more Gaussians than the format can count, or if writing fails.
 pub fn write_spz(state: &Gaussians, path: &Path) -> Result<f64> {
     let furthest = state.position.planes().iter().fold(0.0f64, |most, x| most.max(f64::from(x.abs())));
     if let Some(at) = state.position.planes().iter().position(|x| !x.is_finite()) {
         let id = at % state.len();
-        return Err(Error::usage(format!("{}: no .spz can hold the position of Gaussian {id}", path.shown())));
+        return Err(Error::usage(format!(
+            "{}: the position of Gaussian {id} is not finite, which a .spz cannot store",
+            path.shown()
+        )));
     }
     let count = u32::try_from(state.len())
         .map_err(|_| Error::usage(format!("{}: {} Gaussians are too many for a .spz", path.shown(), state.len())))?;
-    let bits = (MOST / furthest.max(1e-9)).log2().floor().clamp(0.0, f64::from(MOST_BITS)) as i32;
+    let bits = (MAX_FIXED / furthest.max(1e-9)).log2().floor().clamp(0.0, f64::from(MAX_FRACTION_BITS)) as i32;
     let unit = 0.5f64.powi(bits);
-    let off = measured(state, unit)?;
+    let position_error = check_accuracy(state, unit)?;
     let file = File::create(path).map_err(Error::io("create", path))?;
-    // No time and no name: the same scene gives the same bytes.
+    // No time stamp and no name, so that the same scene gives the same bytes.
     let mut out = GzBuilder::new().write(BufWriter::new(file), Compression::best());
     let mut write = || -> std::io::Result<()> {
         for word in [MAGIC, VERSION, count] {
@@ -79,9 +83,9 @@ pub fn write_spz(state: &Gaussians, path: &Path) -> Result<f64> {
             out.write_all(&smallest_three([x, -y, -z, w]).to_le_bytes())?;
         }
         for row in rows {
-            for (k, turned) in (1..state.sh.width() / 3).zip(TURNED) {
+            for (k, turned) in (1..state.sh.width() / 3).zip(AXIS_SIGNS) {
                 for c in 0..3 {
-                    out.write_all(&[harmonic_byte(k, turned * state.sh.plane(3 * k + c)[row])])?;
+                    out.write_all(&[sh_byte(k, turned * state.sh.plane(3 * k + c)[row])])?;
                 }
             }
         }
@@ -89,14 +93,14 @@ pub fn write_spz(state: &Gaussians, path: &Path) -> Result<f64> {
         out.get_mut().flush()
     };
     write().map_err(Error::io("write", path))?;
-    Ok(off)
+    Ok(position_error)
 }
 
-/// Measures what a file with positions in units of `unit` holds of `state`; returns the largest error of a position.
+/// Measures the errors of a file of `state` with positions in units of `unit`. Returns the largest error of a position.
 ///
 /// # Errors
-/// One that is beyond its bound.
-fn measured(state: &Gaussians, unit: f64) -> Result<f64> {
+/// Fails if an error exceeds its bound.
+fn check_accuracy(state: &Gaussians, unit: f64) -> Result<f64> {
     let mut accuracy = Accuracy::new(&state.position);
     for row in 0..state.len() {
         let wanted = Drawn::of_state(state, row);
@@ -109,43 +113,48 @@ fn measured(state: &Gaussians, unit: f64) -> Result<f64> {
         };
         accuracy.add(row, &wanted, &found);
         if wanted.color.iter().any(|c| !c.is_finite()) {
-            accuracy.add_harmonic(row, f64::INFINITY);
+            accuracy.add_sh(row, f64::INFINITY);
         }
         for (k, c) in (1..state.sh.width() / 3).flat_map(|k| (0..3).map(move |c| (k, c))) {
             let value = state.sh.plane(3 * k + c)[row];
-            let held = (f64::from(harmonic_byte(k, value)) - 128.0) / 128.0;
-            accuracy.add_harmonic(row, (f64::from(value) - held).abs());
+            let held = (f64::from(sh_byte(k, value)) - 128.0) / 128.0;
+            accuracy.add_sh(row, (f64::from(value) - held).abs());
         }
     }
     accuracy.check("a .spz")?;
-    Ok(accuracy.position())
+    Ok(accuracy.position_error())
 }
 
-/// A coordinate as 24 bits, in units of `unit`.
+/// Returns a coordinate as a 24-bit integer in units of `unit`.
 fn fixed(value: f64, unit: f64) -> i32 {
-    (value / unit).round().clamp(-MOST, MOST) as i32
+    (value / unit).round().clamp(-MAX_FIXED, MAX_FIXED) as i32
 }
 
+/// Returns the stored byte of an opacity logit.
 fn opacity_byte(logit: f32) -> u8 {
     byte(255.0 * opacity(logit))
 }
 
+/// Returns the stored byte of the SH coefficient of degree 0.
 fn color_byte(dc: f32) -> u8 {
     byte(255.0 * (0.15 * f64::from(dc) + 0.5))
 }
 
+/// Returns the stored byte of a log scale.
 fn scale_byte(log_scale: f32) -> u8 {
     byte(16.0 * (f64::from(log_scale) + 10.0))
 }
 
-/// Coefficient `k`, from 1, of a channel's harmonics: to the nearest of 5 bits in the first band, of 4 in the others.
-fn harmonic_byte(k: usize, value: f32) -> u8 {
+/// Returns the stored byte of SH coefficient `k` (from 1) of one channel, rounded to 5 bits in degree 1 and to 4 bits
+/// above.
+fn sh_byte(k: usize, value: f32) -> u8 {
     let step = if k < 4 { 8.0 } else { 16.0 };
     let nearest = ((128.0 * f64::from(value)).round() + 128.0 + step / 2.0) / step;
     byte(nearest.floor() * step)
 }
 
-/// A unit quaternion xyzw without its largest component, which is positive of it or of its negative.
+/// Encodes a unit quaternion xyzw without its largest component. q and −q are the same rotation; the sign is chosen so
+/// that the largest component is positive.
 fn smallest_three(q: [f64; 4]) -> u32 {
     let largest = (1..4).fold(0, |largest: usize, i| if q[i].abs() > q[largest].abs() { i } else { largest });
     let others = (0..4).filter(|&i| i != largest);
@@ -155,7 +164,7 @@ fn smallest_three(q: [f64; 4]) -> u32 {
     })
 }
 
-/// To the nearest of a byte's values; NaN is 0.
+/// Rounds to the nearest byte value, clamped to 0–255; NaN becomes 0.
 fn byte(value: f64) -> u8 {
     value.round() as u8
 }
@@ -171,10 +180,10 @@ mod tests {
     use crate::model::Columns;
     use crate::passes::gather_all;
 
-    /// Position, opacity, color, scales, rotation wxyz and harmonics of a Gaussian.
+    /// Position, opacity, color, scales, rotation wxyz and SH coefficients of a Gaussian.
     type Row = (Vec<f64>, f64, Vec<f64>, Vec<f64>, [f64; 4], Vec<f64>);
 
-    /// What bytes can hold of a state, read as the format says.
+    /// Reads a file independently of the writer, as the format specifies.
     fn read(path: &Path) -> Vec<Row> {
         let mut bytes = Vec::new();
         GzDecoder::new(File::open(path).unwrap()).read_to_end(&mut bytes).unwrap();
@@ -188,16 +197,17 @@ mod tests {
             .scan(16, |at, width| Some(std::mem::replace(at, *at + width * count)))
             .chain([16 + 20 * count])
             .collect();
-        let of = |array: usize, width: usize, i: usize| &bytes[starts[array] + width * i..][..width];
-        let values =
-            |bytes: &[u8], of: &dyn Fn(f64) -> f64| bytes.iter().map(|&b| of(f64::from(b))).collect::<Vec<f64>>();
+        let row_bytes = |array: usize, width: usize, i: usize| &bytes[starts[array] + width * i..][..width];
+        let values = |bytes: &[u8], decode: &dyn Fn(f64) -> f64| {
+            bytes.iter().map(|&b| decode(f64::from(b))).collect::<Vec<f64>>()
+        };
         (0..count)
             .map(|i| {
-                let place = of(0, 9, i).as_chunks::<3>().0;
-                // The highest byte has the sign.
+                let place = row_bytes(0, 9, i).as_chunks::<3>().0;
+                // The highest byte holds the sign.
                 let place =
                     place.iter().map(|b| f64::from(i32::from_le_bytes([0, b[0], b[1], b[2]]) >> 8) / 2f64.powi(bits));
-                let mut bits_left = u32::from_le_bytes(of(4, 4, i).try_into().unwrap());
+                let mut bits_left = u32::from_le_bytes(row_bytes(4, 4, i).try_into().unwrap());
                 let (largest, mut q) = ((bits_left >> 30) as usize, [0.0f64; 4]);
                 for k in (0..4).rev().filter(|&k| k != largest) {
                     let size = f64::from(bits_left & 511) / 511.0 / 2f64.sqrt();
@@ -207,24 +217,24 @@ mod tests {
                 q[largest] = (1.0 - q.iter().map(|x| x * x).sum::<f64>()).sqrt();
                 (
                     place.collect(),
-                    f64::from(of(1, 1, i)[0]) / 255.0,
-                    values(of(2, 3, i), &|b| (b / 255.0 - 0.5) / 0.15),
-                    values(of(3, 3, i), &|b| b / 16.0 - 10.0),
+                    f64::from(row_bytes(1, 1, i)[0]) / 255.0,
+                    values(row_bytes(2, 3, i), &|b| (b / 255.0 - 0.5) / 0.15),
+                    values(row_bytes(3, 3, i), &|b| b / 16.0 - 10.0),
                     [q[3], q[0], q[1], q[2]],
-                    values(of(5, more, i), &|b| (b - 128.0) / 128.0),
+                    values(row_bytes(5, more, i), &|b| (b - 128.0) / 128.0),
                 )
             })
             .collect()
     }
 
     #[test]
-    fn a_reader_of_the_format_finds_what_bytes_can_hold_of_every_gaussian() {
+    fn independent_reader_finds_the_written_values() {
         let mut state = gather_all(&Scene::new(300, 1), 0, Columns::all()).unwrap();
         state.sh = crate::model::Column::zeros(48, 300);
         state.sh.planes_mut().iter_mut().enumerate().for_each(|(k, x)| *x = (k as f32 * 0.618_034).fract() - 0.5);
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.spz");
-        let off = write_spz(&state, &path).unwrap();
+        let position_error = write_spz(&state, &path).unwrap();
         for (row, (place, visible, color, scales, q, sh)) in read(&path).into_iter().enumerate() {
             let near = |found: &[f64], expected: &[f64], within: f64, what: &str| {
                 for (a, b) in found.iter().zip(expected) {
@@ -232,10 +242,10 @@ mod tests {
                 }
             };
             let [x, y, z] = state.position.row::<3>(row).map(f64::from);
-            near(&place, &[x, -y, -z], 1.01 * off, "position");
+            near(&place, &[x, -y, -z], 1.01 * position_error, "position");
             near(&[visible], &[opacity(state.opacity_logit.row::<1>(row)[0])], 0.5 / 255.0, "opacity");
             let dc = state.sh.row::<3>(row).map(f64::from);
-            near(&color, &dc, 0.51 / 255.0 / 0.15, "colour");
+            near(&color, &dc, 0.51 / 255.0 / 0.15, "color");
             near(
                 &scales,
                 &state.log_scale.row::<3>(row).map(|s| f64::from(s).clamp(-10.0, 5.93)),
@@ -250,8 +260,8 @@ mod tests {
             for k in 1..16 {
                 let half = if k < 4 { 4.5 / 128.0 } else { 8.5 / 128.0 };
                 for c in 0..3 {
-                    let expected = f64::from(TURNED[k - 1] * state.sh.plane(3 * k + c)[row]);
-                    near(&[sh[3 * (k - 1) + c]], &[expected], half, "harmonics");
+                    let expected = f64::from(AXIS_SIGNS[k - 1] * state.sh.plane(3 * k + c)[row]);
+                    near(&[sh[3 * (k - 1) + c]], &[expected], half, "SH coefficient");
                 }
             }
         }
@@ -262,9 +272,9 @@ mod tests {
         assert!(write_spz(&state, &again).unwrap_err().to_string().contains("Gaussian 7"));
     }
 
-    /// A color seen from a direction is the same in both systems of axes: what turned signs are for.
+    /// Evaluates a color in a direction in both coordinate systems; the signs in [`AXIS_SIGNS`] must make both equal.
     #[test]
-    fn harmonics_turn_with_the_axes() {
+    fn sh_signs_match_the_reversed_axes() {
         let basis = |[x, y, z]: [f64; 3]| -> [f64; 15] {
             [
                 -y,
@@ -287,7 +297,7 @@ mod tests {
         let direction = [0.48, -0.6, 0.64];
         let turned = basis([direction[0], -direction[1], -direction[2]]);
         for (k, (a, b)) in basis(direction).iter().zip(turned).enumerate() {
-            assert!((a * f64::from(TURNED[k]) - b).abs() < 1e-12, "function {k}");
+            assert!((a * f64::from(AXIS_SIGNS[k]) - b).abs() < 1e-12, "function {k}");
         }
     }
 }

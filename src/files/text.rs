@@ -1,4 +1,4 @@
-//! Text files as people and editors leave them: UTF-8, with or without its byte order mark.
+//! Reader of text files in UTF-8, with or without a byte order mark.
 
 use std::fs::File;
 use std::io::{BufRead, BufReader, Read};
@@ -7,20 +7,20 @@ use std::path::{Path, PathBuf};
 use super::open::{open_file, read_small};
 use crate::error::{Error, Result};
 
-/// Reads the text of a file of at most `most_bytes`, without a byte order mark.
+/// Reads a text file of at most `most_bytes` and removes its byte order mark.
 ///
 /// # Errors
-/// Those of [`read_small`]; bytes that are no UTF-8, with the place of the first.
+/// Fails like [`read_small`], and if bytes are not UTF-8; the message names the first such byte.
 pub fn read_text(path: &Path, most_bytes: u64) -> Result<String> {
     let bytes = read_small(path, most_bytes, "a text")?;
     let text = without_mark(path, &bytes)?;
     utf_8(path, text, (bytes.len() - text.len()) as u64).map(str::to_owned)
 }
 
-/// Returns `bytes`, the first ones of the file at `path`, without a byte order mark.
+/// Removes a UTF-8 byte order mark from `bytes`, the first bytes of the file at `path`.
 ///
 /// # Errors
-/// The byte order mark of UTF-16.
+/// Fails if there is a UTF-16 byte order mark.
 pub(super) fn without_mark<'a>(path: &Path, bytes: &'a [u8]) -> Result<&'a [u8]> {
     if let [0xff, 0xfe, ..] | [0xfe, 0xff, ..] = bytes {
         let found = "the byte order mark of UTF-16";
@@ -29,13 +29,13 @@ pub(super) fn without_mark<'a>(path: &Path, bytes: &'a [u8]) -> Result<&'a [u8]>
     Ok(bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes))
 }
 
-/// Returns the error for `byte`, which stands at `place` of the file at `path` and does not belong to UTF-8 text.
+/// Returns the error for `byte` at offset `place` of the file at `path`, which is not valid in UTF-8.
 pub(super) fn not_utf_8(path: &Path, place: u64, byte: u8) -> Error {
     Error::input(path, format!("byte {place}"), "text in UTF-8", format!("the byte 0x{byte:02x}"))
         .hint("save it as UTF-8: it may be in Latin-1 or another encoding")
 }
 
-/// Returns `bytes`, which begin at byte `start` of the file at `path`, as text.
+/// Converts `bytes`, which begin at offset `start` of the file at `path`, to text. Fails if they are not UTF-8.
 fn utf_8<'a>(path: &Path, bytes: &'a [u8], start: u64) -> Result<&'a str> {
     str::from_utf8(bytes).map_err(|error| {
         let at = error.valid_up_to();
@@ -43,17 +43,17 @@ fn utf_8<'a>(path: &Path, bytes: &'a [u8], start: u64) -> Result<&'a str> {
     })
 }
 
-/// Maximum number of bytes of a line that is read.
+/// Maximum length of a line in bytes.
 const MAX_LINE: u64 = 1 << 16;
 
-/// The lines of a text file of any length, one at a time.
+/// Reader of the lines of a text file of any length.
 #[derive(Debug)]
 pub(crate) struct TextLines {
     path: PathBuf,
     file: BufReader<File>,
     line: Vec<u8>,
     number: usize,
-    /// Place in the file of the next line.
+    /// Offset in the file of the next line.
     at: u64,
 }
 
@@ -61,16 +61,17 @@ impl TextLines {
     /// Opens the file at `path`.
     ///
     /// # Errors
-    /// A file that cannot be opened.
+    /// Fails if the file cannot be opened.
     pub(crate) fn open(path: &Path) -> Result<TextLines> {
         let file = BufReader::new(open_file(path)?);
         Ok(TextLines { path: path.to_owned(), file, line: Vec::new(), number: 0, at: 0 })
     }
 
-    /// Returns the next line without its end, and its number, from 1 on; `None` at the end of the file.
+    /// Returns the number (from 1) and the text of the next line without its line ending; `None` at the end of the
+    /// file.
     ///
     /// # Errors
-    /// A line that is too long or no UTF-8; a failed read.
+    /// Fails if the line is too long or not UTF-8, or if reading fails.
     pub(crate) fn next_line(&mut self) -> Result<Option<(usize, &str)>> {
         self.line.clear();
         let mut limited = (&mut self.file).take(MAX_LINE + 1);
@@ -91,10 +92,10 @@ impl TextLines {
         Ok(Some((self.number, utf_8(&self.path, text, start + (line.len() - text.len()) as u64)?)))
     }
 
-    /// Passes over a line of any length.
+    /// Skips a line of any length.
     ///
     /// # Errors
-    /// A failed read.
+    /// Fails if reading fails.
     pub(crate) fn skip_line(&mut self) -> Result<()> {
         self.at += self.file.skip_until(b'\n').map_err(Error::io("read", &self.path))? as u64;
         self.number += 1;
@@ -129,7 +130,7 @@ mod tests {
     }
 
     #[test]
-    fn only_lines_that_are_read_have_a_longest_length() {
+    fn length_limit_applies_only_to_lines_read() {
         let long = [b"a\n".to_vec(), vec![b'x'; 1 << 20], b"\nb\n\xff\n".to_vec()].concat();
         let file = file(&long);
         let mut lines = TextLines::open(file.path()).unwrap();
@@ -143,7 +144,7 @@ mod tests {
     }
 
     #[test]
-    fn texts_in_other_encodings_are_named() {
+    fn other_encodings_are_named_in_errors() {
         let refused = |bytes: &[u8]| read_text(file(bytes).path(), 100).unwrap_err().to_string();
         assert!(refused(b"\xef\xbb\xbf\"\xe9").contains("byte 4") && refused(b"caf\xe9").contains("Latin-1"));
         assert!(refused(b"\xff\xfe{\0}\0").contains("UTF-16") && refused(&[b'a'; 101]).contains("at most 100 bytes"));

@@ -1,37 +1,38 @@
-//! How many files a zip archive announces, before a reader makes room for them.
+//! Reader of the number of files that a zip archive declares, so that it can be checked before memory for them is
+//! allocated.
 
 use std::io::{Error, Read, Result, Seek, SeekFrom};
 
-/// Bytes of the record that ends an archive, without its comment.
-const END: u64 = 22;
-/// Most bytes of an archive's comment.
+/// Length in bytes of the end record of an archive, without its comment.
+const END_BYTES: u64 = 22;
+/// Maximum length of an archive's comment in bytes.
 const MAX_COMMENT: u64 = 0xffff;
-/// Bytes of the record that says where the 64-bit numbers are, and of these.
-const LOCATOR: u64 = 20;
-const END_64: u64 = 56;
+/// Length in bytes of the record that locates the 64-bit end record, and of that record itself.
+const LOCATOR_BYTES: u64 = 20;
+const END_64_BYTES: u64 = 56;
 
-/// What an archive says of its own list of files.
+/// Size that an archive declares for its list of files.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Announced {
+pub(crate) struct DeclaredDirectory {
     /// Number of files.
     pub(crate) entries: u64,
-    /// Bytes of the list, as far as to the end of the archive.
+    /// Number of bytes from the start of the list to the end of the archive.
     pub(crate) bytes: u64,
 }
 
-/// Reads the records at the end of the archive as the crate `zip` finds them.
+/// Reads the records at the end of the archive in the way of the crate `zip`.
 ///
 /// # Errors
-/// No such records; failed reads.
-pub(crate) fn announced(file: &mut (impl Read + Seek)) -> Result<Announced> {
+/// Fails if there are no such records or reading fails.
+pub(crate) fn declared_directory(file: &mut (impl Read + Seek)) -> Result<DeclaredDirectory> {
     let len = file.seek(SeekFrom::End(0))?;
     let missing = || Error::other("no list of files at its end");
-    let tail_at = len.saturating_sub(LOCATOR + END + MAX_COMMENT);
+    let tail_at = len.saturating_sub(LOCATOR_BYTES + END_BYTES + MAX_COMMENT);
     let mut tail = Vec::new();
     file.seek(SeekFrom::Start(tail_at))?;
-    file.take(LOCATOR + END + MAX_COMMENT).read_to_end(&mut tail)?;
-    let earliest = len.saturating_sub(END + MAX_COMMENT) - tail_at;
-    let last = tail.len().checked_sub(END as usize).ok_or_else(missing)?;
+    file.take(LOCATOR_BYTES + END_BYTES + MAX_COMMENT).read_to_end(&mut tail)?;
+    let earliest = len.saturating_sub(END_BYTES + MAX_COMMENT) - tail_at;
+    let last = tail.len().checked_sub(END_BYTES as usize).ok_or_else(missing)?;
     let end = (earliest as usize..=last).rev().find(|&at| tail[at..].starts_with(b"PK\x05\x06"));
     let end = end.ok_or_else(missing)?;
     let number = |bytes: &[u8], at: usize, width: usize| -> u64 {
@@ -39,25 +40,25 @@ pub(crate) fn announced(file: &mut (impl Read + Seek)) -> Result<Announced> {
     };
     let end_at = tail_at + end as u64;
     let comment = number(&tail, end + 20, 2);
-    // Where the reader looks for the 64-bit records: by the length of the comment.
-    let locator = (len - tail_at).checked_sub(LOCATOR + END + comment).map(|at| &tail[at as usize..]);
+    // The crate finds the 64-bit records from the length of the comment.
+    let locator = (len - tail_at).checked_sub(LOCATOR_BYTES + END_BYTES + comment).map(|at| &tail[at as usize..]);
     let Some(locator) = locator.filter(|bytes| bytes.starts_with(b"PK\x06\x07")) else {
         let bytes = number(&tail, end + 12, 4) + len - end_at;
-        return Ok(Announced { entries: number(&tail, end + 8, 2), bytes });
+        return Ok(DeclaredDirectory { entries: number(&tail, end + 8, 2), bytes });
     };
     let at = number(locator, 8, 8);
-    if at.checked_add(END_64).is_none_or(|stop| stop > len) {
+    if at.checked_add(END_64_BYTES).is_none_or(|stop| stop > len) {
         return Err(missing());
     }
-    let mut record = [0; END_64 as usize];
+    let mut record = [0; END_64_BYTES as usize];
     file.seek(SeekFrom::Start(at))?;
     file.read_exact(&mut record)?;
-    // Anywhere else the reader would search the whole file for it.
+    // Without a record at this offset the crate would search the whole file for it.
     if !record.starts_with(b"PK\x06\x06") {
         return Err(missing());
     }
     let start = number(&record, 48, 8);
-    Ok(Announced { entries: number(&record, 32, 8), bytes: len.saturating_sub(start) })
+    Ok(DeclaredDirectory { entries: number(&record, 32, 8), bytes: len.saturating_sub(start) })
 }
 
 #[cfg(test)]
@@ -70,7 +71,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn announced_counts_are_those_of_the_archive() {
+    fn declared_size_matches_the_archive() {
         let mut writer = ZipWriter::new(Cursor::new(Vec::new()));
         for name in ["a", "b/c", "b/d"] {
             writer.start_file(name, FileOptions::default()).unwrap();
@@ -78,11 +79,11 @@ mod tests {
         }
         writer.set_comment("a comment");
         let bytes = writer.finish().unwrap().into_inner();
-        let found = announced(&mut Cursor::new(&bytes)).unwrap();
-        // Three records of 46 bytes and a name, the record at the end and the comment.
-        assert_eq!(found, Announced { entries: 3, bytes: 3 * 46 + 7 + 22 + 9 });
+        let found = declared_directory(&mut Cursor::new(&bytes)).unwrap();
+        // Three records of 46 bytes plus names, the end record and the comment.
+        assert_eq!(found, DeclaredDirectory { entries: 3, bytes: 3 * 46 + 7 + 22 + 9 });
         for length in 0..bytes.len() - 9 - 22 {
-            assert!(announced(&mut Cursor::new(&bytes[..length])).is_err(), "{length}");
+            assert!(declared_directory(&mut Cursor::new(&bytes[..length])).is_err(), "{length}");
         }
     }
 }

@@ -1,64 +1,65 @@
-//! A place for a zip archive to be written to that tells of a failed write once, at its end.
+//! Output of a zip writer that reports a failed write once, when it is closed.
 
 use std::io::{self, Seek, SeekFrom, Write};
 
-/// What a zip archive is written into. A writer of archives that is dropped after a failed write writes its directory all
-/// the same and prints what that meets; so after a failure everything is taken, and none of it written.
+/// Output for a zip writer. After a failed write it accepts and discards all further bytes. A zip writer that is
+/// dropped after an error writes its directory nevertheless, and prints the error it gets for that; with this output it
+/// gets none.
 pub(crate) struct ZipOutput<W> {
     inner: W,
     failed: Option<io::Error>,
-    /// Where the next byte would go.
+    /// Offset of the next byte.
     at: u64,
 }
 
 impl<W: Write + Seek> ZipOutput<W> {
-    /// Into `inner`, from its beginning.
+    /// Wraps `inner`, which must be at its start.
     pub(crate) fn new(inner: W) -> Self {
         ZipOutput { inner, failed: None, at: 0 }
     }
 
-    /// Ends writing.
+    /// Flushes the output.
     ///
     /// # Errors
-    /// The first write that failed.
+    /// Fails with the error of the first write that failed.
     pub(crate) fn close(mut self) -> io::Result<()> {
         self.flush()?;
         self.failed.map_or(Ok(()), Err)
     }
 
-    /// What `done` gives, or in its place `instead` once a write has failed.
-    fn or<T>(&mut self, instead: T, done: impl FnOnce(&mut W) -> io::Result<T>) -> T {
+    /// Returns the result of `done`. Returns `fallback` if an earlier operation failed or `done` fails.
+    fn unless_failed<T>(&mut self, fallback: T, done: impl FnOnce(&mut W) -> io::Result<T>) -> T {
         if self.failed.is_some() {
-            return instead;
+            return fallback;
         }
         done(&mut self.inner).unwrap_or_else(|error| {
             self.failed = Some(error);
-            instead
+            fallback
         })
     }
 }
 
 impl<W: Write + Seek> Write for ZipOutput<W> {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
-        let written = self.or(bytes.len(), |inner| inner.write(bytes));
+        let written = self.unless_failed(bytes.len(), |inner| inner.write(bytes));
         self.at += written as u64;
         Ok(written)
     }
 
     fn flush(&mut self) -> io::Result<()> {
-        self.or((), W::flush);
+        self.unless_failed((), W::flush);
         Ok(())
     }
 }
 
 impl<W: Write + Seek> Seek for ZipOutput<W> {
     fn seek(&mut self, to: SeekFrom) -> io::Result<u64> {
-        let instead = match to {
+        let fallback = match to {
             SeekFrom::Start(at) => at,
             SeekFrom::Current(by) => self.at.saturating_add_signed(by),
             SeekFrom::End(_) => self.at,
         };
-        self.at = self.or(instead, |inner| inner.seek(to));
+        self.at = self.unless_failed(fallback, |inner| inner.seek(to));
         Ok(self.at)
     }
 }

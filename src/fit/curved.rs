@@ -1,75 +1,78 @@
-//! Cubic motion and linear rotation under soft windows of time: what the players of SpacetimeGaussians know.
+//! Fit of cubic motion and linear rotation under soft windows in time, the form that players of SpacetimeGaussians
+//! support.
 //!
-//! A window is exp(−((t − center)/width)²). A Gaussian that never changes its opacity and moves as a cubic does takes one
-//! of no end; one that fades once takes one; whatever else it does, curves take it over from one another, 3, 5, 9 … of
-//! them, their centers evenly over its life, each window three quarters of their distance wide: the sum of such windows is
-//! 1 within 2·exp(−(3π/4)²), .8%. Optical depths −ln(1 − α) add up where Gaussians overlap, so that it is these that are
-//! shared out: by multiplicative updates that keep them positive (Richardson 1972, Lucy 1974).
+//! A window is exp(−((t − center)/width)²). A Gaussian with constant opacity and cubic motion needs one curve of
+//! infinite width; a Gaussian that fades once needs one curve. Any other Gaussian is covered by 3, 5, 9 … curves that
+//! overlap: their centers are evenly spaced over the visible time and each width is three quarters of the spacing. The
+//! sum of such windows is 1 within 2·exp(−(3π/4)²) = 0.8%. Optical depths −ln(1 − α) add up where Gaussians overlap, so
+//! depths are distributed among the curves, by multiplicative updates that keep them positive (Richardson 1972, Lucy
+//! 1974).
 
 use super::least_squares::polynomial;
 use super::{FittedTrack, Misfit, SEEN, Tolerance};
 
-/// A Gaussian on its way.
+/// Curve of a Gaussian with cubic motion under a window in time.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CubicTrack {
-    /// Center of its window, and the instant that the polynomials count from.
+    /// Center of the window, and origin of time for the polynomials.
     pub center: f64,
-    /// Width of its window; infinite where it has no end.
+    /// Width of the window; infinite for constant opacity.
     pub width: f64,
-    /// Coefficients of dt⁰ to dt³, scene units.
+    /// Coefficients of dt⁰ to dt³ of the position, scene units.
     pub position: [[f64; 3]; 4],
-    /// Coefficients of dt⁰ and dt¹, wxyz.
+    /// Coefficients of dt⁰ and dt¹ of the rotation quaternion wxyz.
     pub rotation: [[f64; 4]; 2],
-    /// Natural logarithms of scene units.
+    /// Log scales, natural logarithms of scene units.
     pub log_scale: [f64; 3],
-    /// At the center, in [0, 1].
+    /// Opacity at the center, in [0, 1].
     pub opacity: f64,
-    /// Harmonic coefficients.
+    /// SH coefficients.
     pub sh: Vec<f32>,
 }
 
 impl CubicTrack {
-    /// Where it is at `time`.
-    pub fn place(&self, time: f64) -> [f64; 3] {
+    /// Returns the position at `time`.
+    pub fn position_at(&self, time: f64) -> [f64; 3] {
         let dt = time - self.center;
         std::array::from_fn(|c| self.position.iter().rev().fold(0.0, |sum, row| sum * dt + row[c]))
     }
 
-    /// How opaque it is at `time`.
-    pub fn visible(&self, time: f64) -> f64 {
+    /// Returns the opacity at `time`.
+    pub fn opacity_at(&self, time: f64) -> f64 {
         self.opacity * window(time, self.center, self.width)
     }
 }
 
-/// Most curves that take a life over from one another.
-const MOST: usize = 32;
-/// Updates of shared optical depths, at most, and the change by which they have settled.
-const UPDATES: usize = 60;
-const SETTLED: f64 = 1e-3;
-/// Opacities count as at most this: an optical depth has to be a number.
-const OPAQUE: f64 = 0.999;
-/// What coefficients that frames do not determine are held by.
+/// Maximum number of intervals between the centers of overlapping curves.
+const MAX_INTERVALS: usize = 32;
+/// Maximum number of updates of the distributed optical depths.
+const MAX_UPDATES: usize = 60;
+/// Change of the depths below which the updates stop.
+const CONVERGED: f64 = 1e-3;
+/// Maximum opacity, so that the optical depth stays finite.
+const MAX_OPACITY: f64 = 0.999;
+/// Ridge weight for coefficients that the frames do not determine.
 const RIDGE: f64 = 1e-6;
-/// Part of the weight below which a frame is no matter of a curve.
-const LIGHT: f64 = 1e-3;
+/// Fraction of the weight below which a frame does not affect a curve.
+const MIN_WEIGHT: f64 = 1e-3;
 
-/// The curves of `track`, as few as hold what `tolerance` says at every frame that is seen; the closest if none do. How
-/// far they are off goes into `misfit`.
+/// Returns the curves of `track`: as few as meet `tolerance` at every visible frame, or the closest ones tried if none
+/// do. The error of the curves is added to `misfit`.
 pub fn curved(track: &FittedTrack, tolerance: &Tolerance, misfit: &mut Misfit) -> Vec<CubicTrack> {
     let Some(first) = (0..track.len()).find(|&frame| track.is_seen(frame)) else { return Vec::new() };
     let last = (first..track.len()).rev().find(|&frame| track.is_seen(frame)).unwrap_or(first);
     let mut best: Option<(f64, Vec<CubicTrack>, Misfit)> = None;
     let mut attempt = |curves: Vec<CubicTrack>| {
-        let (excess, found) = misfit_of(track, &curves, tolerance);
+        let (excess, found) = measure_misfit(track, &curves, tolerance);
         if best.as_ref().is_none_or(|(least, _, _)| excess < *least) {
             best = Some((excess, curves, found));
         }
         excess <= 1.0
     };
-    let mut done = attempt(vec![endless(track)]) || attempt(vec![once(track)]);
+    let mut done = attempt(vec![constant_curve(track)]) || attempt(vec![single_window_curve(track)]);
     let mut count = 2;
-    while !done && count <= MOST.min((last - first + 1).max(2)) {
-        done = attempt(handing_over(track, [track.times[first], track.times[last]], count));
+    while !done && count <= MAX_INTERVALS.min((last - first + 1).max(2)) {
+        done = attempt(overlapping_curves(track, [track.times[first], track.times[last]], count));
         count *= 2;
     }
     let (_, curves, found) = best.unwrap_or_default();
@@ -82,28 +85,28 @@ fn window(time: f64, center: f64, width: f64) -> f64 {
 }
 
 fn depth(opacity: f64) -> f64 {
-    -(-opacity.clamp(0.0, OPAQUE)).ln_1p()
+    -(-opacity.clamp(0.0, MAX_OPACITY)).ln_1p()
 }
 
-/// One curve without an end.
-fn endless(track: &FittedTrack) -> CubicTrack {
+/// Returns one curve of infinite width.
+fn constant_curve(track: &FittedTrack) -> CubicTrack {
     let center = track.times[0].midpoint(track.times[track.len() - 1]);
     let seen = (0..track.len()).filter(|&frame| track.is_seen(frame));
     let (sum, count) = seen.fold((0.0, 0.0), |(sum, count), frame| (sum + track.opacity[frame], count + 1.0));
-    let curve = moving(track, center, f64::INFINITY, |_| 1.0);
+    let curve = fit_motion(track, center, f64::INFINITY, |_| 1.0);
     CubicTrack { opacity: sum / f64::max(count, 1.0), ..curve }
 }
 
-/// One curve whose window has the middle and the spread of the opacities.
-fn once(track: &FittedTrack) -> CubicTrack {
-    let moment = |of: &dyn Fn(f64) -> f64| -> f64 {
-        (0..track.len()).map(|frame| track.opacity[frame] * of(track.times[frame])).sum()
+/// Returns one curve whose window has the mean and the variance of the opacities.
+fn single_window_curve(track: &FittedTrack) -> CubicTrack {
+    let moment = |value: &dyn Fn(f64) -> f64| -> f64 {
+        (0..track.len()).map(|frame| track.opacity[frame] * value(track.times[frame])).sum()
     };
     let whole = moment(&|_| 1.0);
     let center = moment(&|t| t) / whole;
     let variance = moment(&|t| (t - center).powi(2)) / whole;
     let step = (track.times[track.len() - 1] - track.times[0]) / track.len().max(2) as f64;
-    // exp(−(dt/w)²) has variance w²/2; frames a step apart cannot tell less than half of one.
+    // exp(−(dt/w)²) has variance w²/2. Frames one step apart cannot resolve a width below half a step.
     let width = (2.0 * variance).sqrt().max(0.5 * step).max(1e-9);
     let windows = |frame: usize| window(track.times[frame], center, width);
     let (mut right, mut normal) = (0.0, 0.0);
@@ -111,29 +114,29 @@ fn once(track: &FittedTrack) -> CubicTrack {
         right += windows(frame) * track.opacity[frame];
         normal += windows(frame).powi(2);
     }
-    let curve = moving(track, center, width, |frame| window(track.times[frame], center, width));
-    CubicTrack { opacity: (right / normal.max(1e-300)).min(OPAQUE), ..curve }
+    let curve = fit_motion(track, center, width, |frame| window(track.times[frame], center, width));
+    CubicTrack { opacity: (right / normal.max(1e-300)).min(MAX_OPACITY), ..curve }
 }
 
-/// `count` + 1 curves over the life between two instants.
-fn handing_over(track: &FittedTrack, [start, end]: [f64; 2], count: usize) -> Vec<CubicTrack> {
+/// Returns `count` + 1 overlapping curves over the visible time between two instants.
+fn overlapping_curves(track: &FittedTrack, [start, end]: [f64; 2], count: usize) -> Vec<CubicTrack> {
     let apart = ((end - start) / count as f64).max(1e-9);
     let width = 0.75 * apart;
     let centers: Vec<f64> = (0..=count).map(|k| start + k as f64 * apart).collect();
-    let wanted: Vec<f64> = track.opacity.iter().map(|&opacity| depth(opacity)).collect();
-    // Of each curve the frames that it is a matter of.
+    let target_depths: Vec<f64> = track.opacity.iter().map(|&opacity| depth(opacity)).collect();
+    // For each curve the frames that affect it, with the value of its window.
     let shares: Vec<Vec<(usize, f64)>> = centers
         .iter()
         .map(|&center| {
             let share = |frame: usize| (frame, window(track.times[frame], center, width));
-            (0..track.len()).map(share).filter(|(_, share)| *share > LIGHT).collect()
+            (0..track.len()).map(share).filter(|(_, share)| *share > MIN_WEIGHT).collect()
         })
         .collect();
-    let most = wanted.iter().copied().fold(0.0, f64::max);
+    let most = target_depths.iter().copied().fold(0.0, f64::max);
     let mut depths = vec![most / 2.0; centers.len()];
     let mut shown = vec![0.0; track.len()];
-    for _ in 0..UPDATES {
-        // Opacities, not depths, follow windows: what a curve adds is the depth of its share.
+    for _ in 0..MAX_UPDATES {
+        // Opacities, not depths, are multiplied by windows, so a curve adds the depth of its windowed opacity.
         shown.fill(0.0);
         for (shares, d) in shares.iter().zip(&depths) {
             let opacity = 1.0 - (-d).exp();
@@ -141,37 +144,41 @@ fn handing_over(track: &FittedTrack, [start, end]: [f64; 2], count: usize) -> Ve
         }
         let mut moved = 0.0f64;
         for (shares, depth) in shares.iter().zip(&mut depths) {
-            let ratio: f64 = shares.iter().map(|&(frame, share)| share * wanted[frame] / shown[frame].max(1e-9)).sum();
+            let ratio: f64 =
+                shares.iter().map(|&(frame, share)| share * target_depths[frame] / shown[frame].max(1e-9)).sum();
             let weight: f64 = shares.iter().map(|(_, share)| share).sum();
             let by = if weight > 0.0 { (ratio / weight).min(4.0) } else { 0.0 };
             moved = moved.max((by - 1.0).abs().min(*depth));
-            *depth = (*depth * by).min(self::depth(OPAQUE));
+            *depth = (*depth * by).min(self::depth(MAX_OPACITY));
         }
-        if moved < SETTLED {
+        if moved < CONVERGED {
             break;
         }
     }
     let curve = |(k, depth): (usize, f64)| {
-        let curve = moving(track, centers[k], width, |frame| window(track.times[frame], centers[k], width));
+        let curve = fit_motion(track, centers[k], width, |frame| window(track.times[frame], centers[k], width));
         CubicTrack { opacity: 1.0 - (-depth).exp(), ..curve }
     };
     depths.into_iter().enumerate().map(curve).collect()
 }
 
-/// A curve that moves and turns as `track` does where `weight` is, by least squares; its opacity is still to be said.
-fn moving(track: &FittedTrack, center: f64, width: f64, weight: impl Fn(usize) -> f64) -> CubicTrack {
+/// Returns a curve that follows the position and rotation of `track`, by least squares with the given weights. The
+/// opacity is left at 0.
+fn fit_motion(track: &FittedTrack, center: f64, width: f64, weight: impl Fn(usize) -> f64) -> CubicTrack {
     let weight = |frame: usize| if track.is_seen(frame) { weight(frame) * track.opacity[frame] } else { 0.0 };
-    let heavy: Vec<(usize, f64)> =
-        (0..track.len()).map(|frame| (frame, weight(frame))).filter(|(_, weight)| *weight > LIGHT * SEEN).collect();
-    let reach = heavy.iter().map(|&(frame, _)| (track.times[frame] - center).abs()).fold(1e-9, f64::max);
+    let samples: Vec<(usize, f64)> = (0..track.len())
+        .map(|frame| (frame, weight(frame)))
+        .filter(|(_, weight)| *weight > MIN_WEIGHT * SEEN)
+        .collect();
+    let reach = samples.iter().map(|&(frame, _)| (track.times[frame] - center).abs()).fold(1e-9, f64::max);
     let scaled = |frame: usize| (track.times[frame] - center) / reach;
     let position: [[f64; 3]; 4] =
-        polynomial(heavy.iter().map(|&(frame, weight)| (scaled(frame), track.position[frame], weight)), RIDGE);
+        polynomial(samples.iter().map(|&(frame, weight)| (scaled(frame), track.position[frame], weight)), RIDGE);
     let rotation: [[f64; 4]; 2] =
-        polynomial(heavy.iter().map(|&(frame, weight)| (scaled(frame), track.rotation[frame], weight)), RIDGE);
-    let whole: f64 = heavy.iter().map(|&(_, weight)| weight).sum();
-    let mean = |of: &dyn Fn(usize) -> f64| {
-        heavy.iter().map(|&(frame, weight)| weight * of(frame)).sum::<f64>() / whole.max(1e-300)
+        polynomial(samples.iter().map(|&(frame, weight)| (scaled(frame), track.rotation[frame], weight)), RIDGE);
+    let whole: f64 = samples.iter().map(|&(_, weight)| weight).sum();
+    let mean = |value: &dyn Fn(usize) -> f64| {
+        samples.iter().map(|&(frame, weight)| weight * value(frame)).sum::<f64>() / whole.max(1e-300)
     };
     let width_of_sh = track.sh(0).len();
     let unscaled = |k: usize| reach.powi(k as i32);
@@ -186,33 +193,33 @@ fn moving(track: &FittedTrack, center: f64, width: f64, weight: impl Fn(usize) -
     }
 }
 
-/// How far `curves` are off, in tolerances at worst and altogether. Where several are seen, each has to be where the
-/// Gaussian is, as much as it is seen.
-fn misfit_of(track: &FittedTrack, curves: &[CubicTrack], tolerance: &Tolerance) -> (f64, Misfit) {
+/// Returns the error of `curves`: the largest one in units of `tolerance`, and all errors together. Where several
+/// curves are visible, each must be close to the Gaussian, in proportion to its visibility.
+fn measure_misfit(track: &FittedTrack, curves: &[CubicTrack], tolerance: &Tolerance) -> (f64, Misfit) {
     let (mut worst, mut misfit) = (0.0f64, Misfit::default());
     for frame in 0..track.len() {
         let time = track.times[frame];
         let (mut shown, mut away) = (0.0, 0.0);
         for curve in curves {
-            let share = depth(curve.visible(time));
+            let share = depth(curve.opacity_at(time));
             shown += share;
-            if curve.visible(time) < SEEN {
+            if curve.opacity_at(time) < SEEN {
                 continue;
             }
             let dt = time - curve.center;
             let rotation = std::array::from_fn(|c| curve.rotation[0][c] + dt * curve.rotation[1][c]);
             let scale = (0..3).map(|c| (curve.log_scale[c] - track.log_scale[frame][c]).abs()).fold(0.0, f64::max);
             let sh = curve.sh.iter().zip(track.sh(frame)).map(|(a, b)| f64::from((a - b).abs())).fold(0.0, f64::max);
-            let distance = track.distance(frame, curve.place(time));
+            let distance = track.distance(frame, curve.position_at(time));
             away += share * distance;
             worst = [
                 distance / tolerance.position,
-                track.turned(frame, rotation) / tolerance.rotation,
+                track.rotation_error(frame, rotation) / tolerance.rotation,
                 scale / tolerance.log_scale,
                 sh / tolerance.sh,
             ]
             .into_iter()
-            // One that is hardly seen need not be as close.
+            // A curve that is hardly visible need not be as close.
             .map(|excess| excess * (share / depth(track.opacity[frame]).max(SEEN)).min(1.0))
             .fold(worst, f64::max);
         }
@@ -242,7 +249,7 @@ mod tests {
     }
 
     #[test]
-    fn what_the_format_says_itself_is_found_again() {
+    fn cubic_and_fading_tracks_are_recovered_exactly() {
         let cubic = |t: f64| [t - 2.0 * t * t + t.powi(3), 0.3, -t];
         let mut misfit = Misfit::default();
         let one = curved(&track(60, cubic, |_| 0.8), &Tolerance::default(), &mut misfit);
@@ -256,11 +263,11 @@ mod tests {
     }
 
     #[test]
-    fn longer_stories_are_handed_over_and_their_opacities_add_up() {
+    fn complex_tracks_are_shared_by_curves_whose_opacity_adds_up() {
         let wave = |t: f64| [(18.0 * t).sin(), 0.0, 0.0];
         let mut misfit = Misfit::default();
         let many = curved(&track(120, wave, |_| 0.6), &Tolerance::default(), &mut misfit);
-        assert!((4..=MOST + 1).contains(&many.len()), "{} curves", many.len());
+        assert!((4..=MAX_INTERVALS + 1).contains(&many.len()), "{} curves", many.len());
         assert!(misfit.opacity < 0.05 && misfit.rms() < 0.1, "{misfit:?}");
         let mut misfit = Misfit::default();
         let step =
@@ -269,11 +276,11 @@ mod tests {
     }
 
     #[test]
-    fn what_is_never_seen_takes_none_and_a_single_frame_takes_one() {
+    fn invisible_track_has_no_curve_and_single_frame_has_one() {
         let mut misfit = Misfit::default();
         assert!(curved(&track(20, |_| [0.0; 3], |_| 1e-3), &Tolerance::default(), &mut misfit).is_empty());
         let still = curved(&track(1, |_| [1.0; 3], |_| 0.5), &Tolerance::default(), &mut misfit);
-        assert!(still.len() == 1 && still[0].place(0.0).iter().all(|x| (x - 1.0).abs() < 1e-9), "{still:?}");
+        assert!(still.len() == 1 && still[0].position_at(0.0).iter().all(|x| (x - 1.0).abs() < 1e-9), "{still:?}");
         let flash = track(30, |_| [0.0; 3], |t| if (t - 0.5).abs() < 1e-9 { 0.5 } else { 0.0 });
         assert!(!curved(&flash, &Tolerance::default(), &mut misfit).is_empty());
     }

@@ -1,7 +1,8 @@
 //! Weighted least squares of polynomials of low degree, in f64.
 
-/// Coefficients c of Σ cₖ·uᵏ, k below `K`, that make Σ w·(y − Σ cₖ uᵏ)² least for every component, plus `ridge` times
-/// Σw·cₖ² for k ≥ 1 (a proportion of the weight: what frames do not determine stays small). `u` should be about within ±1.
+/// Returns the coefficients cₖ, k < `K`, that minimize Σ w·(y − Σ cₖ·uᵏ)² for every component of y, plus `ridge`·Σw·cₖ²
+/// for k ≥ 1. The ridge, proportional to the total weight, keeps coefficients small that the samples do not determine.
+/// Samples are (u, y, w), and `u` should be about within ±1. Returns zeros if the system cannot be solved.
 pub(crate) fn polynomial<const K: usize, const C: usize>(
     samples: impl Iterator<Item = (f64, [f64; C], f64)>,
     ridge: f64,
@@ -20,7 +21,7 @@ pub(crate) fn polynomial<const K: usize, const C: usize>(
     for (k, row) in normal.iter_mut().enumerate().skip(1) {
         row[k] += ridge * whole + f64::MIN_POSITIVE;
     }
-    // Gauss and Jordan, with pivots: the matrix is positive definite but for rounding.
+    // Gauss-Jordan elimination with pivots: the matrix is positive definite except for rounding.
     for k in 0..K {
         let pivot = (k..K).max_by(|&a, &b| normal[a][k].abs().total_cmp(&normal[b][k].abs())).unwrap_or(k);
         normal.swap(k, pivot);
@@ -31,9 +32,9 @@ pub(crate) fn polynomial<const K: usize, const C: usize>(
         }
         for i in (0..K).filter(|&i| i != k) {
             let factor = normal[i][k] / by;
-            let (of_normal, of_right) = (normal[k], right[k]);
-            normal[i].iter_mut().zip(of_normal).for_each(|(to, of)| *to -= factor * of);
-            right[i].iter_mut().zip(of_right).for_each(|(to, of)| *to -= factor * of);
+            let (pivot_normal, pivot_right) = (normal[k], right[k]);
+            normal[i].iter_mut().zip(pivot_normal).for_each(|(to, from)| *to -= factor * from);
+            right[i].iter_mut().zip(pivot_right).for_each(|(to, from)| *to -= factor * from);
         }
     }
     std::array::from_fn(|k| right[k].map(|value| value / normal[k][k]))
@@ -44,7 +45,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn polynomials_are_found_again_and_what_is_not_determined_stays_small() {
+    fn polynomials_are_recovered_and_free_coefficients_stay_small() {
         let cubic = |u: f64| [1.0 - 2.0 * u + 0.5 * u * u - 3.0 * u.powi(3), 4.0];
         let found: [[f64; 2]; 4] = polynomial(
             (0..9).map(|i| (f64::from(i) / 4.0 - 1.0, cubic(f64::from(i) / 4.0 - 1.0), 1.0 + f64::from(i))),

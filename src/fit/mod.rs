@@ -1,7 +1,7 @@
-//! Few numbers for many states: what a Gaussian does along the frames, as the motions that compact formats know.
+//! Curves fitted to the states of one Gaussian over all frames, in the forms that compact formats store.
 //!
-//! [`straight`] cuts a life into pieces of straight motion; [`curved`] covers it with cubic motions under soft windows of
-//! time. Both say how far they are off.
+//! [`straight`] divides a track into pieces of linear motion. [`curved`] covers it with cubic motions under soft
+//! windows in time. Both report their error.
 
 mod curved;
 mod least_squares;
@@ -13,43 +13,43 @@ pub(crate) use least_squares::polynomial;
 pub use straight::{LinearPiece, straight};
 pub use track::{FittedTrack, SEEN};
 
-/// How far a fit may be from the states, at every frame that is seen.
+/// Maximum error of a fit at every frame where the Gaussian is visible.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Tolerance {
-    /// Of positions, as a part of the middle one of the three scales.
+    /// Maximum error of positions, in units of the middle one of the three scales.
     pub position: f64,
-    /// Of rotations, radians; counts only where axes differ by more than a tenth.
+    /// Maximum error of rotations, radians. Ignored if no two log scales differ by 0.1 or more.
     pub rotation: f64,
-    /// Of scales, natural logarithm.
+    /// Maximum error of log scales (natural logarithm).
     pub log_scale: f64,
-    /// Of opacities.
+    /// Maximum error of opacities.
     pub opacity: f64,
-    /// Of harmonic coefficients.
+    /// Maximum error of SH coefficients.
     pub sh: f64,
 }
 
 impl Default for Tolerance {
-    /// About what one step of 8 bits shows.
+    /// Returns tolerances of about one quantization step of 8 bits.
     fn default() -> Tolerance {
         Tolerance { position: 0.1, rotation: 0.05, log_scale: 0.05, opacity: 0.02, sh: 0.05 }
     }
 }
 
-/// How far fits are off, over all Gaussians and frames that are seen.
+/// Error of fits, over all Gaussians and the frames where they are visible.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Misfit {
-    /// States compared.
+    /// Number of compared states.
     pub states: u64,
-    /// Sum of squares of the distances, in middle scales.
+    /// Sum of squared distances, in units of the middle scale squared.
     squares: f64,
-    /// Largest of them.
+    /// Largest distance, in units of the middle scale.
     pub position: f64,
-    /// Largest difference of opacity.
+    /// Largest difference of opacities.
     pub opacity: f64,
 }
 
 impl Misfit {
-    /// One state: how far its position is off, in middle scales, and its opacity.
+    /// Adds one state with the error of its position, in units of the middle scale, and of its opacity.
     fn add(&mut self, position: f64, opacity: f64) {
         self.states += 1;
         self.squares += position * position;
@@ -57,7 +57,7 @@ impl Misfit {
         self.opacity = self.opacity.max(opacity.abs());
     }
 
-    /// Both together.
+    /// Returns the combined error of both sets of fits.
     pub fn and(self, other: Misfit) -> Misfit {
         Misfit {
             states: self.states + other.states,
@@ -67,7 +67,7 @@ impl Misfit {
         }
     }
 
-    /// Root mean square of the distances, in middle scales.
+    /// Returns the root mean square of the distances, in units of the middle scale.
     pub fn rms(&self) -> f64 {
         (self.squares / self.states.max(1) as f64).sqrt()
     }

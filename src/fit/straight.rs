@@ -1,77 +1,81 @@
-//! Pieces of straight motion: within each, everything else stands still.
+//! Fit of pieces with linear motion; all other attributes are constant within a piece.
 
 use std::ops::Range;
 
 use super::least_squares::polynomial;
 use super::{FittedTrack, Misfit, Tolerance};
 
-/// What a Gaussian is for some frames.
+/// Attributes of a Gaussian during some frames.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LinearPiece {
-    /// Its frames.
+    /// Frames of the piece.
     pub frames: Range<usize>,
-    /// The instant at which it is at `position`.
+    /// Time at which the Gaussian is at `position`.
     pub at: f64,
-    /// Scene units.
+    /// Position, scene units.
     pub position: [f64; 3],
-    /// Scene units per unit of time.
+    /// Velocity, scene units per unit of time.
     pub velocity: [f64; 3],
-    /// Unit quaternion wxyz.
+    /// Rotation, unit quaternion wxyz.
     pub rotation: [f64; 4],
-    /// Natural logarithms of scene units.
+    /// Log scales, natural logarithms of scene units.
     pub log_scale: [f64; 3],
-    /// In [0, 1].
+    /// Opacity in [0, 1].
     pub opacity: f64,
-    /// Harmonic coefficients.
+    /// SH coefficients.
     pub sh: Vec<f32>,
 }
 
-/// The pieces of `track`, in order: halves of the sequence, of its halves and so on (of 2ᵏ frames from a multiple of 2ᵏ on),
-/// each the largest that holds what `tolerance` says at every frame; nothing where it is not seen. Of all Gaussians together
-/// there are so no more different spans than twice the frames. How far the pieces are off goes into `misfit`.
+/// Returns the pieces of `track` in order. Spans are halves of the sequence, halves of those and so on: 2ᵏ frames that
+/// begin at a multiple of 2ᵏ. Each piece is the largest such span that meets `tolerance` at every frame. Frames where
+/// the Gaussian is invisible have no piece. All Gaussians together have at most twice as many different spans as there
+/// are frames. The error of the pieces is added to `misfit`.
 pub fn straight(track: &FittedTrack, tolerance: &Tolerance, misfit: &mut Misfit) -> Vec<LinearPiece> {
     let mut pieces = Vec::new();
-    cut(track, 0..track.len().next_power_of_two(), tolerance, &mut pieces);
+    add_pieces(track, 0..track.len().next_power_of_two(), tolerance, &mut pieces);
     for piece in &pieces {
         for frame in piece.frames.clone() {
-            misfit.add(track.distance(frame, place(piece, track.times[frame])), track.opacity[frame] - piece.opacity);
+            misfit.add(
+                track.distance(frame, position_at(piece, track.times[frame])),
+                track.opacity[frame] - piece.opacity,
+            );
         }
     }
     pieces
 }
 
-/// Adds the pieces of a span of 2ᵏ frames, of which the last ones may not exist.
-fn cut(track: &FittedTrack, span: Range<usize>, tolerance: &Tolerance, pieces: &mut Vec<LinearPiece>) {
+/// Adds the pieces of a span of 2ᵏ frames; the last frames of the span may not exist.
+fn add_pieces(track: &FittedTrack, span: Range<usize>, tolerance: &Tolerance, pieces: &mut Vec<LinearPiece>) {
     let frames = span.start..span.end.min(track.len());
     let seen = frames.clone().filter(|&frame| track.is_seen(frame)).count();
     if seen == 0 {
         return;
     }
     if seen == frames.len() {
-        let whole = piece(track, frames.clone());
-        if frames.len() == 1 || holds(track, &whole, tolerance) {
+        let whole = fit_piece(track, frames.clone());
+        if frames.len() == 1 || is_within(track, &whole, tolerance) {
             return pieces.push(whole);
         }
     }
     let middle = span.start.midpoint(span.end);
-    cut(track, span.start..middle, tolerance, pieces);
-    cut(track, middle..span.end, tolerance, pieces);
+    add_pieces(track, span.start..middle, tolerance, pieces);
+    add_pieces(track, middle..span.end, tolerance, pieces);
 }
 
-/// Where `piece` is at `time`.
-fn place(piece: &LinearPiece, time: f64) -> [f64; 3] {
+/// Returns the position of `piece` at `time`.
+fn position_at(piece: &LinearPiece, time: f64) -> [f64; 3] {
     std::array::from_fn(|c| piece.position[c] + piece.velocity[c] * (time - piece.at))
 }
 
-/// The best piece of these frames: positions by least squares, all else their mean.
-fn piece(track: &FittedTrack, frames: Range<usize>) -> LinearPiece {
+/// Returns the best piece for the given frames: least squares for positions, means for all other attributes.
+fn fit_piece(track: &FittedTrack, frames: Range<usize>) -> LinearPiece {
     let count = frames.len() as f64;
     let (first, last) = (track.times[frames.start], track.times[frames.end - 1]);
     let (at, half) = (first.midpoint(last), ((last - first) / 2.0).max(f64::MIN_POSITIVE));
     let samples = frames.clone().map(|frame| ((track.times[frame] - at) / half, track.position[frame], 1.0));
     let [position, velocity] =
         if frames.len() > 1 { polynomial(samples, 0.0) } else { [track.position[frames.start], [0.0; 3]] };
-    let mean = |of: &dyn Fn(usize) -> f64| frames.clone().map(of).sum::<f64>() / count;
+    let mean = |value: &dyn Fn(usize) -> f64| frames.clone().map(value).sum::<f64>() / count;
     let rotation: [f64; 4] = std::array::from_fn(|c| mean(&|frame| track.rotation[frame][c]));
     let length = rotation.iter().map(|x| x * x).sum::<f64>().sqrt();
     let width = track.sh(frames.start).len();
@@ -87,12 +91,12 @@ fn piece(track: &FittedTrack, frames: Range<usize>) -> LinearPiece {
     }
 }
 
-/// Whether `piece` is as close as `tolerance` asks at every one of its frames.
-fn holds(track: &FittedTrack, piece: &LinearPiece, tolerance: &Tolerance) -> bool {
+/// Returns whether `piece` is within `tolerance` at every one of its frames.
+fn is_within(track: &FittedTrack, piece: &LinearPiece, tolerance: &Tolerance) -> bool {
     let near = |a: f64, b: f64, within: f64| (a - b).abs() <= within;
     piece.frames.clone().all(|frame| {
-        track.distance(frame, place(piece, track.times[frame])) <= tolerance.position
-            && track.turned(frame, piece.rotation) <= tolerance.rotation
+        track.distance(frame, position_at(piece, track.times[frame])) <= tolerance.position
+            && track.rotation_error(frame, piece.rotation) <= tolerance.rotation
             && near(track.opacity[frame], piece.opacity, tolerance.opacity)
             && (0..3).all(|c| near(track.log_scale[frame][c], piece.log_scale[c], tolerance.log_scale))
             && track.sh(frame).iter().zip(&piece.sh).all(|(a, b)| near(f64::from(*a), f64::from(*b), tolerance.sh))
@@ -103,7 +107,7 @@ fn holds(track: &FittedTrack, piece: &LinearPiece, tolerance: &Tolerance) -> boo
 mod tests {
     use super::*;
 
-    /// A Gaussian of size e⁻³ at `position`, seen with `opacity`.
+    /// Returns a track of a Gaussian of scale e⁻³ with the given position and opacity at each time.
     pub(super) fn track(
         frames: usize,
         position: impl Fn(f64) -> [f64; 3],
@@ -121,21 +125,21 @@ mod tests {
     }
 
     #[test]
-    fn straight_motion_is_one_piece_and_an_edge_begins_another() {
+    fn linear_motion_is_one_piece_and_a_bend_splits_it() {
         let mut misfit = Misfit::default();
         let one = straight(&track(50, |t| [1.0 + 2.0 * t, -t, 0.0], |_| 0.7), &Tolerance::default(), &mut misfit);
         assert_eq!(one.len(), 1);
         assert!((one[0].velocity[0] - 2.0).abs() < 1e-9 && one[0].frames == (0..50) && misfit.position < 1e-9);
         let bent = track(50, |t| [(t - 0.4).abs(), 0.0, 0.0], |_| 0.7);
         let pieces = straight(&bent, &Tolerance::default(), &mut misfit);
-        // The edge lies in frame 20: 0 to 15, 16 to 19 and 20 on.
+        // The bend is in frame 20. Pieces: frames 0 to 15, 16 to 19, and 20 on.
         assert!(pieces.len() >= 3 && pieces.len() <= 8, "{} pieces", pieces.len());
         assert_eq!(pieces.iter().map(|piece| piece.frames.len()).sum::<usize>(), 50);
         assert!(misfit.position <= 0.1 && misfit.states == 100, "{misfit:?}");
     }
 
     #[test]
-    fn what_is_not_seen_takes_no_piece_and_a_life_may_pause() {
+    fn invisible_frames_have_no_piece_and_tracks_may_pause() {
         let mut misfit = Misfit::default();
         let blink = track(60, |_| [0.0; 3], |t| if (0.2..0.4).contains(&t) || t > 0.7 { 0.5 } else { 0.001 });
         let pieces = straight(&blink, &Tolerance::default(), &mut misfit);
@@ -143,12 +147,12 @@ mod tests {
         assert_eq!(frames, [12..16, 16..24, 43..44, 44..48, 48..60]);
         let mut broken = track(5, |_| [0.0; 3], |_| 0.5);
         broken.position[2][1] = f64::NAN;
-        // 0 and 1, 3, 4.
+        // Pieces: frames 0 and 1, frame 3, frame 4.
         assert_eq!(straight(&broken, &Tolerance::default(), &mut misfit).len(), 3);
     }
 
     #[test]
-    fn every_frame_of_a_wild_one_is_held_within_the_tolerance() {
+    fn every_frame_of_a_wild_track_is_within_tolerance() {
         let mut misfit = Misfit::default();
         let mut wild = track(200, |t| [(37.0 * t).sin(), (23.0 * t).cos(), t * t], |t| 0.5 + 0.4 * (50.0 * t).sin());
         for (frame, (rotation, scale)) in wild.rotation.iter_mut().zip(&mut wild.log_scale).enumerate() {
@@ -156,7 +160,7 @@ mod tests {
             (*rotation, *scale) = ([angle.cos(), angle.sin(), 0.0, 0.0], [-3.0, -2.0, -4.0 + angle]);
         }
         let pieces = straight(&wild, &Tolerance::default(), &mut misfit);
-        assert!(pieces.iter().all(|piece| holds(&wild, piece, &Tolerance::default()) || piece.frames.len() == 1));
+        assert!(pieces.iter().all(|piece| is_within(&wild, piece, &Tolerance::default()) || piece.frames.len() == 1));
         assert!(pieces.windows(2).all(|pair| pair[0].frames.end == pair[1].frames.start));
         assert!(misfit.position <= 0.1 && misfit.opacity <= 0.02 && misfit.states == 200, "{misfit:?}");
     }

@@ -1,29 +1,29 @@
-//! One Gaussian along all frames.
+//! Track of one Gaussian: its state at every frame.
 
 use crate::model::{Gaussians, opacity};
 
-/// Opacity below which a Gaussian is not drawn (1/255): there nothing has to fit.
+/// Opacity below which a Gaussian is not drawn (1/255). Fits ignore frames below it.
 pub const SEEN: f64 = 1.0 / 255.0;
 
-/// What one Gaussian does.
+/// States of one Gaussian at all frames.
 #[derive(Debug, Clone, Default)]
 pub struct FittedTrack {
-    /// Of every frame, increasing.
+    /// Times of the frames, increasing.
     pub times: Vec<f64>,
-    /// Scene units.
+    /// Positions, scene units.
     pub position: Vec<[f64; 3]>,
-    /// Unit quaternions wxyz, each on the side of the one before.
+    /// Rotations, unit quaternions wxyz, each in the hemisphere of the previous one.
     pub rotation: Vec<[f64; 4]>,
-    /// Natural logarithms of scene units.
+    /// Log scales, natural logarithms of scene units.
     pub log_scale: Vec<[f64; 3]>,
-    /// In [0, 1].
+    /// Opacities in [0, 1].
     pub opacity: Vec<f64>,
-    /// Harmonic coefficients, a row for every frame, or one for all.
+    /// SH coefficients, one row per frame or one row for all frames.
     pub sh: Vec<Vec<f32>>,
 }
 
 impl FittedTrack {
-    /// Of Gaussian `row` of the states at `times`, in order.
+    /// Returns the track of Gaussian `row` from the frame states at `times`, in order.
     pub fn from_states(times: &[f64], states: &[Gaussians], row: usize) -> FittedTrack {
         let mut track = FittedTrack { times: times.to_vec(), ..FittedTrack::default() };
         let mut last = [1.0, 0.0, 0.0, 0.0];
@@ -32,7 +32,7 @@ impl FittedTrack {
             let q = state.rotation.row::<4>(row).map(f64::from);
             let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
             let dot: f64 = q.iter().zip(last).map(|(a, b)| a * b).sum();
-            // One without a direction stays as the last was.
+            // A quaternion of length zero or infinity is replaced by the previous rotation.
             if length > 0.0 && length.is_finite() {
                 last = q.map(|x| if dot < 0.0 { -x / length } else { x / length });
             }
@@ -52,43 +52,43 @@ impl FittedTrack {
         track
     }
 
-    /// Number of frames.
+    /// Returns the number of frames.
     pub fn len(&self) -> usize {
         self.times.len()
     }
 
-    /// Whether there are no frames.
+    /// Returns whether there are no frames.
     pub fn is_empty(&self) -> bool {
         self.times.is_empty()
     }
 
-    /// Whether it is drawn at `frame`, with values that can be drawn.
+    /// Returns whether the Gaussian is visible at `frame` and its values are finite.
     pub fn is_seen(&self, frame: usize) -> bool {
         let finite = |values: &[f64]| values.iter().all(|x| x.is_finite());
         self.opacity[frame] >= SEEN && finite(&self.position[frame]) && finite(&self.log_scale[frame])
     }
 
-    /// Harmonic coefficients at `frame`.
+    /// Returns the SH coefficients at `frame`.
     pub fn sh(&self, frame: usize) -> &[f32] {
         &self.sh[frame.min(self.sh.len() - 1)]
     }
 
-    /// The middle one of the three scales at `frame`, scene units.
-    pub fn size(&self, frame: usize) -> f64 {
+    /// Returns the middle one of the three scales at `frame`, scene units; at least 1e-12.
+    pub fn middle_scale(&self, frame: usize) -> f64 {
         let mut scales = self.log_scale[frame];
         scales.sort_by(f64::total_cmp);
         scales[1].exp().max(1e-12)
     }
 
-    /// How far `position` is from where it is at `frame`, in middle scales.
+    /// Returns the distance between `position` and the position at `frame`, in units of the middle scale.
     pub fn distance(&self, frame: usize, position: [f64; 3]) -> f64 {
         let apart = position.iter().zip(self.position[frame]).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt();
-        apart / self.size(frame)
+        apart / self.middle_scale(frame)
     }
 
-    /// Angle between the rotation at `frame` and `rotation`, radians; 0 where no axis differs from another by more than a
-    /// tenth.
-    pub fn turned(&self, frame: usize, rotation: [f64; 4]) -> f64 {
+    /// Returns the angle between the rotation at `frame` and `rotation`, radians. Returns 0 if no two log scales differ
+    /// by 0.1 or more.
+    pub fn rotation_error(&self, frame: usize, rotation: [f64; 4]) -> f64 {
         let scales = self.log_scale[frame];
         let [least, most] =
             [scales.iter().copied().fold(f64::MAX, f64::min), scales.iter().copied().fold(f64::MIN, f64::max)];

@@ -1,11 +1,11 @@
-//! Summaries as a part of what a work folder keeps.
+//! Storage of summaries in cache entries.
 
 use serde::de::{DeserializeOwned, Error as _};
 use serde::ser::Error as _;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
-/// A summary that is stored as text. The binary format of a work folder has no optional fields; summaries, made for JSON, do.
-/// TOML has them too, and unlike JSON holds NaN and infinities.
+/// Wrapper that serializes a summary as TOML text. The binary format of cache entries has no optional fields, but
+/// summaries, which are made for JSON, have some. TOML supports them and, unlike JSON, also NaN and infinities.
 #[derive(Debug)]
 pub(crate) struct AsToml<T>(pub(crate) T);
 
@@ -35,13 +35,13 @@ mod tests {
         postcard::from_bytes::<AsToml<T>>(&postcard::to_stdvec(&AsToml(value)).unwrap()).unwrap().0
     }
 
-    /// The values as text, for NaN is not equal to itself.
+    /// Checks that a value is unchanged after storage. Compares texts, because NaN is not equal to itself.
     fn same<T: Serialize + DeserializeOwned + Clone + std::fmt::Debug>(value: &T) {
         assert_eq!(format!("{:?}", kept(value.clone())), format!("{value:?}"));
     }
 
     #[test]
-    fn nan_and_infinity_are_read_back_as_they_were() {
+    fn nan_and_infinity_are_read_back_unchanged() {
         for odd in [f64::NAN, f64::INFINITY, f64::NEG_INFINITY, 0.1 + 0.2, 1e-300, -0.0] {
             let tried = vec![(7, odd), (9, 30.0)];
             same(&ArchiveSummary {

@@ -1,5 +1,5 @@
-//! What happens in a run, written down where it happens: stages with their time, memory and reads, what was left out
-//! and why, and notes.
+//! Journal of a run: stages with their time, memory and reads, omitted stages with reasons, and notes. Each is recorded
+//! where it happens.
 
 pub(crate) mod as_toml;
 pub mod records;
@@ -19,63 +19,65 @@ use crate::machine::peak_memory_bytes;
 use crate::scene::Scene;
 use crate::source::{FrameSource, Reads};
 
-/// When something began.
+/// Start of a measured period.
 #[derive(Debug, Clone, Copy)]
 pub struct Clock {
     wall: Instant,
-    /// Seconds of all processors.
+    /// Processor time of the process at the start, seconds; `None` where the system does not report it.
     processors: Option<f64>,
 }
 
 impl Clock {
-    /// Now.
+    /// Starts a measurement now.
     pub fn start() -> Clock {
         Clock { wall: Instant::now(), processors: processor_seconds() }
     }
 
-    /// Seconds since then.
+    /// Returns the wall-clock seconds since the start.
     pub fn seconds(&self) -> f64 {
         self.wall.elapsed().as_secs_f64()
     }
 
-    /// Seconds that this process took since then of all processors together; none where the system does not say.
+    /// Returns the seconds that this process used on all processors since the start; `None` where the system does not
+    /// report them.
     pub fn processor_seconds(&self) -> Option<f64> {
         processor_seconds().zip(self.processors).map(|(now, before)| now - before)
     }
 }
 
-/// Seconds that this process took of all processors together; none where the system does not say.
+/// Returns the seconds that this process has used on all processors; `None` where the system does not report them.
 fn processor_seconds() -> Option<f64> {
     ProcessTime::try_now().ok().map(|time| time.as_duration().as_secs_f64())
 }
 
-/// The record of a run so far, or of a stage that is kept.
+/// Record of a run so far, or of a cached stage.
 #[derive(Debug, Default, Serialize, Deserialize)]
 pub struct Journal {
-    /// What reading every frame once reads.
+    /// Size of one full read: the reads of one pass over every frame.
     #[serde(skip)]
     pub whole: Reads,
-    /// Everything done, in order.
+    /// Records of all stages in order.
     pub stages: Vec<StageRecord>,
-    /// What the scene did not need.
+    /// Stages that the run omitted, with reasons.
     pub left_out: Vec<LeftOut>,
-    /// Things a person should know.
+    /// Notes for the user.
     pub notes: Vec<String>,
-    /// What was found about the field's precision.
+    /// Measured effect of half precision on the deformation field.
     pub field: Option<FieldSummary>,
-    /// What was found about the bands of spherical harmonics.
+    /// Measured effect of lower SH degrees.
     pub bands: Option<BandsSummary>,
-    /// What refining gained.
+    /// Quality gained by refinement.
     pub refined: Option<RefinedSummary>,
-    /// What the run was expected to take, where that was said.
+    /// Forecast that was made before the run, if there was one.
     pub forecast: Option<Forecast>,
 }
 
 impl Journal {
-    /// Runs `work` as a stage that reads `source`; it gives its result and the number of Gaussians that left it.
+    /// Runs `work` as a stage that reads `source`. `work` returns its result and the number of Gaussians after the
+    /// stage.
     ///
     /// # Errors
-    /// Those of `work`; nothing is written down then.
+    /// Fails if `work` fails; nothing is recorded then.
     pub fn stage<T>(
         &mut self,
         name: &'static str,
@@ -90,10 +92,11 @@ impl Journal {
         Ok(value)
     }
 
-    /// [`Journal::stage`] of which nothing is divided, with its result kept in the scene's work folder for `key`.
+    /// Runs an undivided stage like [`Journal::stage`]. Its result is cached under `key` in the work folder of the
+    /// scene.
     ///
     /// # Errors
-    /// Those of `compute` and of the folder; a run of a part ends before it.
+    /// Fails if `compute` fails or the cache cannot be used. A run of a single shard ends before the stage.
     pub fn kept_stage<T: Serialize + DeserializeOwned>(
         &mut self,
         name: &'static str,
@@ -116,10 +119,11 @@ impl Journal {
         bands.or(field).or(self.refined.map(|refined| refined.result))
     }
 
-    /// What `compute` finds, as a piece of `work` called `stage`, with all that it writes down.
+    /// Returns the cached result of `stage` or computes it, together with everything that `compute` records in the
+    /// journal.
     ///
     /// # Errors
-    /// Those of `compute` and of the folder.
+    /// Fails if `compute` fails or the cache cannot be used.
     pub fn kept<T: Serialize + DeserializeOwned>(
         &mut self,
         work: &Cache,
@@ -147,17 +151,17 @@ impl Journal {
         Ok(found)
     }
 
-    /// Writes down that opening the input, begun at `start`, gave `gaussians` Gaussians and read so much.
+    /// Records the opening of the input: it began at `start`, found `gaussians` Gaussians and did `reads`.
     pub fn opened(&mut self, name: &'static str, start: Clock, gaussians: usize, reads: Reads) {
         self.add(name, [0, gaussians], start, reads, 0);
     }
 
-    /// Writes down what was not done, and why not.
+    /// Adds an entry for the omitted work `what` with the reason `why`.
     pub fn leave_out(&mut self, what: impl Into<String>, why: impl Into<String>) {
         self.left_out.push(LeftOut { what: what.into(), why: why.into(), saved: None });
     }
 
-    /// The same of what would have taken so much.
+    /// Adds an entry for the omitted work `what` with the reason `why` and the saved cost.
     pub fn spare(&mut self, what: impl Into<String>, why: impl Into<String>, saved: Saved) {
         self.left_out.push(LeftOut { what: what.into(), why: why.into(), saved: Some(saved) });
     }

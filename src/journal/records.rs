@@ -1,4 +1,4 @@
-//! Parts of the summary that stages write while a run goes on.
+//! Records for the summary that stages write during a run.
 
 use bytesize::ByteSize;
 use serde::{Deserialize, Deserializer, Serialize};
@@ -7,64 +7,64 @@ use crate::metrics::decibels_text;
 use crate::progress::duration;
 use crate::source::Reads;
 
-/// One stage of a run.
+/// Record of one stage of a run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct StageRecord {
-    /// Its name.
+    /// Name of the stage.
     pub name: String,
-    /// Gaussians that entered it.
+    /// Number of Gaussians before the stage.
     pub gaussians_in: usize,
-    /// Gaussians that left it.
+    /// Number of Gaussians after the stage.
     pub gaussians_out: usize,
-    /// What it read of the input, counted where it happened.
+    /// Reads of the input, counted where they happened.
     pub reads: Reads,
-    /// The same as full reads of the input: by bytes where it is stored in tiles, else by states.
+    /// Reads as a number of full reads of the input: by bytes if it is stored in tiles, otherwise by states.
     pub full_reads: f64,
-    /// Bytes that it read back of scratch files, which are no part of the input.
+    /// Bytes read back from scratch files, which are not part of the input.
     pub scratch_bytes: u64,
-    /// Whether it was found in a work folder: then its times and reads are those of the run that it was found by.
+    /// Whether the result came from the cache. Times and reads are then those of the run that computed it.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub kept: bool,
-    /// Wall-clock time.
+    /// Wall-clock time, seconds.
     pub seconds: f64,
-    /// Time of all processors together, where the system tells.
+    /// Time of all processors together, seconds, where the system reports it.
     pub processor_seconds: Option<f64>,
-    /// Largest resident memory of the process up to the end of this stage, where the system tells.
+    /// Largest resident memory of the process up to the end of this stage, bytes, where the system reports it.
     pub peak_memory_bytes: Option<u64>,
 }
 
-/// Something the scene did not need.
+/// Stage or step that was omitted.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct LeftOut {
-    /// What was not done.
+    /// Name of the omitted work.
     pub what: String,
-    /// Why not.
+    /// Reason.
     pub why: String,
-    /// What it would have taken, where that is known.
+    /// Cost that was saved, where it is known.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub saved: Option<Saved>,
 }
 
-/// What something would have taken that was left out.
+/// Cost that was saved by omitting work.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Saved {
-    /// A stage: about so many seconds on all threads, and full reads of the frames at most.
+    /// Cost of a stage: approximate time on all threads, and maximum full reads of the frames.
     Stage {
-        /// Seconds.
+        /// Time, seconds.
         seconds: f64,
-        /// Full reads.
+        /// Number of full reads.
         reads: f64,
     },
-    /// Values that are the same as before, not read again.
+    /// Values that did not change and were not read again.
     Values {
-        /// Their bytes.
+        /// Bytes of these values.
         bytes: u64,
     },
 }
 
 impl Saved {
-    /// For a person.
+    /// Formats the saved cost for display.
     pub fn text(self) -> String {
         match self {
             Saved::Stage { seconds, reads } => format!("about {}, {reads:.2} full reads", duration(seconds)),
@@ -74,7 +74,7 @@ impl Saved {
 }
 
 impl LeftOut {
-    /// Why, and what that saved, for a person.
+    /// Returns the reason and the saved cost as text for display.
     pub fn reason(&self) -> String {
         match self.saved {
             Some(saved) => format!("{}; saves {}", self.why, saved.text()),
@@ -83,56 +83,58 @@ impl LeftOut {
     }
 }
 
-/// Sizes or degrees with a number each.
+/// Deserializes pairs of an integer (size or SH degree) and a number; null becomes NaN.
 pub(crate) fn sizes<'de, D: Deserializer<'de>>(from: D) -> std::result::Result<Vec<(usize, f64)>, D::Error> {
     let found = Vec::<(usize, Option<f64>)>::deserialize(from)?;
-    Ok(found.into_iter().map(|(size, of)| (size, of.unwrap_or(f64::NAN))).collect())
+    Ok(found.into_iter().map(|(size, value)| (size, value.unwrap_or(f64::NAN))).collect())
 }
 
-/// A number as JSON has it: null stands for what is not finite.
+/// Deserializes a number; null, which JSON writes for numbers that are not finite, becomes NaN.
 pub(crate) fn number<'de, D: Deserializer<'de>>(from: D) -> std::result::Result<f64, D::Error> {
     Ok(Option::<f64>::deserialize(from)?.unwrap_or(f64::NAN))
 }
 
-/// What half precision of the field does to pictures of the result.
+/// Effect of half precision of the deformation field on renders of the result.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct FieldSummary {
     /// Whether the field is written in half precision.
     pub half: bool,
-    /// Pictures that were compared.
+    /// Number of compared views.
     pub pictures: usize,
-    /// Mean PSNR of pictures with the field in half precision against those with the exact field, dB.
+    /// Mean PSNR of renders with the half-precision field against those with the exact field, dB.
     #[serde(deserialize_with = "number")]
     pub rounding: f64,
-    /// Mean PSNR of pictures with the exact field against the original's, dB; none where it did not matter.
+    /// Mean PSNR of renders with the exact field against the original, dB; `None` if the decision did not need it.
     pub result: Option<f64>,
-    /// What `rounding` was to be at least, dB.
+    /// Minimum of `rounding` for which half precision is accepted, dB.
     #[serde(deserialize_with = "number")]
     pub least: f64,
 }
 
 impl FieldSummary {
-    /// Why the field is as it is.
+    /// Returns the reason for the precision of the field as text.
     pub(crate) fn why(&self) -> String {
         let FieldSummary { pictures, rounding, result, least, .. } = self;
-        let from = |psnr: f64, what: &str| format!("{} from {what}", decibels_text(psnr, 1));
-        let result = result.map_or(String::new(), |result| format!(", {}", from(result, "the original's to these")));
+        let against = |psnr: f64, what: &str| format!("{} {what}", decibels_text(psnr, 1));
+        let result = result.map_or(String::new(), |psnr| {
+            format!(", {}", against(psnr, "of the result with the exact field against the original"))
+        });
         format!(
-            "{pictures} pictures with it are {}{result}; at least {least:.1} dB were asked for",
-            from(*rounding, "those with the exact field")
+            "PSNR over {pictures} views: {}{result}; at least {least:.1} dB against the exact field required",
+            against(*rounding, "against the exact field")
         )
     }
 }
 
-/// What refining the result gained.
+/// Quality gained by refinement.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct RefinedSummary {
-    /// Pictures that were compared, apart from those that were refined toward.
+    /// Number of validation views, which are not used for fitting.
     pub pictures: usize,
-    /// Their mean PSNR against the original's before, dB.
+    /// Mean PSNR against the original before refinement, dB.
     #[serde(deserialize_with = "number")]
     pub before: f64,
-    /// And after, dB.
+    /// Mean PSNR against the original after refinement, dB.
     #[serde(deserialize_with = "number")]
     pub result: f64,
 }
@@ -179,17 +181,17 @@ pub struct QualitySummary {
     pub render_ms: Option<RenderTime>,
 }
 
-/// What pictures of the result say of its bands of spherical harmonics.
+/// Effect of lower SH degrees on renders of the result.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct BandsSummary {
     /// SH degree of the output.
     pub sh_degree: usize,
-    /// Pictures that were compared.
+    /// Number of compared views.
     pub pictures: usize,
-    /// Every lower degree, and the mean PSNR of pictures with it against those with all bands, dB.
+    /// Tried lower SH degrees, each with the mean PSNR of its renders against those with all degrees, dB.
     #[serde(deserialize_with = "sizes")]
     pub tried: Vec<(usize, f64)>,
-    /// Mean PSNR of pictures with all bands against the original's, dB.
+    /// Mean PSNR of renders with all SH degrees against the original, dB.
     #[serde(deserialize_with = "number")]
     pub result: f64,
     /// Minimum PSNR that a lower degree needed to be chosen, dB.
@@ -198,61 +200,61 @@ pub struct BandsSummary {
 }
 
 impl BandsSummary {
-    /// Why bands went, or stayed.
+    /// Returns the reason for the SH degree as text.
     pub(crate) fn why(&self) -> String {
         let BandsSummary { pictures, tried, result, least, .. } = self;
-        let of = |(degree, apart): &(usize, f64)| format!("{} at degree {degree}", decibels_text(*apart, 1));
-        let tried: Vec<String> = tried.iter().map(of).collect();
+        let line = |(degree, apart): &(usize, f64)| format!("{} at degree {degree}", decibels_text(*apart, 1));
+        let tried: Vec<String> = tried.iter().map(line).collect();
         format!(
-            "{pictures} pictures are {} from those with all bands, {} from the original's to these; at least \
-             {least:.1} dB were asked for",
+            "PSNR over {pictures} views: {} against all degrees, {} of the result with all degrees against the \
+             original; at least {least:.1} dB against all degrees required",
             tried.join(", "),
             decibels_text(*result, 1)
         )
     }
 }
 
-/// A value that is known within bounds.
+/// Range of an estimated value.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Range {
-    /// Hardly less.
+    /// Lower bound; smaller values are unlikely.
     pub least: f64,
-    /// About.
+    /// Expected value.
     pub likely: f64,
-    /// Hardly more.
+    /// Upper bound; larger values are unlikely.
     pub most: f64,
 }
 
-/// What a stage will take of all processors together.
+/// Expected processor time of a stage.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct StageForecast {
-    /// Its name.
+    /// Name of the stage.
     pub name: String,
-    /// Seconds, about.
+    /// Expected time of all processors together, seconds.
     pub core_seconds: f64,
 }
 
-/// What a run will take.
+/// Expected time and memory of a run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Forecast {
-    /// Wall-clock time.
+    /// Wall-clock time, seconds.
     pub seconds: Range,
-    /// Time of all processors together.
+    /// Time of all processors together, seconds.
     pub core_seconds: Range,
-    /// Threads at work.
+    /// Number of threads.
     pub threads: u64,
-    /// Whether some work was done to measure by.
+    /// Whether the forecast is based on a calibration on this machine.
     pub measured: bool,
-    /// Most memory.
+    /// Maximum memory, bytes.
     pub memory_bytes: u64,
-    /// Stage by stage.
+    /// Forecasts of all stages in order.
     pub stages: Vec<StageForecast>,
 }
 
-/// A term of the scores.
+/// Percentiles of a term of the score.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct TermSummary {
-    /// [`Graded::name`](crate::statistics::score::Graded::name).
+    /// Name of the term, see [`Graded::name`](crate::statistics::score::Graded::name).
     pub name: String,
     /// 1st percentile.
     #[serde(deserialize_with = "number")]
@@ -260,23 +262,23 @@ pub struct TermSummary {
     /// 99th percentile.
     #[serde(deserialize_with = "number")]
     pub p99: f64,
-    /// Whether the percentiles differ, so that the term grades rather than splits.
+    /// Whether the percentiles differ. If they are equal, the term only splits Gaussians into two groups.
     pub active: bool,
 }
 
-/// Counts of odd Gaussians.
+/// Counts of unusual Gaussians.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 pub struct FlagSummary {
-    /// NaN or infinity in some frame.
+    /// Gaussians with NaN or infinity in some frame.
     pub non_finite: usize,
-    /// Zero quaternion in some frame.
+    /// Gaussians with a zero quaternion in some frame.
     pub zero_rotation: usize,
-    /// D set to 0 as rounding noise.
+    /// Gaussians whose motion D was set to 0 as rounding noise.
     pub snapped_d: usize,
-    /// κ set to 0 as rounding noise.
+    /// Gaussians whose curvature κ was set to 0 as rounding noise.
     pub snapped_kappa: usize,
-    /// Never alive.
+    /// Gaussians that are never alive.
     pub never_alive: usize,
-    /// In no picture of the scored cameras.
+    /// Gaussians that are in no scored view.
     pub never_in_view: usize,
 }

@@ -1,22 +1,22 @@
-//! Tests 1 and 2: whether two Gaussians look alike at the reference frame.
+//! Tests 1 and 2 of merging: whether two Gaussians look alike at the reference frame.
 //!
-//! In: two rows of Gaussians. Out: yes or no. Memory: none. A NaN fails every test.
+//! Input: two rows of Gaussians. Output: pass or fail. No memory is allocated. A NaN fails every test.
 
 use glam::{DMat3, DQuat, DVec3};
 
 use crate::model::{Gaussians, SH_C0};
 use crate::recipe;
 
-/// ε in the denominator of the cosines of base colors and of steps, as in the paper (section 3.5.1).
+/// ε in the denominator of the cosines of base colors and of motion steps, as in the paper (section 3.5.1).
 pub(super) const COSINE_EPSILON: f64 = 1e-8;
-/// Share of the trace added to the diagonal of the averaged covariance, so that coplanar pancakes
-/// have a finite distance.
+/// Fraction of the trace added to the diagonal of the averaged covariance, so that coplanar flat Gaussians have a
+/// finite Mahalanobis distance.
 const REGULARIZATION: f64 = 1e-6;
-/// Below this fraction of its middle scale the smallest scale counts as flat: how flat is a matter
-/// of training noise, and no picture shows it.
-const FLAT: f64 = 0.1;
+/// Smallest scale as a fraction of the middle scale below which a Gaussian counts as flat. Thickness below this
+/// fraction is training noise that no render shows.
+const MIN_THICKNESS: f64 = 0.1;
 
-/// Tests 1 and 2 of one merge pass.
+/// Thresholds of tests 1 and 2 of one merge pass.
 #[derive(Debug, Clone, Copy)]
 pub struct Gates {
     d0: f64,
@@ -26,7 +26,7 @@ pub struct Gates {
 }
 
 impl Gates {
-    /// The thresholds of `pass` and of `merge`.
+    /// Creates the tests from the thresholds of `pass` and `merge`.
     pub fn new(merge: &recipe::MergeParams, pass: &recipe::MergePass) -> Self {
         Gates {
             d0: pass.d0,
@@ -36,21 +36,22 @@ impl Gates {
         }
     }
 
-    /// Whether `a` and `b` pass both tests; symmetric. The cheap tests come first.
+    /// Returns whether `a` and `b` pass both tests; symmetric in `a` and `b`. The cheap tests run first.
     pub fn pass(&self, a: &Appearance, b: &Appearance) -> bool {
         (a.color - b.color).length() <= self.max_color_difference
             && cosine(a.dc, b.dc) > self.rho
-            && alike_in_size(a.log_scale, b.log_scale, self.max_log_scale_ratio)
+            && are_sizes_alike(a.log_scale, b.log_scale, self.max_log_scale_ratio)
             && mahalanobis(a.position - b.position, &((a.covariance() + b.covariance()) * 0.5)) < self.d0
     }
 }
 
-/// What the tests read of a Gaussian.
+/// Values of one Gaussian that tests 1 and 2 read.
 #[derive(Debug, Clone, Copy)]
 pub struct Appearance {
     position: DVec3,
     rotation: DQuat,
-    /// Descending, the smallest no flatter than [`FLAT`] for the comparison of sizes.
+    /// Log scales, descending; the smallest is raised to at least [`MIN_THICKNESS`] times the middle scale for the
+    /// comparison of sizes.
     log_scale: [f64; 3],
     scales: DVec3,
     dc: DVec3,
@@ -58,14 +59,14 @@ pub struct Appearance {
 }
 
 impl Appearance {
-    /// Row `i` of `states`.
+    /// Reads row `i` of `states`.
     pub fn new(states: &Gaussians, i: usize) -> Self {
         let log_scale = states.log_scale.row::<3>(i).map(f64::from);
         let mut sorted = log_scale;
         sorted.sort_by(|a, b| b.total_cmp(a));
-        // Only a finite scale is lifted: minus infinity is no thickness and must fail.
+        // Only a finite scale is raised: minus infinity is not a thickness and must fail.
         if sorted[2].is_finite() {
-            sorted[2] = sorted[2].max(sorted[1] + FLAT.ln());
+            sorted[2] = sorted[2].max(sorted[1] + MIN_THICKNESS.ln());
         }
         let dc = DVec3::from(states.sh.row::<3>(i).map(f64::from));
         Appearance {
@@ -84,28 +85,29 @@ impl Appearance {
     }
 }
 
-/// The unit quaternion of a stored wxyz row; the identity where it is zero or not finite.
+/// Returns the unit quaternion of a stored wxyz row; the identity if the row has length zero or is not finite.
 pub(super) fn unit_rotation([w, x, y, z]: [f32; 4]) -> DQuat {
     let rotation = DQuat::from_xyzw(x.into(), y.into(), z.into(), w.into());
     let length = rotation.length();
     if length > 0.0 && length.is_finite() { rotation / length } else { DQuat::IDENTITY }
 }
 
-/// Whether corresponding scales (largest and largest, middle and middle, smallest and smallest)
-/// differ by at most a factor exp(`max_log_ratio`). A giant beside detail fails whatever its shape.
-/// Equal infinities differ by NaN and fail.
-fn alike_in_size(a: [f64; 3], b: [f64; 3], max_log_ratio: f64) -> bool {
+/// Returns whether corresponding scales (largest and largest, middle and middle, smallest and smallest) differ by at
+/// most a factor exp(`max_log_ratio`). A very large Gaussian next to fine detail fails whatever its shape. Equal
+/// infinities differ by NaN and fail.
+fn are_sizes_alike(a: [f64; 3], b: [f64; 3], max_log_ratio: f64) -> bool {
     (0..3).all(|c| (a[c] - b[c]).abs() <= max_log_ratio)
 }
 
-/// (a·b)/(‖a‖‖b‖ + ε), in [−1, 1]; 1 for equal vectors of any length, so that duplicates of exactly
-/// medium gray, whose coefficients are zero, are alike.
+/// Returns (a·b)/(‖a‖‖b‖ + ε), in [−1, 1]. Equal vectors of any length give 1, so that duplicates of exactly medium
+/// gray, whose coefficients are zero, count as alike.
 fn cosine(a: DVec3, b: DVec3) -> f64 {
     if a == b { 1.0 } else { a.dot(b) / (a.length() * b.length() + COSINE_EPSILON) }
 }
 
-/// √(Δᵀ (Σ + 1e-6 tr Σ)⁻¹ Δ) for a positive semidefinite Σ, by Cholesky in f64 of Σ over its trace,
-/// so that neither 1e-12 nor 1e6 squared leaves the range. Σ = 0: 0 for Δ = 0, else infinite.
+/// Returns √(Δᵀ (Σ + 1e-6 tr Σ)⁻¹ Δ) for a positive semidefinite Σ. Uses a Cholesky factorization in f64 of Σ divided
+/// by its trace, so that the squares of scales between 1e-12 and 1e6 stay in range. Σ = 0 gives 0 for Δ = 0, else
+/// infinity.
 fn mahalanobis(delta: DVec3, sigma: &DMat3) -> f64 {
     let trace = sigma.x_axis.x + sigma.y_axis.y + sigma.z_axis.z;
     if trace == 0.0 {
@@ -137,7 +139,7 @@ mod tests {
         Gates::new(&merge, &merge.passes[0])
     }
 
-    fn two(edit: impl Fn(&mut Gaussians)) -> [Appearance; 2] {
+    fn pair_from(edit: impl Fn(&mut Gaussians)) -> [Appearance; 2] {
         let mut states = Gaussians::zeros(2, 0);
         for i in 0..2 {
             states.rotation.set_row(i, [1.0, 0.0, 0.0, 0.0]);
@@ -148,21 +150,21 @@ mod tests {
     }
 
     fn passes(edit: impl Fn(&mut Gaussians)) -> bool {
-        let [a, b] = two(edit);
+        let [a, b] = pair_from(edit);
         assert_eq!(default_gates().pass(&a, &b), default_gates().pass(&b, &a));
         default_gates().pass(&a, &b)
     }
 
     #[test]
-    fn black_beside_gray_of_the_same_direction_is_not_merged() {
+    fn black_and_gray_are_not_merged() {
         let edit = |states: &mut Gaussians| {
             states.sh.set_row(0, [-1.7; 3]);
             states.sh.set_row(1, [-0.2; 3]);
         };
-        let [black, gray] = two(edit);
+        let [black, gray] = pair_from(edit);
         assert!(cosine(black.dc, gray.dc) > 0.99);
         assert!(!passes(edit));
-        // Below black there is only black: the renderer clamps.
+        // Values below black are clamped to black by the renderer.
         assert!(passes(|states| {
             states.sh.set_row(0, [-1.8; 3]);
             states.sh.set_row(1, [-9.0; 3]);
@@ -180,15 +182,15 @@ mod tests {
     }
 
     #[test]
-    fn a_giant_does_not_swallow_detail() {
+    fn large_and_small_gaussians_are_not_merged() {
         assert!(!passes(|states| states.log_scale.set_row(0, [6.0; 3])));
         assert!(!passes(|states| states.log_scale.set_row(0, [2.0, 0.0, 0.0])));
         assert!(!passes(|states| states.log_scale.set_row(0, [0.0, -2.0, -2.0])));
-        assert!(!passes(|states| states.log_scale.set_row(0, [0.0, 0.0, -8.0])), "a ball beside a pancake");
+        assert!(!passes(|states| states.log_scale.set_row(0, [0.0, 0.0, -8.0])), "a sphere and a flat Gaussian");
     }
 
     #[test]
-    fn pancakes_of_different_thickness_are_alike() {
+    fn flat_gaussians_of_different_thickness_pass() {
         assert!(passes(|states| {
             states.log_scale.set_row(0, [0.0, -20.0, 0.1]);
             states.log_scale.set_row(1, [0.0, -8.0, 0.0]);
@@ -196,11 +198,11 @@ mod tests {
     }
 
     #[test]
-    fn nothing_that_is_not_finite_passes() {
+    fn non_finite_values_never_pass() {
         let bad = [f32::NAN, f32::INFINITY, f32::NEG_INFINITY];
         for value in bad {
             assert!(!passes(|states| states.position.set_row(0, [value, 0.0, 0.0])), "position {value}");
-            assert!(!passes(|states| states.sh.set_row(0, [value, 0.0, 0.0])), "colour {value}");
+            assert!(!passes(|states| states.sh.set_row(0, [value, 0.0, 0.0])), "color {value}");
             assert!(
                 !passes(|states| (0..2).for_each(|i| states.log_scale.set_row(i, [0.0, value, 0.0]))),
                 "scale {value}"
@@ -220,7 +222,7 @@ mod tests {
             let trace = sigma.x_axis.x + sigma.y_axis.y + sigma.z_axis.z;
             let regular = sigma + DMat3::from_diagonal(DVec3::splat(REGULARIZATION * trace));
             let delta = DVec3::from(delta);
-            // Inverting by cofactors loses about cond(Σ) ≤ 1e6 ulp. Σ is divided by its trace first, because its
+            // Inversion by cofactors loses about cond(Σ) ≤ 1e6 ulp. Σ is divided by its trace first because its
             // determinant may overflow.
             let expected = (delta.dot((regular * trace.recip()).inverse() * delta) / trace).sqrt();
             let got = mahalanobis(delta, &sigma);

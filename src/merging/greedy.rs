@@ -1,41 +1,41 @@
-//! Which Gaussians join which leader: the sequential greedy rule, computed in parallel.
+//! Assignment of Gaussians to leaders: the sequential greedy rule, computed in parallel.
 //!
-//! The rule: in order of rank, a node that no leader took leads and takes every node that it passes
-//! with and that no leader took. A pair is tested against the leader only, so the leaders are the
-//! lexicographically first independent set, and whoever does not lead joins its earliest leader.
-//! That much is decided locally (Blelloch, Fineman and Shun, "Greedy sequential maximal independent
-//! set and matching are parallel on average", 2012): in synchronous rounds a node reads only what
-//! earlier rounds decided, so threads cannot change the outcome.
+//! The rule: visit the nodes in order of rank. A node without a leader becomes a leader and takes every node without a
+//! leader that passes all tests with it. A pair is tested against the leader only, so the leaders are the
+//! lexicographically first independent set, and every other node joins its earliest leader. This set can be computed
+//! locally (Blelloch, Fineman and Shun, "Greedy sequential maximal independent set and matching are parallel on
+//! average", 2012): in synchronous rounds a node reads only the decisions of earlier rounds, so the thread count cannot
+//! change the result.
 //!
-//! In: ranks and directed pairs. Out: a leader for every node. Memory: 24 bytes per node beside the
-//! input; the pairs are sorted where they lie.
+//! Input: ranks and directed pairs. Output: a leader for every node. Memory: 24 bytes per node beside the input; the
+//! pairs are sorted in place.
 
 use rayon::prelude::*;
 
-/// Rounds before the rest is done sequentially: 5 to 8 suffice for scenes, a chain sorted along a
-/// line would need one for every second node.
+/// Number of parallel rounds before the remaining nodes are decided sequentially. Scenes need 5 to 8; a chain sorted
+/// along a line would need one round for every second node.
 const MAX_ROUNDS: usize = 32;
-/// Below this many undecided nodes another round costs more than finishing in order.
+/// Number of undecided nodes below which another round costs more than deciding them sequentially.
 const FEW: usize = 64;
 
-/// Who leads whom.
+/// Leader of every node, and counts of the work.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Clustering {
-    /// Leader of every node; a node that joined nobody is its own.
+    /// Leader of every node; a node that joined no other is its own leader.
     pub leader_of: Vec<u32>,
-    /// Nodes that joined another.
+    /// Number of nodes that joined another.
     pub joins: usize,
-    /// Parallel rounds it took.
+    /// Number of parallel rounds.
     pub rounds: usize,
-    /// Whether nodes were left over after the last round and decided in sequence.
+    /// Whether nodes were left undecided after the last round and were decided sequentially.
     pub sequential: bool,
 }
 
-/// The rank of every node: descending size, then ascending hash, then index; a permutation of 0..N.
+/// Returns the rank of every node: by descending size, then ascending hash, then index; a permutation of 0..N.
 ///
 /// A size that is NaN counts as the smallest; −0 equals 0.
 pub fn ranks(size: &[f64], hash: &[u64]) -> Vec<u32> {
-    // + 0.0 turns -0 into 0.
+    // Adding 0.0 turns −0 into 0.
     let key = |i: u32| if size[i as usize].is_nan() { f64::NEG_INFINITY } else { size[i as usize] + 0.0 };
     let mut order: Vec<u32> = (0..size.len() as u32).collect();
     order.par_sort_unstable_by(|&a, &b| {
@@ -48,14 +48,14 @@ pub fn ranks(size: &[f64], hash: &[u64]) -> Vec<u32> {
     rank
 }
 
-/// What is known of a node. A member is stored as the index of its leader.
+/// Marker of a node without a decision in `leader_of`. A decided member holds the index of its leader.
 const UNDECIDED: u32 = u32::MAX;
 
-/// Clusters the nodes with these `rank`s (a permutation of 0..N) along `pairs` (leader, member),
-/// rank(leader) < rank(member), in any order; the outcome is that of the sequential rule.
+/// Clusters the nodes with these `rank`s (a permutation of 0..N) along `pairs` (leader, member), rank(leader) <
+/// rank(member), in any order. The result is that of the sequential rule.
 ///
-/// With `limit`, merging stops after exactly that many joins in sequential order: by the leader's
-/// rank, then by the member's. Members cut off stay alone.
+/// With `limit`, merging stops after exactly that many joins in sequential order: by the leader's rank, then by the
+/// member's. Members beyond the limit stay single.
 pub fn cluster(rank: &[u32], pairs: Vec<(u32, u32)>, limit: Option<usize>) -> Clustering {
     let predecessors = Predecessors::new(rank, pairs);
     let mut leader_of = vec![UNDECIDED; rank.len()];
@@ -75,17 +75,17 @@ pub fn cluster(rank: &[u32], pairs: Vec<(u32, u32)>, limit: Option<usize>) -> Cl
     let sequential = undecided.len() > FEW;
     undecided.sort_unstable_by_key(|&node| rank[node as usize]);
     for node in undecided {
-        // Every predecessor is decided by now, so there always is a decision.
+        // Every predecessor is decided by now, so `decide` always returns a leader.
         leader_of[node as usize] = predecessors.decide(node, &leader_of).unwrap_or(node);
     }
     let joins = truncate(rank, &mut leader_of, limit);
     Clustering { leader_of, joins, rounds, sequential }
 }
 
-/// The leaders that could take a node, for every node, by rank.
+/// For every node the leaders that could take it, by rank.
 struct Predecessors {
     start: Vec<usize>,
-    /// (leader, member), by member.
+    /// Pairs (leader, member), sorted by member, then by the leader's rank.
     pairs: Vec<(u32, u32)>,
 }
 
@@ -102,11 +102,11 @@ impl Predecessors {
         Predecessors { start, pairs }
     }
 
-    /// The leader of `node` (itself if it leads) as far as `leader_of` tells; none while an earlier
+    /// Returns the leader of `node` (itself if it leads) as far as `leader_of` determines it; `None` while an earlier
     /// predecessor that might take it is undecided.
     fn decide(&self, node: u32, leader_of: &[u32]) -> Option<u32> {
-        let of_node = &self.pairs[self.start[node as usize]..self.start[node as usize + 1]];
-        for &(predecessor, _) in of_node {
+        let candidates = &self.pairs[self.start[node as usize]..self.start[node as usize + 1]];
+        for &(predecessor, _) in candidates {
             match leader_of[predecessor as usize] {
                 UNDECIDED => return None,
                 leader if leader == predecessor => return Some(leader),
@@ -136,8 +136,8 @@ mod tests {
 
     use super::*;
 
-    /// The rule as it reads: nodes in order, each unmerged one takes what it can.
-    fn one_by_one(rank: &[u32], pairs: &[(u32, u32)], limit: Option<usize>) -> (Vec<u32>, usize) {
+    /// Applies the rule literally: visits nodes in order, and each free node takes every free node that it can.
+    fn sequential_oracle(rank: &[u32], pairs: &[(u32, u32)], limit: Option<usize>) -> (Vec<u32>, usize) {
         let n = rank.len();
         let mut order: Vec<u32> = (0..n as u32).collect();
         order.sort_by_key(|&node| rank[node as usize]);
@@ -151,7 +151,7 @@ mod tests {
             for &member in &order {
                 let free = leader_of[member as usize].is_none();
                 if free && pairs.contains(&(leader, member)) {
-                    // A join beyond the limit is not made, yet nobody else may have the member.
+                    // A join beyond the limit is not made, but no other leader may take the member either.
                     leader_of[member as usize] =
                         Some(if limit.is_none_or(|limit| joins < limit) { leader } else { member });
                     joins += usize::from(leader_of[member as usize] == Some(leader));
@@ -161,7 +161,7 @@ mod tests {
         (leader_of.into_iter().map(|leader| leader.expect("all visited")).collect(), joins)
     }
 
-    fn graph() -> impl Strategy<Value = (Vec<u32>, Vec<(u32, u32)>)> {
+    fn any_graph() -> impl Strategy<Value = (Vec<u32>, Vec<(u32, u32)>)> {
         (1usize..200, 0usize..600).prop_flat_map(|(n, edges)| {
             let ranks = Just((0..n as u32).collect::<Vec<_>>()).prop_shuffle();
             (ranks, prop::collection::vec((0..n as u32, 0..n as u32), edges)).prop_map(|(rank, edges)| {
@@ -176,21 +176,21 @@ mod tests {
         })
     }
 
-    fn assert_sequential(rank: &[u32], pairs: &[(u32, u32)], limit: Option<usize>) -> Clustering {
+    fn assert_equals_oracle(rank: &[u32], pairs: &[(u32, u32)], limit: Option<usize>) -> Clustering {
         let got = cluster(rank, pairs.to_vec(), limit);
-        let (leader_of, joins) = one_by_one(rank, pairs, limit);
+        let (leader_of, joins) = sequential_oracle(rank, pairs, limit);
         assert_eq!((&got.leader_of, got.joins), (&leader_of, joins), "limit {limit:?}");
         got
     }
 
     proptest! {
         #[test]
-        fn rounds_equal_the_sequential_rule_on_any_graph((rank, pairs) in graph(), limit in prop::option::of(0usize..150)) {
-            assert_sequential(&rank, &pairs, limit);
+        fn rounds_equal_the_sequential_rule((rank, pairs) in any_graph(), limit in prop::option::of(0usize..150)) {
+            assert_equals_oracle(&rank, &pairs, limit);
         }
 
         #[test]
-        fn the_order_of_pairs_does_not_matter((rank, pairs) in graph()) {
+        fn order_of_pairs_does_not_matter((rank, pairs) in any_graph()) {
             let mut reversed = pairs.clone();
             reversed.reverse();
             prop_assert_eq!(cluster(&rank, pairs, None), cluster(&rank, reversed, None));
@@ -198,31 +198,31 @@ mod tests {
     }
 
     #[test]
-    fn a_chain_sorted_along_a_line_falls_back_and_equals_the_sequential_result() {
+    fn a_long_chain_is_finished_sequentially_with_equal_result() {
         let n = 1000;
         let rank: Vec<u32> = (0..n).collect();
         let pairs: Vec<(u32, u32)> = (1..n).map(|i| (i - 1, i)).collect();
-        let got = assert_sequential(&rank, &pairs, None);
+        let got = assert_equals_oracle(&rank, &pairs, None);
         assert!(got.sequential, "a chain of {n} was decided in {} rounds", got.rounds);
         assert_eq!((got.rounds, got.joins), (MAX_ROUNDS, 500));
         let backwards: Vec<u32> = (0..n).rev().collect();
         let pairs: Vec<(u32, u32)> = (1..n).map(|i| (i, i - 1)).collect();
-        assert!(assert_sequential(&backwards, &pairs, None).sequential);
+        assert!(assert_equals_oracle(&backwards, &pairs, None).sequential);
     }
 
     #[test]
-    fn a_star_is_taken_whole_and_a_crowd_of_duplicates_has_one_leader() {
+    fn stars_and_complete_graphs_get_one_leader() {
         let n = 300;
         let rank: Vec<u32> = (0..n).collect();
         let star: Vec<(u32, u32)> = (1..n).map(|i| (0, i)).collect();
-        assert_eq!(assert_sequential(&rank, &star, None).leader_of, vec![0; n as usize]);
-        let crowd: Vec<(u32, u32)> = (0..n).flat_map(|i| (i + 1..n).map(move |j| (i, j))).collect();
-        let got = cluster(&rank, crowd, None);
+        assert_eq!(assert_equals_oracle(&rank, &star, None).leader_of, vec![0; n as usize]);
+        let complete: Vec<(u32, u32)> = (0..n).flat_map(|i| (i + 1..n).map(move |j| (i, j))).collect();
+        let got = cluster(&rank, complete, None);
         assert_eq!((got.leader_of, got.sequential), (vec![0; n as usize], false));
     }
 
     #[test]
-    fn a_member_does_not_lead_and_the_earliest_leader_wins() {
+    fn members_never_lead_and_the_earliest_leader_wins() {
         // 0 takes 1; 1 could take 2 but was taken; 3 passes with 2 only, so 2 leads it.
         let got = cluster(&[0, 1, 2, 3], vec![(0, 1), (1, 2), (2, 3)], None);
         assert_eq!(got.leader_of, [0, 0, 2, 2]);
@@ -235,7 +235,7 @@ mod tests {
         let rank: Vec<u32> = (0..100).collect();
         let star: Vec<(u32, u32)> = (1..100).map(|i| (0, i)).collect();
         for limit in [0, 1, 57, 99, 100] {
-            let got = assert_sequential(&rank, &star, Some(limit));
+            let got = assert_equals_oracle(&rank, &star, Some(limit));
             assert_eq!(got.joins, limit.min(99));
         }
     }

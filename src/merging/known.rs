@@ -1,50 +1,51 @@
-//! What is known of how pairs move: a pair is measured once, however often passes and trials ask.
+//! Cache of the motion similarities of pairs. A pair is measured once, however often passes and trials request it.
 //!
 //! Memory: [`KNOWN_BYTES`] per pair.
 
-/// Memory of one pair whose likeness is known.
+/// Memory of one pair with known similarity, in bytes.
 pub const KNOWN_BYTES: usize = size_of::<Likeness>();
 
-/// Two rows, the smaller first, and how alike they move ([`super::motion::MotionGate::likeness`]).
+/// Two rows, the smaller first, and their motion similarity ([`super::motion::MotionGate::likeness`]).
 pub type Likeness = (u32, u32, f64);
 
-/// The likeness of pairs of rows, by pair.
+/// Motion similarities of pairs of rows, sorted by pair.
 #[derive(Debug, Default)]
 pub struct KnownPairs(Vec<Likeness>);
 
 impl KnownPairs {
-    /// Those of `pairs` that are not known yet, the smaller row first, increasing, none twice.
+    /// Returns the pairs of `pairs` whose similarity is not known yet: the smaller row first, increasing, without
+    /// duplicates.
     pub fn missing(&self, pairs: impl ExactSizeIterator<Item = (u32, u32)>) -> Vec<(u32, u32)> {
         let mut missing = Vec::with_capacity(pairs.len());
-        missing.extend(pairs.map(|(a, b)| (a.min(b), a.max(b))).filter(|&pair| self.place(pair).is_err()));
+        missing.extend(pairs.map(|(a, b)| (a.min(b), a.max(b))).filter(|&pair| self.position(pair).is_err()));
         missing.sort_unstable();
         missing.dedup();
         missing
     }
 
-    /// Pairs that were found, in any order, none twice.
+    /// Creates the cache from measured pairs, in any order, without duplicates.
     pub fn new(mut found: Vec<Likeness>) -> Self {
         found.sort_unstable_by_key(|&(a, b, _)| (a, b));
         KnownPairs(found)
     }
 
-    /// Adds pairs that were missing, unless more than `most` would be known then.
-    pub fn add(&mut self, mut found: KnownPairs, most: usize) {
+    /// Adds measured pairs that were missing, unless the cache would then hold more than `max_pairs` pairs.
+    pub fn add(&mut self, mut found: KnownPairs, max_pairs: usize) {
         if self.0.is_empty() {
             *self = found;
-        } else if self.0.len() + found.0.len() <= most {
+        } else if self.0.len() + found.0.len() <= max_pairs {
             self.0.reserve_exact(found.0.len());
             self.0.append(&mut found.0);
             self.0.sort_unstable_by_key(|&(a, b, _)| (a, b));
         }
     }
 
-    /// How alike a pair moves, in either order, if that is known.
+    /// Returns the motion similarity of a pair, given in either order, if it is known.
     pub fn likeness(&self, (a, b): (u32, u32)) -> Option<f64> {
-        self.place((a.min(b), a.max(b))).ok().map(|place| self.0[place].2)
+        self.position((a.min(b), a.max(b))).ok().map(|position| self.0[position].2)
     }
 
-    fn place(&self, pair: (u32, u32)) -> Result<usize, usize> {
+    fn position(&self, pair: (u32, u32)) -> Result<usize, usize> {
         self.0.binary_search_by_key(&pair, |&(a, b, _)| (a, b))
     }
 }
@@ -56,20 +57,20 @@ mod tests {
     #[test]
     fn a_pair_is_missing_once_and_known_in_either_order() {
         let mut known = KnownPairs::default();
-        let asked = [(7, 2), (2, 7), (1, 2), (7, 2)];
-        assert_eq!(known.missing(asked.into_iter()), [(1, 2), (2, 7)]);
+        let requested = [(7, 2), (2, 7), (1, 2), (7, 2)];
+        assert_eq!(known.missing(requested.into_iter()), [(1, 2), (2, 7)]);
         known.add(KnownPairs::new(vec![(2, 7, 0.5), (1, 2, f64::NAN)]), 3);
         assert_eq!(known.missing([(7, 2), (9, 1)].into_iter()), [(1, 9)]);
         known.add(KnownPairs::new(vec![(1, 9, -1.0)]), 3);
         assert_eq!([(7, 2), (2, 7), (9, 1)].map(|pair| known.likeness(pair)), [0.5, 0.5, -1.0].map(Some));
         assert!(known.likeness((2, 1)).unwrap().is_nan() && known.likeness((4, 5)).is_none());
-        assert!(known.missing(asked.into_iter()).is_empty());
+        assert!(known.missing(requested.into_iter()).is_empty());
         known.add(KnownPairs::new(vec![(4, 5, 1.0)]), 3);
         assert!(known.likeness((4, 5)).is_none(), "a fourth pair is known");
     }
 
     #[test]
-    fn a_known_pair_takes_no_more_than_is_stated() {
+    fn known_pairs_stay_within_the_stated_memory() {
         let mut known = KnownPairs::default();
         known.add(KnownPairs::new((0..1000).map(|i| (i, i + 1, 0.0)).collect()), 1777);
         known.add(KnownPairs::new((0..777).map(|i| (i, i + 2, 0.0)).collect()), 1777);

@@ -1,9 +1,9 @@
-//! A sequence of explicit trajectories with its clusters merged, frame by frame as it is read.
+//! A sequence with explicit frames whose clusters are merged frame by frame while it is read.
 //!
-//! At every frame a proxy is the moment match of its members at that frame, with the weights of the
-//! reference frame: Σ w_i x_i(t) is its path. Nothing is stored; memory is that of the members read. Members lie
-//! anywhere in the source: whoever reads many Gaussians reads them together ([`MergedSequence::together`]), so that
-//! what is decoded for one serves all.
+//! At every frame a proxy is the moment match of its members at that frame, with the weights of the reference frame;
+//! its trajectory is Σ w_i x_i(t). Nothing is stored; the memory is that of the members being read. The members of a
+//! proxy may lie anywhere in the source. A caller that reads many Gaussians reads them together
+//! ([`MergedSequence::together`]), so that blocks decoded for one Gaussian serve all of them.
 
 use std::ops::Range;
 
@@ -16,45 +16,47 @@ use crate::passes::FrameReaders;
 use crate::recipe::{MergeParams, Placement};
 use crate::source::{BlockReader, FrameSource, Ids, ReadPlan, Reads};
 
-/// Columns that follow from one another: moments mix position, rotation and scale, and opacity follows from areas.
+/// Attributes that depend on each other in a proxy: moments mix position, rotation and scale, and opacity depends on
+/// areas.
 const MIXED: Columns = Columns::all().difference(Columns::SH);
 
-/// Proxies made at a time.
+/// Number of proxies computed in one batch.
 const BATCH: usize = 4096;
 
-/// What is kept of a source.
+/// Survivors of a source, with clusters replaced by proxies.
 pub struct MergedSequence<'a> {
     source: &'a dyn FrameSource,
     info: SequenceInfo,
-    /// Ids of the source, one per Gaussian of this sequence; a proxy has its leader's.
-    kept: &'a [u32],
-    /// Members (id, weight) of each Gaussian that is a proxy; empty for the others.
+    /// Ids in the source, one per Gaussian of this sequence; a proxy has its leader's id.
+    survivors: &'a [u32],
+    /// Members (id, weight) of each Gaussian that is a proxy; empty for other Gaussians.
     members: Vec<&'a [(u32, f64)]>,
     merge: MergeParams,
 }
 
 impl<'a> MergedSequence<'a> {
-    /// The Gaussians `kept` of `source`, those at `clusters` (place in `kept`, members by id) replaced
-    /// by proxies. A path that is known needs no leader to follow, so proxies go to the mean.
+    /// Creates the sequence of the Gaussians `survivors` of `source`, with the Gaussians at `clusters` (index into
+    /// `survivors`, members by id) replaced by proxies. Proxies are placed at the mean of their members: with a known
+    /// trajectory they need not follow their leader.
     pub fn new(
         source: &'a dyn FrameSource,
-        kept: &'a [u32],
+        survivors: &'a [u32],
         clusters: impl Iterator<Item = (u32, &'a [(u32, f64)])>,
         merge: &MergeParams,
     ) -> Self {
-        let mut members: Vec<&[(u32, f64)]> = vec![&[]; kept.len()];
-        for (place, of_cluster) in clusters {
-            members[place as usize] = of_cluster;
+        let mut members: Vec<&[(u32, f64)]> = vec![&[]; survivors.len()];
+        for (place, cluster_members) in clusters {
+            members[place as usize] = cluster_members;
         }
         let mut varying = source.info().varying;
         if !(varying & MIXED).is_empty() && members.iter().any(|members| !members.is_empty()) {
             varying |= MIXED;
         }
-        let info = SequenceInfo { count: kept.len(), varying, ..source.info().clone() };
+        let info = SequenceInfo { count: survivors.len(), varying, ..source.info().clone() };
         MergedSequence {
             source,
             info,
-            kept,
+            survivors,
             members,
             merge: MergeParams { placement: Placement::Mean, ..merge.clone() },
         }
@@ -62,17 +64,17 @@ impl<'a> MergedSequence<'a> {
 }
 
 impl MergedSequence<'_> {
-    /// A reader of the Gaussians `places` at the frames `wanted` that reads what they are made of together, on all
+    /// Opens a reader of the Gaussians `places` at the frames `wanted` that reads all their members together, on all
     /// threads.
     ///
-    /// Memory per Gaussian needed, members included: its reader, its state at one frame, and 24 bytes.
+    /// Memory per Gaussian to be read, members included: its reader, its state at one frame, and 24 bytes.
     pub fn together(&self, places: Range<usize>, wanted: &ReadPlan) -> Result<Box<dyn BlockReader + '_>> {
-        let merging = MergedMembers::new(self, places);
-        let frames = FrameReaders::open(self.source, Ids::List(&merging.ids), Columns::all(), wanted)?;
-        Ok(Box::new(MergedReader::new(self, Box::new(frames), merging)))
+        let inputs = MergedMembers::new(self, places);
+        let frames = FrameReaders::open(self.source, Ids::List(&inputs.ids), Columns::all(), wanted)?;
+        Ok(Box::new(MergedSequenceReader::new(self, Box::new(frames), inputs)))
     }
 
-    /// How many Gaussians of the source that at `place` is made of.
+    /// Returns the number of source Gaussians from which the Gaussian at `place` is made; 1 if it is not a proxy.
     pub fn members(&self, place: usize) -> usize {
         self.members[place].len().max(1)
     }
@@ -84,13 +86,13 @@ impl FrameSource for MergedSequence<'_> {
     }
 
     fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>> {
-        let merging = MergedMembers::new(self, ids.iter());
-        let reader = self.source.open(Ids::List(&merging.ids))?;
-        Ok(Box::new(MergedReader::new(self, reader, merging)))
+        let inputs = MergedMembers::new(self, ids.iter());
+        let reader = self.source.open(Ids::List(&inputs.ids))?;
+        Ok(Box::new(MergedSequenceReader::new(self, reader, inputs)))
     }
 
     fn open_all(&self, wanted: &ReadPlan) -> Option<Result<Box<dyn BlockReader + '_>>> {
-        Some(self.together(0..self.kept.len(), wanted))
+        Some(self.together(0..self.survivors.len(), wanted))
     }
 
     fn reads(&self) -> Reads {
@@ -98,11 +100,11 @@ impl FrameSource for MergedSequence<'_> {
     }
 }
 
-/// What some Gaussians are made of.
+/// Source Gaussians needed for a selection of Gaussians of the sequence.
 struct MergedMembers {
-    /// Everybody needed, by id in the source.
+    /// Ids in the source of all Gaussians to be read, increasing.
     ids: Vec<u32>,
-    /// For every Gaussian the row of its own id in `ids`.
+    /// Row in `ids` of the own id of every selected Gaussian.
     rows: Vec<u32>,
     proxies: Vec<Proxy>,
     /// Row in `ids` and weight of the members of all proxies.
@@ -110,7 +112,7 @@ struct MergedMembers {
 }
 
 struct Proxy {
-    /// Which of the Gaussians it is.
+    /// Index of the proxy among the selected Gaussians.
     row: usize,
     members: Range<usize>,
 }
@@ -118,27 +120,27 @@ struct Proxy {
 impl MergedMembers {
     fn new(sequence: &MergedSequence<'_>, places: impl IntoIterator<Item = usize>) -> MergedMembers {
         let places: Vec<usize> = places.into_iter().collect();
-        let mut ids: Vec<u32> = places.iter().map(|&place| sequence.kept[place]).collect();
+        let mut ids: Vec<u32> = places.iter().map(|&place| sequence.survivors[place]).collect();
         ids.extend(places.iter().flat_map(|&place| sequence.members[place].iter().map(|&(id, _)| id)));
         ids.sort_unstable();
         ids.dedup();
-        let row_of = |id: u32| ids.binary_search(&id).unwrap_or_default() as u32;
-        let rows = places.iter().map(|&place| row_of(sequence.kept[place])).collect();
+        let find_row = |id: u32| ids.binary_search(&id).unwrap_or_default() as u32;
+        let rows = places.iter().map(|&place| find_row(sequence.survivors[place])).collect();
         let (mut proxies, mut members) = (Vec::new(), Vec::new());
         for (row, &place) in places.iter().enumerate().filter(|&(_, &place)| !sequence.members[place].is_empty()) {
             let first = members.len();
-            members.extend(sequence.members[place].iter().map(|&(id, weight)| (row_of(id), weight)));
+            members.extend(sequence.members[place].iter().map(|&(id, weight)| (find_row(id), weight)));
             proxies.push(Proxy { row, members: first..members.len() });
         }
         MergedMembers { ids, rows, proxies, members }
     }
 
-    /// Columns of the members that `want` takes.
+    /// Returns the attributes of the members that must be read to compute the attributes `want`.
     fn needed(&self, want: Columns) -> Columns {
         if self.proxies.is_empty() || want.is_empty() { want } else { want | MIXED }
     }
 
-    /// Writes the columns `want` of the Gaussians, made of `state`, to `out`.
+    /// Writes the attributes `want` of the selected Gaussians, computed from the source states `state`, to `out`.
     fn write(&self, state: &Gaussians, want: Columns, merge: &MergeParams, out: &mut Gaussians) {
         for column in want.iter() {
             let (from, to) = (state.column(column), out.column_mut(column));
@@ -163,28 +165,28 @@ impl MergedMembers {
     }
 }
 
-struct MergedReader<'a> {
+struct MergedSequenceReader<'a> {
     sequence: &'a MergedSequence<'a>,
     reader: Box<dyn BlockReader + 'a>,
     state: Gaussians,
-    /// What `state` holds of columns that are the same at every frame.
-    known: Columns,
-    merging: MergedMembers,
+    /// Attributes in `state` that do not vary and were already read.
+    constant_read: Columns,
+    inputs: MergedMembers,
 }
 
-impl<'a> MergedReader<'a> {
-    fn new(sequence: &'a MergedSequence<'a>, reader: Box<dyn BlockReader + 'a>, merging: MergedMembers) -> Self {
-        let state = Gaussians::zeros(merging.ids.len(), sequence.info.sh_degree);
-        MergedReader { sequence, reader, state, known: Columns::empty(), merging }
+impl<'a> MergedSequenceReader<'a> {
+    fn new(sequence: &'a MergedSequence<'a>, reader: Box<dyn BlockReader + 'a>, inputs: MergedMembers) -> Self {
+        let state = Gaussians::zeros(inputs.ids.len(), sequence.info.sh_degree);
+        MergedSequenceReader { sequence, reader, state, constant_read: Columns::empty(), inputs }
     }
 }
 
-impl BlockReader for MergedReader<'_> {
+impl BlockReader for MergedSequenceReader<'_> {
     fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
-        let needed = self.merging.needed(want);
-        self.reader.read(frame, needed.difference(self.known), &mut self.state)?;
-        self.known |= needed.difference(self.sequence.source.info().varying);
-        self.merging.write(&self.state, want, &self.sequence.merge, out);
+        let needed = self.inputs.needed(want);
+        self.reader.read(frame, needed.difference(self.constant_read), &mut self.state)?;
+        self.constant_read |= needed.difference(self.sequence.source.info().varying);
+        self.inputs.write(&self.state, want, &self.sequence.merge, out);
         Ok(())
     }
 

@@ -5,14 +5,14 @@
 //!                                                          frames ──▲
 //! ```
 //!
-//! In: the survivors' states at the reference frame, and whoever can measure the motion of pairs. Out:
-//! groups of survivors and one state per group of several.
+//! Input: the states of the survivors at the reference frame, and a callback that measures the motion of pairs. Output:
+//! groups of survivors, and the state of one proxy per group of more than one member.
 //!
-//! Memory, all of it resident at once at the worst: per survivor its state, which the caller holds, the states of
-//! proxies, of which there are half as many at most, before a pass and after it, and [`BYTES_PER_SURVIVOR`]; per
-//! candidate pair of those that are measured together [`BYTES_PER_PAIR`], and per pair that passed all tests
-//! [`BYTES_PER_PASSING`]. Pairs are at most `max_neighbors` per survivor, 3.5 measured among evenly strewn Gaussians.
-//! Whoever measures motion needs more.
+//! Peak memory: per survivor its state, held by the caller; the proxy states before and after a pass (each at most half
+//! as many as survivors); and [`BYTES_PER_SURVIVOR`]. In addition [`BYTES_PER_PAIR`] per candidate pair measured
+//! together and [`BYTES_PER_PASSING`] per pair that passed all tests. There are at most `max_neighbors` pairs per
+//! survivor; 3.5 were measured for evenly distributed Gaussians. The callback that measures motion needs memory of its
+//! own.
 
 pub mod gates;
 pub mod greedy;
@@ -41,92 +41,99 @@ use neighbors::{NeighborSearch, PointIndex};
 use proxy::Importance;
 use tree::TreePoint;
 
-/// Memory per survivor beside its state while a pass is made: groups 12 before and 12 after, place of the state 4,
-/// rank 4, and the largest of the neighbor index, 46, who coincides with whom, 24, and the clustering, 24.
+/// Memory per survivor beside its state during a pass, in bytes: groups 12 before and 12 after, state row 4, rank 4,
+/// and the largest of neighbor index (46), coincident nodes (24) and clustering (24).
 pub const BYTES_PER_SURVIVOR: usize = 12 + 12 + 4 + 4 + 46;
 
-/// Memory per candidate pair of those handed on together, beside what measuring takes: the pair, the same pair as one
-/// to be measured, what is known of it and of another of earlier passes ([`known::KnownPairs`]), and its likeness.
+/// Memory per candidate pair of one call of `measure`, beside the memory of the measurement itself, in bytes: the pair,
+/// the same pair in the list to be measured, its known similarity and that of one pair of earlier passes
+/// ([`known::KnownPairs`]), and its motion similarity.
 pub const BYTES_PER_PAIR: usize = 2 * size_of::<(u32, u32)>() + 2 * KNOWN_BYTES + size_of::<f64>();
 
-/// Memory per pair that passed all tests of a pass: the pair, with some room for the list to grow.
+/// Memory per pair that passed all tests of a pass, in bytes: the pair, and 4 bytes of spare list capacity.
 pub const BYTES_PER_PASSING: usize = size_of::<(u32, u32)>() + size_of::<u32>();
 
-/// Nodes whose neighbors one task looks up.
+/// Number of nodes whose neighbors one task looks up.
 const CHUNK: usize = 1024;
 
-/// The Gaussians to merge: some rows of a table of states.
+/// The Gaussians to merge: selected rows of a table of states.
 #[derive(Debug, Clone, Copy)]
 pub struct Survivors<'a> {
-    /// States at the reference frame. Of the harmonics only the first band is read; proxies get as many as there are.
+    /// States at the reference frame. Only the SH coefficients of degree 0 are read; proxies get all degrees of the
+    /// table.
     pub states: &'a Gaussians,
     /// The M rows that survive, increasing.
     pub rows: &'a [u32],
-    /// Ids of all rows, whose hashes break ties of size; C by id, the size that ranks leaders; and Vis by id.
+    /// Ids of all rows, whose hashes break ties of size; contribution C by id, the size that ranks leaders; visibility
+    /// by id.
     pub importance: Importance<'a>,
-    /// With which others each of the rows may merge: those of its class; none: with nobody. One whose state is not finite
-    /// never does.
+    /// Merge class of every row: a Gaussian may merge only with others of its class; `None`: with no other. A Gaussian
+    /// with a state that is not finite never merges.
     pub classes: &'a [Option<u8>],
-    /// Scene extent, the unit of [`LengthUnit::Extent`](recipe::LengthUnit::Extent).
+    /// Scene extent in scene units, the unit of [`LengthUnit::Extent`](recipe::LengthUnit::Extent).
     pub extent: f64,
 }
 
-/// Pairs of a pass whose motion is asked for.
+/// Pairs of a pass whose motion is to be measured.
 #[derive(Debug, Clone, Copy)]
 pub struct RequestedPairs<'a> {
     pairs: &'a [(u32, u32)],
     row: &'a [u32],
-    /// ε of the pass, scene units: the nodes of a pair lie within it.
+    /// ε of the pass in scene units: the two nodes of a pair are at most this far apart at the reference frame.
     pub reach: f64,
-    /// Whether there are more in this pass, asked for before or after.
+    /// Whether this pass has further pairs, requested before or after these.
     pub is_part: bool,
 }
 
 impl<'a> RequestedPairs<'a> {
-    /// The pairs, as rows of the states.
+    /// Returns the pairs as rows of the states.
     pub fn pairs(self) -> impl ExactSizeIterator<Item = (u32, u32)> + 'a {
         self.pairs.iter().map(move |&(i, j)| (self.row[i as usize], self.row[j as usize]))
     }
 }
 
-/// What merging made of the survivors.
+/// Result of merging: groups and proxies.
 #[derive(Debug, Clone)]
 pub struct Merged {
-    /// Who stands for whom.
+    /// Groups of survivors; every survivor is in exactly one.
     pub groups: MergeGroups,
-    /// State at the reference frame of every group of more than one member, in their order.
+    /// State at the reference frame of every group of more than one member, in the order of the groups.
     pub proxies: Gaussians,
-    /// What each pass did; passes after the limit was met are not made.
+    /// Counts of each pass. Passes after the join limit was reached are not run and have no entry.
     pub passes: Vec<PassCounts>,
 }
 
-/// What one pass did.
+/// Counts of one merge pass.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct PassCounts {
-    /// Nodes with more neighbors within ε than were looked at.
+    /// Number of nodes with more neighbors within ε than were examined.
     pub truncated: usize,
-    /// Pairs that passed tests 1 and 2.
+    /// Number of pairs that passed tests 1 and 2.
     pub candidates: usize,
-    /// Of those, pairs that passed test 3.
+    /// Number of candidate pairs that also passed test 3.
     pub passing: usize,
-    /// Nodes that joined a leader.
+    /// Number of nodes that joined a leader.
     pub joins: usize,
-    /// Rounds of the parallel greedy rule.
+    /// Number of rounds of the parallel greedy rule.
     pub rounds: usize,
-    /// Whether it was finished in sequence.
+    /// Whether the remaining nodes were decided sequentially after the last round.
     pub sequential: bool,
 }
 
-/// All passes of `recipe` over `survivors`, in each of which nodes that coincide merge first.
+/// Runs all passes of `recipe` over `survivors`. Every pass first merges nodes that coincide, then neighbors.
 ///
-/// `measure` answers test 3: for every pair, in order, how alike it moves; a pair passes where that exceeds the pass's
-/// τ_m. It is asked once per pass, and once before if nodes coincide, unless no pair is left; more often if there are
-/// more than `most_pairs`: then for so many at a time, in the voxel order of those that lead. The answer depends on the
-/// pair alone, so the caller may remember it. In later passes nodes are groups: state = proxy over all original members,
-/// size = ΣC, trajectory, life and hash = the leader's.
+/// `measure` answers test 3: it returns the motion similarity of every requested pair, in order; a pair passes if its
+/// similarity exceeds the pass's τ_m. It is called once per pass, and once before that if nodes coincide, and not at
+/// all without candidate pairs. With more than `most_pairs` pairs it is called several times, for at most `most_pairs`
+/// pairs each, in the voxel order of the leaders. The similarity depends on the pair alone, so the caller may cache it.
+/// In later passes the nodes are groups: state = proxy over all original members, size = ΣC, trajectory, life span and
+/// hash = the leader's.
 ///
-/// With `limit`, merging stops after exactly that many joins over all passes, or fewer if there are
-/// not so many; the joins kept are the first ones in sequential order. Fails only if `measure` does.
+/// With `limit`, merging stops after exactly that many joins over all passes, or fewer if fewer are possible; the joins
+/// kept are the first ones in sequential order.
+///
+/// # Errors
+/// Returns the first error of `measure`; nothing else fails.
 pub fn run<E>(
     survivors: &Survivors<'_>,
     recipe: &recipe::MergeParams,
@@ -138,9 +145,9 @@ pub fn run<E>(
     let unit = recipe.length_unit.in_scene_units(survivors.extent);
     let mut groups = MergeGroups::alone(survivors.rows);
     let mut proxies = survivors.states.pick(&[]);
-    let (mut passes, mut left) = (Vec::new(), limit);
+    let (mut passes, mut remaining_joins) = (Vec::new(), limit);
     for pass in &recipe.passes {
-        if left == Some(0) {
+        if remaining_joins == Some(0) {
             break;
         }
         let mut counts = PassCounts::default();
@@ -149,8 +156,9 @@ pub fn run<E>(
             let nodes = MergeNodes::new(survivors, &groups, &proxies);
             let mut pairs = Vec::new();
             let take = |some: &[(u32, u32)], is_part| {
-                let asked = RequestedPairs { pairs: some, row: groups.leaders(), reach: pass.epsilon * unit, is_part };
-                let likeness = measure(asked)?;
+                let request =
+                    RequestedPairs { pairs: some, row: groups.leaders(), reach: pass.epsilon * unit, is_part };
+                let likeness = measure(request)?;
                 debug_assert_eq!(likeness.len(), some.len(), "one likeness per pair");
                 let alike = some.iter().zip(likeness).filter(|&(_, likeness)| likeness > pass.tau_m);
                 pairs.extend(alike.map(|(&pair, _)| pair));
@@ -166,14 +174,14 @@ pub fn run<E>(
                 counts.truncated = each_candidate(&nodes, &rank, recipe, (pass, unit), most_pairs, take)?;
             }
             counts.passing += pairs.len();
-            let clustering = greedy::cluster(&rank, pairs, left);
-            left = left.map(|left| left - clustering.joins);
+            let clustering = greedy::cluster(&rank, pairs, remaining_joins);
+            remaining_joins = remaining_joins.map(|joins| joins - clustering.joins);
             counts.joins += clustering.joins;
             counts.rounds += clustering.rounds;
             counts.sequential |= clustering.sequential;
             groups = groups.joined(&clustering.leader_of);
             proxies = proxy::merge_groups(&groups, importance, survivors.states, recipe);
-            if left == Some(0) {
+            if remaining_joins == Some(0) {
                 break;
             }
         }
@@ -182,7 +190,7 @@ pub fn run<E>(
     Ok(Merged { groups, proxies, passes })
 }
 
-/// The rank of every group: by ΣC, ties by the hash of the leader's id.
+/// Returns the rank of every group: by descending ΣC, ties by the hash of the leader's id.
 fn ranks(groups: &MergeGroups, importance: &Importance<'_>) -> Vec<u32> {
     let size = |group: usize| groups.members(group).iter().map(|&row| importance.coverage(row)).sum();
     let sizes: Vec<f64> = (0..groups.len()).map(size).collect();
@@ -191,12 +199,12 @@ fn ranks(groups: &MergeGroups, importance: &Importance<'_>) -> Vec<u32> {
     greedy::ranks(&sizes, &hashes)
 }
 
-/// The groups of a pass: Gaussians that are alone, and proxies.
+/// The nodes of a pass: single Gaussians and proxies.
 struct MergeNodes<'a> {
     survivors: &'a Survivors<'a>,
     groups: &'a MergeGroups,
     proxies: &'a Gaussians,
-    /// Row of the survivors' states, or of the proxies.
+    /// Row of each node in the survivors' states (a single Gaussian) or in the proxies.
     place: Vec<u32>,
 }
 
@@ -213,7 +221,7 @@ impl<'a> MergeNodes<'a> {
         self.place.len()
     }
 
-    /// The states among which that of `node` is, and its row.
+    /// Returns the table that holds the state of `node`, and the row in it.
     fn state(&self, node: usize) -> (&Gaussians, usize) {
         let alone = self.groups.members(node).len() == 1;
         (if alone { self.survivors.states } else { self.proxies }, self.place[node] as usize)
@@ -233,13 +241,13 @@ impl<'a> MergeNodes<'a> {
         states.position.row(row)
     }
 
-    fn look(&self, node: usize) -> Appearance {
+    fn appearance(&self, node: usize) -> Appearance {
         let (states, row) = self.state(node);
         Appearance::new(states, row)
     }
 
-    /// The bits of all that an [`Appearance`] is made of, −0 as 0.
-    fn look_bits(&self, node: usize) -> [u32; 13] {
+    /// Returns the bits of all values that determine an [`Appearance`], with −0 stored as 0.
+    fn appearance_bits(&self, node: usize) -> [u32; 13] {
         let (states, row) = self.state(node);
         let [x, y, z] = states.position.row(row);
         let [qw, qx, qy, qz] = states.rotation.row(row);
@@ -249,62 +257,72 @@ impl<'a> MergeNodes<'a> {
     }
 }
 
-/// Calls `take` with the pairs (leader, member) of coincident nodes: nodes that are equal in every attribute that `gates`
-/// compare, and that pass them. The leader of such a crowd is its first node in rank, and all others are its members,
-/// however many. Pairs come ordered by leader, `most` (at least 1) at a time.
+/// Calls `take` with the pairs (leader, member) of coincident nodes: nodes that are equal in every attribute that
+/// `gates` compare, and that pass them. The leader of a set of coincident nodes is its first node in rank; all others
+/// are its members, however many. Pairs are ordered by leader and passed `max_batch` (at least 1) at a time.
 ///
-/// Needed because the neighbor search returns a fixed number of nearest Gaussians: where more coincide, all their neighbors
-/// are members of the same crowd, so that it would neither merge into one nor meet the Gaussians around it.
+/// This step is needed because the neighbor search returns a fixed number of nearest Gaussians. If more Gaussians than
+/// that coincide, all neighbors of each are in the same set, so the set would neither merge into one nor reach the
+/// Gaussians around it.
+///
+/// # Errors
+/// Returns the first error of `take`.
 fn each_coincident<E>(
     nodes: &MergeNodes<'_>,
     rank: &[u32],
     gates: &Gates,
-    most: usize,
+    max_batch: usize,
     mut take: impl FnMut(&[(u32, u32)], bool) -> Result<(), E>,
 ) -> Result<(), E> {
-    let key = |node: usize| nodes.look_bits(node).iter().fold(0, |key, &bits| hash_id(key ^ u64::from(bits)));
+    let key = |node: usize| nodes.appearance_bits(node).iter().fold(0, |key, &bits| hash_id(key ^ u64::from(bits)));
     let usable = (0..nodes.len()).into_par_iter().filter(|&node| nodes.is_usable(node));
     let mut order: Vec<(u64, u32, u32)> = usable.map(|node| (key(node), rank[node], node as u32)).collect();
     order.par_sort_unstable();
     let mut pairs = Vec::new();
-    for crowd in order.chunk_by(|a, b| a.0 == b.0).filter(|crowd| crowd.len() > 1) {
-        let leader = crowd[0].2;
-        let (bits, look) = (nodes.look_bits(leader as usize), nodes.look(leader as usize));
+    for coincident in order.chunk_by(|a, b| a.0 == b.0).filter(|coincident| coincident.len() > 1) {
+        let leader = coincident[0].2;
+        let (bits, appearance) = (nodes.appearance_bits(leader as usize), nodes.appearance(leader as usize));
         let class = nodes.class(leader as usize);
-        let is_like = |node: usize| nodes.class(node) == class && nodes.look_bits(node) == bits;
-        let alike = |node: u32| is_like(node as usize) && gates.pass(&look, &nodes.look(node as usize));
-        pairs.extend(crowd[1..].iter().filter(|member| alike(member.2)).map(|member| (leader, member.2)));
+        let is_equal = |node: usize| nodes.class(node) == class && nodes.appearance_bits(node) == bits;
+        let is_member =
+            |node: u32| is_equal(node as usize) && gates.pass(&appearance, &nodes.appearance(node as usize));
+        pairs.extend(coincident[1..].iter().filter(|member| is_member(member.2)).map(|member| (leader, member.2)));
     }
     drop(order);
     pairs.par_sort_unstable();
-    let is_part = pairs.len() > most;
-    pairs.chunks(most).try_for_each(|some| take(some, is_part))
+    let is_part = pairs.len() > max_batch;
+    pairs.chunks(max_batch).try_for_each(|some| take(some, is_part))
 }
 
-/// Hands on the pairs of nodes (leader, member) that pass tests 1 and 2 of `pass`, `unit` being the length of one unit
-/// of the recipe: the member is among the leader's nearest neighbors and ranks behind it. By leader in voxel order,
-/// then by distance; `most` (at least 1) at a time, and whether that is a part of them. Gives the number of nodes with
-/// more neighbors within ε than were looked at.
+/// Calls `take` with the pairs of nodes (leader, member) that pass tests 1 and 2 of `pass`: the member is among the
+/// leader's nearest neighbors and ranks after it. `unit` is the length of one unit of the recipe, in scene units. Pairs
+/// are ordered by leader in voxel order, then by distance, and passed `max_batch` (at least 1) at a time, with a flag
+/// that says whether there are several batches. Returns the number of nodes with more neighbors within ε than were
+/// examined.
 ///
-/// A node that is not mergeable or not finite leads nobody, joins nobody and takes no place among the nearest
-/// neighbors of others.
+/// A node that is not mergeable or not finite never leads or joins, and does not count among the nearest neighbors of
+/// others.
+///
+/// # Errors
+/// Returns the first error of `take`.
 fn each_candidate<E>(
     nodes: &MergeNodes<'_>,
     rank: &[u32],
     recipe: &recipe::MergeParams,
     (pass, unit): (&recipe::MergePass, f64),
-    most: usize,
+    max_batch: usize,
     mut take: impl FnMut(&[(u32, u32)], bool) -> Result<(), E>,
 ) -> Result<usize, E> {
     let usable = (0..nodes.len()).into_par_iter().filter(|&node| nodes.is_usable(node));
     let points = usable.map(|node| TreePoint { at: nodes.position(node), index: node as u32 }).collect();
     let index = PointIndex::new(points, pass.epsilon * unit);
     let gates = Gates::new(recipe, pass);
-    let of_chunk = |search: &mut NeighborSearch<'_>, leaders: &[TreePoint]| {
+    let find_pairs = |search: &mut NeighborSearch<'_>, leaders: &[TreePoint]| {
         let (mut pairs, mut truncated) = (Vec::new(), 0);
         for &TreePoint { at, index: i } in leaders {
-            let (look, class) = (nodes.look(i as usize), nodes.class(i as usize));
-            let passes = |j: u32| nodes.class(j as usize) == class && gates.pass(&look, &nodes.look(j as usize));
+            let (appearance, class) = (nodes.appearance(i as usize), nodes.class(i as usize));
+            let passes =
+                |j: u32| nodes.class(j as usize) == class && gates.pass(&appearance, &nodes.appearance(j as usize));
             let (near, cut) = search.nearest(i, at, recipe.max_neighbors);
             truncated += usize::from(cut);
             let behind = near.filter(|&j| rank[i as usize] < rank[j as usize]);
@@ -313,18 +331,18 @@ fn each_candidate<E>(
         (pairs, truncated)
     };
     let (mut pairs, mut truncated, mut is_part) = (Vec::new(), 0, false);
-    // One batch of chunks at a time bounds the pairs that wait beside those that are handed on.
+    // Processing one batch of chunks at a time bounds the number of pairs that wait for the next call of `take`.
     for batch in index.points().chunks(2 * CHUNK * rayon::current_num_threads()) {
         let chunks: Vec<(Vec<(u32, u32)>, usize)> =
-            batch.par_chunks(CHUNK).map_init(|| index.search(), of_chunk).collect();
-        for (of_chunk, cut) in chunks {
-            pairs.extend(of_chunk);
+            batch.par_chunks(CHUNK).map_init(|| index.search(), find_pairs).collect();
+        for (chunk_pairs, cut) in chunks {
+            pairs.extend(chunk_pairs);
             truncated += cut;
         }
-        while pairs.len() > most {
+        while pairs.len() > max_batch {
             is_part = true;
-            take(&pairs[..most], is_part)?;
-            pairs.drain(..most);
+            take(&pairs[..max_batch], is_part)?;
+            pairs.drain(..max_batch);
         }
     }
     if !pairs.is_empty() {
@@ -333,7 +351,7 @@ fn each_candidate<E>(
     Ok(truncated)
 }
 
-/// Whether every value of a row is finite.
+/// Returns whether every value of a row is finite.
 pub fn is_finite(states: &Gaussians, row: usize) -> bool {
     let columns = Columns::all().iter().map(|column| states.column(column));
     columns.into_iter().all(|column| (0..column.width()).all(|c| column.plane(c)[row].is_finite()))

@@ -1,51 +1,49 @@
-//! Moment matching: the one Gaussian with the weighted mean and covariance of several.
+//! Moment matching: computes the single Gaussian that has the weighted mean and covariance of several.
 //!
-//! In: weighted ellipsoids. Out: one ellipsoid. Memory: 96 bytes per part. The covariance
-//! Σ = Σ_i w_i (R_i S_i S_iᵀ R_iᵀ + (μ_i − μ)(μ_i − μ)ᵀ) is never formed: squaring halves the digits,
-//! and the smallest scale of a needle is the first to go. Its factor F (3 × 4n, Σ = F Fᵀ) has the
-//! columns √w_i R_i S_i and √w_i (μ_i − μ); a one-sided Jacobi SVD rotates its three rows until they
-//! are orthogonal (Demmel and Veselić, "Jacobi's method is more accurate than QR", 1992). Every
-//! rotation is exact to rounding column by column, so a column a billion times shorter than another
-//! keeps its digits.
+//! Input: weighted ellipsoids. Output: one ellipsoid. Memory: 96 bytes per part. The covariance Σ = Σ_i w_i (R_i S_i
+//! S_iᵀ R_iᵀ + (μ_i − μ)(μ_i − μ)ᵀ) is never formed, because squaring halves the number of correct digits and the
+//! smallest scale of a needle would lose its digits first. Its factor F (3 × 4n, Σ = F Fᵀ) has the columns √w_i R_i S_i
+//! and √w_i (μ_i − μ). A one-sided Jacobi SVD rotates the three rows of F until they are orthogonal (Demmel and
+//! Veselić, "Jacobi's method is more accurate than QR", 1992). Every rotation is exact to rounding column by column, so
+//! a column a billion times shorter than another keeps its digits.
 
 use glam::{DMat3, DQuat, DVec3};
 
-/// Sweeps over the three pairs of rows; quadratic convergence needs about six, noise in nearly equal
-/// singular values a few more.
+/// Maximum number of sweeps over the three pairs of rows. Quadratic convergence needs about six; rounding noise in
+/// nearly equal singular values needs a few more.
 const MAX_SWEEPS: usize = 40;
 
-/// A weighted Gaussian of a mixture.
+/// One Gaussian of a mixture, with its weight.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct WeightedGaussian {
-    /// Share in the mixture, ≥ 0; the shares sum to 1.
+    /// Weight in the mixture, ≥ 0; the weights sum to 1.
     pub weight: f64,
-    /// μ, any unit of length.
+    /// μ, in any unit of length.
     pub position: DVec3,
-    /// R, unit.
+    /// R, a unit quaternion.
     pub rotation: DQuat,
-    /// Diagonal of S, standard deviations along the columns of R, in the unit of `position`.
+    /// Diagonal of S: standard deviations along the columns of R, in the unit of `position`.
     pub scales: DVec3,
 }
 
 /// Mean and covariance R S Sᵀ Rᵀ of a Gaussian.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Ellipsoid {
-    /// Center.
+    /// Center, in the unit of the parts.
     pub mean: DVec3,
-    /// Unit, w ≥ 0.
+    /// Unit quaternion with w ≥ 0.
     pub rotation: DQuat,
     /// Standard deviations along the columns of the rotation.
     pub scales: DVec3,
 }
 
-/// The Gaussian whose mean is Σ w_i μ_i and whose covariance is the mixture's about that mean; with
-/// `about`, the mean is that point instead and the second moments are taken about it.
+/// Returns the Gaussian whose mean is Σ w_i μ_i and whose covariance is the mixture's about that mean. With `about`,
+/// the mean is that point instead and the second moments are taken about it.
 ///
-/// Canonical form: scales descend; the first two axes have their largest component positive and the
-/// third completes a right-handed frame, so a reflection met on the way flips the smallest axis.
-/// Guarantee: every scale has a relative error of about 1e-14 if the parts' columns do, at any
-/// anisotropy. Edges: no parts give zero scales at `about` or the origin; scales need only be finite,
-/// their squares may overflow.
+/// Canonical form: scales descend; the first two axes have their largest component positive and the third completes a
+/// right-handed frame, so that a reflection is resolved by flipping the smallest axis. Accuracy: every scale has a
+/// relative error of about 1e-14 if the columns of the parts do, at any anisotropy. Edge cases: without parts all
+/// scales are zero, at `about` or the origin; scales need only be finite, their squares may overflow.
 pub fn moments(parts: &[WeightedGaussian], about: Option<DVec3>) -> Ellipsoid {
     let mean = about.unwrap_or_else(|| parts.iter().map(|part| part.weight * part.position).sum());
     let mut rows: [Vec<f64>; 3] = std::array::from_fn(|_| Vec::with_capacity(4 * parts.len()));
@@ -62,7 +60,7 @@ pub fn moments(parts: &[WeightedGaussian], about: Option<DVec3>) -> Ellipsoid {
             row.extend(columns.iter().map(|column| column[r]));
         }
     }
-    // Dot products square: bring the largest entry near 1 first. A power of two changes no digit.
+    // Dot products square the entries, so scale the largest entry to about 1 first. A power of two changes no digit.
     let largest = rows.iter().flatten().fold(0.0f64, |most, x| most.max(x.abs()));
     let unit = if largest.is_normal() { 2f64.powi(largest.log2().floor() as i32) } else { 1.0 };
     rows.iter_mut().flatten().for_each(|x| *x /= unit);
@@ -76,11 +74,11 @@ pub fn moments(parts: &[WeightedGaussian], about: Option<DVec3>) -> Ellipsoid {
     Ellipsoid { mean, rotation: unit_from_axes(&frame), scales: DVec3::from(order.map(|r| lengths[r])) }
 }
 
-/// Rotates pairs of rows until all three are orthogonal; returns the axes, one per row, such that
-/// the rows before are Σ_r axis_r ⊗ row_r.
+/// Rotates pairs of rows until all three are orthogonal. Returns one axis per row such that the original rows are Σ_r
+/// axis_r ⊗ row_r.
 fn orthogonalize_rows(rows: &mut [Vec<f64>; 3]) -> [DVec3; 3] {
     let mut axes = [DVec3::X, DVec3::Y, DVec3::Z];
-    // A dot product of n terms is itself uncertain by about this much of the lengths.
+    // A dot product of n terms has a rounding error of about this fraction of the product of the lengths.
     let tolerance = f64::EPSILON * (rows[0].len() as f64).sqrt().max(1.0);
     for _ in 0..MAX_SWEEPS {
         let mut rotated = false;
@@ -116,17 +114,17 @@ fn with_largest_positive(axis: DVec3) -> DVec3 {
     if axis[largest] < 0.0 { -axis } else { axis }
 }
 
-/// The rotation whose matrix has these columns, w ≥ 0.
+/// Returns the rotation whose matrix has these columns, with w ≥ 0.
 fn unit_from_axes(frame: &DMat3) -> DQuat {
     let rotation = DQuat::from_mat3(frame).normalize();
     if rotation.w < 0.0 { -rotation } else { rotation }
 }
 
-/// The same ellipsoid with its axes renamed and turned round so that its rotation is the nearest to
-/// `reference`, in the sign nearest to it: of the 24 proper signed permutations the one with the
-/// largest |⟨q, reference⟩|, the first of them on a tie.
+/// Returns the ellipsoid with its axes permuted and flipped so that its rotation is the nearest to `reference`. Of the
+/// 24 proper signed permutations the one with the largest |⟨q, reference⟩| is taken, the first one on a tie; q gets the
+/// sign nearest to `reference`.
 ///
-/// A deformation field adds its deltas per axis, so a proxy must call its axes what its leader does.
+/// A deformation field adds its deltas per axis, so a proxy must number its axes as its leader does.
 pub fn align_axes(ellipsoid: &Ellipsoid, reference: DQuat) -> Ellipsoid {
     let axes = DMat3::from_quat(ellipsoid.rotation);
     let (mut closest, mut rotation, mut scales) = (f64::NEG_INFINITY, ellipsoid.rotation, ellipsoid.scales);
@@ -181,7 +179,7 @@ mod tests {
         axes * DMat3::from_diagonal(scales * scales) * axes.transpose()
     }
 
-    /// Mean and covariance by the textbook, forming Σ.
+    /// Computes mean and covariance by the textbook formula, forming Σ.
     fn oracle(parts: &[WeightedGaussian], about: Option<DVec3>) -> (DVec3, DMat3) {
         let mean = about.unwrap_or_else(|| parts.iter().fold(DVec3::ZERO, |sum, p| sum + p.position * p.weight));
         let sigma = parts
@@ -224,31 +222,31 @@ mod tests {
         }
 
         #[test]
-        fn a_moved_mixture_merges_to_the_moved_gaussian(parts in mixture(), turn in unit_quaternion(), shift in prop::array::uniform3(-9.0..9.0f64)) {
-            let still = moments(&parts, None);
+        fn moving_the_mixture_moves_the_merged_gaussian(parts in mixture(), turn in unit_quaternion(), shift in prop::array::uniform3(-9.0..9.0f64)) {
+            let unmoved = moments(&parts, None);
             let shift = DVec3::from(shift);
             let moved: Vec<WeightedGaussian> = parts
                 .iter()
                 .map(|p| WeightedGaussian { position: turn * p.position + shift, rotation: (turn * p.rotation).normalize(), ..*p })
                 .collect();
             let got = moments(&moved, None);
-            prop_assert!((got.mean - (turn * still.mean + shift)).length() < 1e-13);
-            prop_assert!(((got.scales - still.scales) / still.scales).abs().max_element() < 1e-12);
-            assert_covariance(&Ellipsoid { scales: still.scales, ..got }, covariance((turn * still.rotation).normalize(), still.scales));
+            prop_assert!((got.mean - (turn * unmoved.mean + shift)).length() < 1e-13);
+            prop_assert!(((got.scales - unmoved.scales) / unmoved.scales).abs().max_element() < 1e-12);
+            assert_covariance(&Ellipsoid { scales: unmoved.scales, ..got }, covariance((turn * unmoved.rotation).normalize(), unmoved.scales));
         }
 
         #[test]
-        fn aligning_renames_axes_only_and_comes_within_63_degrees(parts in mixture(), reference in unit_quaternion()) {
+        fn aligning_permutes_axes_to_within_63_degrees(parts in mixture(), reference in unit_quaternion()) {
             let got = moments(&parts, None);
             let aligned = align_axes(&got, reference);
             assert_covariance(&aligned, covariance(got.rotation, got.scales));
-            // The farthest rotation from the 24 of the cube is 62.8 degrees away.
+            // The rotation farthest from the 24 rotations of the cube is 62.8 degrees away.
             prop_assert!(aligned.rotation.dot(reference) > (62.9f64.to_radians() / 2.0).cos());
         }
     }
 
     #[test]
-    fn needle_merged_with_its_duplicate_keeps_its_smallest_scale_to_1e_12() {
+    fn merged_needles_keep_their_smallest_scale_to_1e_12() {
         for rotation in [DQuat::IDENTITY, tilt()] {
             for order in [DVec3::new(1e6, 1.0, 1e-6), DVec3::new(1e-6, 1e6, 1e-6), DVec3::new(1e-6, 3e-6, 1e6)] {
                 let needle = part(0.5, DVec3::new(1.0, 2.0, 3.0), rotation, order);
@@ -260,7 +258,7 @@ mod tests {
     }
 
     #[test]
-    fn coplanar_pancakes_stay_flat() {
+    fn coplanar_flat_gaussians_stay_flat() {
         let (u, v) = (tilt() * DVec3::X, tilt() * DVec3::Y);
         let parts = [(0.1, 0.2), (-0.4, 0.3), (0.2, -0.5)]
             .map(|(a, b)| part(1.0 / 3.0, a * u + b * v, tilt(), DVec3::new(0.1, 0.2, 1e-9)));
@@ -271,8 +269,8 @@ mod tests {
     }
 
     #[test]
-    fn covariance_with_equal_diagonal_gets_its_diagonal_axes() {
-        // Σ = [[2, 1, 0], [1, 2, 0], [0, 0, 2]]: an eigenvector method that trusts the diagonal sees a ball.
+    fn equal_diagonal_covariance_gets_diagonal_axes() {
+        // Σ = [[2, 1, 0], [1, 2, 0], [0, 0, 2]]: an eigenvector method that looks at the diagonal only finds a sphere.
         let long = DQuat::from_rotation_z(std::f64::consts::FRAC_PI_4);
         let got = moments(&[part(1.0, DVec3::ZERO, long, DVec3::new(3f64.sqrt(), 1.0, 2f64.sqrt()))], None);
         assert!((got.scales - DVec3::new(3f64.sqrt(), 2f64.sqrt(), 1.0)).length() < 1e-14);
@@ -281,7 +279,7 @@ mod tests {
     }
 
     #[test]
-    fn scales_from_1e_12_to_1e6_and_far_beyond_neither_overflow_nor_vanish() {
+    fn extreme_scales_neither_overflow_nor_vanish() {
         for size in [1e-300, 1e-12, 1.0, 1e6, 1e200] {
             let parts = [-1.0, 1.0].map(|side| part(0.5, DVec3::X * size * side, tilt(), DVec3::splat(size)));
             let got = moments(&parts, None).scales / size;

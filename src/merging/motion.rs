@@ -1,9 +1,9 @@
-//! Test 3: whether two Gaussians move alike over their common life, measured as frames stream by.
+//! Test 3 of merging: whether two Gaussians move alike while both are alive, measured frame by frame.
 //!
-//! In: pairs, then the positions and liveness of every node frame by frame. Out: a [`PairMeasure`]
-//! for each pair, independent of any threshold, which a [`MotionGate`] turns into the one number that passes
-//! compare with their τ_m. Memory: [`PAIR_BYTES`] per pair and [`NODE_BYTES`] per node; nothing grows with the
-//! number of frames. A pair is summed by one thread in frame order, so threads do not change the sums.
+//! Input: pairs, then position and liveness of every node at each frame. Output: a [`PairMeasure`] for each pair,
+//! independent of any threshold, which a [`MotionGate`] turns into the one number that passes compare with their τ_m.
+//! Memory: [`PAIR_BYTES`] per pair and [`NODE_BYTES`] per node; nothing grows with the number of frames. Each pair is
+//! summed by one thread in frame order, so the thread count does not change the sums.
 
 use glam::DVec3;
 use rayon::prelude::*;
@@ -11,51 +11,55 @@ use rayon::prelude::*;
 use super::gates::COSINE_EPSILON;
 use crate::recipe::{self, MotionParams, Trajectory};
 
-/// Memory of one pair while frames stream by.
+/// Memory of one pair during the measurement, in bytes.
 pub const PAIR_BYTES: usize = size_of::<NodePair>();
-/// Memory of one node while frames stream by.
+/// Memory of one node during the measurement, in bytes.
 pub const NODE_BYTES: usize = size_of::<NodeTrack>();
 
-/// How two Gaussians move beside each other. Velocities are steps x(t) − x(t−1) between consecutive
-/// frames, whatever their distance in time: the noise floor they are held against is one of steps.
+/// Motion of two Gaussians relative to each other. Velocities are steps x(t) − x(t−1) between consecutive frames,
+/// whatever the time between them, because the noise level they are compared with is one per step.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PairMeasure {
-    /// Mean cosine of velocities, a·b/(‖a‖‖b‖ + 1e-8); a step with a velocity of zero counts as 0. The mean is over all
-    /// frames of the common life (`MotionParams::Literal`) or over the steps inside it (`MotionParams::Runs`).
+    /// Mean cosine of the velocities, a·b/(‖a‖‖b‖ + 1e-8); a step with a velocity of zero counts as 0. The mean is over
+    /// all frames in which both are alive (`MotionParams::Literal`), or over the steps whose two frames are both such
+    /// frames (`MotionParams::Runs`).
     pub cosine: f64,
-    /// Σ a·b over the steps, squared scene units.
+    /// Σ a·b over the steps, in squared scene units.
     pub dot: f64,
-    /// Σ ‖a‖² + ‖b‖² over the steps, squared scene units.
+    /// Σ ‖a‖² + ‖b‖² over the steps, in squared scene units.
     pub squares: f64,
-    /// n, the number of steps.
+    /// Number of steps n.
     pub steps: u32,
-    /// |life ∩ life'| in frames.
+    /// Number of frames in which both are alive, |life ∩ life'|.
     pub common: u32,
-    /// |life ∪ life'| in frames.
+    /// Number of frames in which at least one is alive, |life ∪ life'|.
     pub union: u32,
-    /// Largest ‖(x_i − x_j)(t) − (x_i − x_j)(t₀)‖ over the common life, scene units; t₀ is the
-    /// reference frame, whose offset is the one a proxy is built from.
+    /// Maximum of ‖(x_i − x_j)(t) − (x_i − x_j)(t₀)‖ over the frames in which both are alive, in scene units. t₀ is the
+    /// reference frame; a proxy is built from the offset at that frame.
     pub drift: f64,
 }
 
 impl PairMeasure {
-    /// A = (2Σ a·b + 2nσ²)/(Σ‖a‖² + Σ‖b‖² + 2nσ²), in [−1, 1]: 1 for two static Gaussians, the
-    /// cosine for equally fast ones, small for v beside 10 v. Nothing moved and σ = 0, or no step: 1.
+    /// Returns A = (2Σ a·b + 2nσ²)/(Σ‖a‖² + Σ‖b‖² + 2nσ²), in [−1, 1]: 1 for two static Gaussians, the cosine for
+    /// equally fast ones, and a small value for velocities v and 10 v. Without any step, or without motion at σ = 0, A
+    /// is 1.
     ///
     /// `noise` is σ in scene units per step.
     pub fn alignment(&self, noise: f64) -> f64 {
         let floor = 2.0 * f64::from(self.steps) * noise * noise;
-        let whole = self.squares + floor;
-        if whole == 0.0 { 1.0 } else { (2.0 * self.dot + floor) / whole }
+        let denominator = self.squares + floor;
+        if denominator == 0.0 { 1.0 } else { (2.0 * self.dot + floor) / denominator }
     }
 
-    /// The fraction of the union of both lives in which only one lives; 1 if neither ever does.
+    /// Returns the fraction of the frames with at least one alive in which only one is alive; 1 if neither is ever
+    /// alive.
     pub fn dead_time(&self) -> f64 {
         if self.union == 0 { 1.0 } else { f64::from(self.union - self.common) / f64::from(self.union) }
     }
 }
 
-/// What every pass asks of a pair in test 3, lengths in scene units; how alike is enough is the pass's τ_m.
+/// Thresholds of test 3 that hold for every pass, lengths in scene units. The required motion similarity is the pass's
+/// τ_m.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MotionGate {
     trajectory: Trajectory,
@@ -65,9 +69,9 @@ pub struct MotionGate {
 }
 
 impl MotionGate {
-    /// The thresholds of `merge`; `unit` is the length of one unit of the recipe.
+    /// Creates the test from the thresholds of `merge`; `unit` is the length of one unit of the recipe, in scene units.
     pub fn new(merge: &recipe::MergeParams, unit: f64) -> Self {
-        // An unlimited drift stays unlimited in a scene of no extent.
+        // An unlimited drift stays unlimited in a scene of extent 0.
         let max_drift = if merge.max_drift.is_infinite() { f64::INFINITY } else { merge.max_drift * unit };
         MotionGate {
             trajectory: merge.trajectory,
@@ -77,8 +81,9 @@ impl MotionGate {
         }
     }
 
-    /// How alike the pair moves, in [−1, 1]: it passes test 3 where this exceeds τ_m. NaN, which exceeds no τ_m
-    /// whatever, for lives that never meet, that have too much dead time together, and for pairs that drift apart.
+    /// Returns the motion similarity of a pair, in [−1, 1]; the pair passes test 3 if it exceeds τ_m. Returns NaN,
+    /// which exceeds no τ_m, if the two are never alive together, if the fraction of frames with only one alive is too
+    /// large, or if the pair drifts apart.
     pub fn likeness(&self, pair: &PairMeasure) -> f64 {
         let together = pair.common > 0 && pair.drift <= self.max_drift && pair.dead_time() <= self.max_dead_time;
         match self.trajectory {
@@ -89,7 +94,7 @@ impl MotionGate {
     }
 }
 
-/// A node between two frames.
+/// Position and liveness of a node at two consecutive frames, and its position at the reference frame.
 #[derive(Debug, Clone, Copy)]
 struct NodeTrack {
     reference: [f32; 3],
@@ -111,7 +116,7 @@ struct NodePair {
     drift_squared: f64,
 }
 
-/// Measures pairs of nodes over frames that arrive in order.
+/// Measurement of pairs of nodes over frames that arrive in order.
 #[derive(Debug)]
 pub struct PairMotion {
     motion: MotionParams,
@@ -121,9 +126,9 @@ pub struct PairMotion {
 }
 
 impl PairMotion {
-    /// Starts measuring `pairs` of nodes; `reference` gives the position of each of the N nodes at the reference
-    /// frame. `motion` says which steps count: `Literal` those that end in the common life, `Runs` those
-    /// that begin there too.
+    /// Starts measuring `pairs` of nodes; `reference` gives the position of each of the N nodes at the reference frame.
+    /// `motion` says which steps count: with `Literal` all steps that end in a frame in which both are alive, with
+    /// `Runs` only those that also begin in one.
     pub fn new(
         pairs: impl ExactSizeIterator<Item = (u32, u32)>,
         reference: impl ExactSizeIterator<Item = [f32; 3]>,
@@ -149,7 +154,7 @@ impl PairMotion {
         }
     }
 
-    /// Takes the next frame: `state` gives position and liveness of each of the N nodes.
+    /// Adds the next frame; `state` returns position and liveness of each of the N nodes.
     pub fn frame(&mut self, state: impl Fn(usize) -> ([f32; 3], bool) + Sync) {
         self.tracks.par_iter_mut().enumerate().for_each(|(i, track)| {
             (track.before, track.alive_before) = (track.now, track.alive);
@@ -172,7 +177,7 @@ impl PairMotion {
         self.frames += 1;
     }
 
-    /// What the frames so far say of each pair, in the order given.
+    /// Returns the measure of each pair over the frames so far, in the order given.
     pub fn finish(self) -> impl ExactSizeIterator<Item = PairMeasure> {
         let motion = self.motion;
         let measure = move |pair: NodePair| {
@@ -212,7 +217,7 @@ impl NodePair {
     fn drift(&mut self, a: &NodeTrack, b: &NodeTrack) {
         let change = (wide(a.now) - wide(b.now)) - (wide(a.reference) - wide(b.reference));
         let squared = change.length_squared();
-        // A NaN must not be forgotten: it counts as an endless drift.
+        // A NaN must not be lost by `max`: it counts as an infinite drift.
         self.drift_squared = self.drift_squared.max(if squared.is_nan() { f64::INFINITY } else { squared });
     }
 }
@@ -248,7 +253,7 @@ mod tests {
         (0..20).map(|t| (x(t), true)).collect()
     }
 
-    /// Verdict of the default recipe in a scene of extent `extent`.
+    /// Returns whether the pair passes with the default recipe in a scene of extent `extent`.
     fn merges(a: &Path, b: &Path, extent: f64) -> bool {
         let merge = Recipe::preset("default").unwrap().merge;
         MotionGate::new(&merge, extent).likeness(&measure(a, b, MotionParams::Runs)) > merge.passes[0].tau_m
@@ -260,7 +265,7 @@ mod tests {
     }
 
     #[test]
-    fn static_gaussians_move_alike_though_not_to_the_letter_of_the_paper() {
+    fn static_gaussians_move_alike_except_by_the_paper() {
         let still = path(|_| 3.0);
         assert!(merges(&still, &path(|_| 3.1), 1.0));
         assert!(merges(&still, &path(|_| 3.1), 0.0), "a scene of no extent");
@@ -270,7 +275,7 @@ mod tests {
     }
 
     #[test]
-    fn opposite_velocities_and_v_beside_10_v_are_not_merged() {
+    fn different_velocities_are_not_merged() {
         let slow = path(|t| 0.01 * t as f32);
         assert!(!merges(&slow, &path(|t| -0.01 * t as f32), 1.0));
         assert!(!merges(&slow, &path(|t| 0.1 * t as f32), 1.0));
@@ -284,21 +289,21 @@ mod tests {
     }
 
     #[test]
-    fn steps_that_are_next_to_nothing_hardly_count_in_the_cosine_of_the_paper() {
+    fn tiny_steps_hardly_count_in_the_cosine_of_the_paper() {
         let slow = path(|t| 1e-5 * t as f32);
         assert!(merges_in_paper(&path(|t| 1e-3 * t as f32), &path(|t| 1e-3 * t as f32)));
         let cosine = measure(&slow, &slow, MotionParams::Runs).cosine;
-        // 1e-10 / (1e-10 + 1e-8), of coordinates in f32.
+        // 1e-10 / (1e-10 + 1e-8), from f32 coordinates.
         assert!((cosine - 1.0 / 101.0).abs() < 1e-6, "{cosine}");
         assert!(!merges_in_paper(&slow, &slow));
     }
 
     #[test]
-    fn a_teleport_while_alive_never_merges_and_one_while_dead_does() {
+    fn jumps_prevent_merging_only_while_alive() {
         let still = path(|_| 0.0);
         let jump = path(|t| if t < 10 { 0.0 } else { 50.0 });
         assert!(!merges(&still, &jump, 1.0) && !merges_in_paper(&still, &jump));
-        // Away in frame 10, dead there: nothing was seen to move.
+        // The node jumps at frame 10 while it is not alive, so no visible motion occurs.
         let mut hidden = path(|t| if t == 10 { 50.0 } else { 0.0 });
         hidden[10].1 = false;
         assert!(merges(&still, &hidden, 1.0));
@@ -307,14 +312,14 @@ mod tests {
     }
 
     #[test]
-    fn disjoint_lives_are_not_merged() {
+    fn disjoint_life_spans_are_not_merged() {
         let first: Path = (0..20).map(|t| (0.0, t < 10)).collect();
         let last: Path = (0..20).map(|t| (0.0, t >= 10)).collect();
         assert!(!merges(&first, &last, 1.0));
         let mut merge = Recipe::preset("default").unwrap().merge;
         merge.max_dead_time = f64::INFINITY;
         merge.max_drift = f64::INFINITY;
-        // No threshold lets them through, not even one that all alignments exceed.
+        // No threshold lets them pass, not even one that every alignment exceeds.
         let exceeds = |a: &Path, b: &Path, tau: f64| {
             MotionGate::new(&merge, 1.0).likeness(&measure(a, b, MotionParams::Runs)) > tau
         };
@@ -325,7 +330,7 @@ mod tests {
     }
 
     #[test]
-    fn dead_time_is_the_share_of_the_union_in_which_one_lives_alone() {
+    fn dead_time_is_the_fraction_with_only_one_alive() {
         let long: Path = (0..20).map(|t| (0.0, t < 16)).collect();
         let short: Path = (0..20).map(|t| (0.0, (4..16).contains(&t))).collect();
         let pair = measure(&long, &short, MotionParams::Runs);
@@ -334,11 +339,11 @@ mod tests {
     }
 
     #[test]
-    fn a_step_to_nowhere_is_never_forgotten() {
+    fn a_step_to_nan_or_infinity_prevents_merging() {
         for lost in [f32::NAN, f32::INFINITY] {
-            let wild = path(|t| if t == 7 { lost } else { 0.0 });
-            assert!(!merges(&wild, &wild, 1.0), "{lost}");
-            assert!(!merges_in_paper(&wild, &path(|t| t as f32)), "{lost}");
+            let non_finite = path(|t| if t == 7 { lost } else { 0.0 });
+            assert!(!merges(&non_finite, &non_finite, 1.0), "{lost}");
+            assert!(!merges_in_paper(&non_finite, &path(|t| t as f32)), "{lost}");
         }
     }
 

@@ -1,10 +1,11 @@
-//! Measuring how alike pairs of Gaussians move, over all frames.
+//! Measures the motion similarity of pairs of Gaussians over all frames.
 //!
-//! As long as all pairs fit, they are measured in one read of the source. Else [`crate::merging::run`] cuts them into
-//! partitions, so many consecutive pairs in voxel order, and the trajectories of all survivors are gathered once in
-//! that order: a partition reads the Gaussians that lead its pairs and their ghosts, the partners within ε that other
-//! partitions share. As partitions are cut by counting pairs, a voxel that holds more than fit is split. Every pair is
-//! summed whole in one partition, so no cut changes a bit.
+//! If all pairs fit into memory, they are measured in one read of the source. Otherwise [`crate::merging::run`] splits
+//! them into partitions of a fixed number of consecutive pairs in voxel order, and the trajectories of all survivors
+//! are first gathered into a scratch file in that order. A partition reads the Gaussians that lead its pairs and their
+//! ghosts, that is, partners within ε that other partitions also read. Partitions are cut by counting pairs, so a voxel
+//! that holds more pairs than fit is split. The sums of a pair are computed entirely in one partition, so partitioning
+//! does not change a bit.
 
 use std::path::PathBuf;
 
@@ -22,59 +23,61 @@ use crate::progress::Events;
 use crate::recipe;
 use crate::source::{BlockReader, FrameSource, Ids, ReadPlan};
 
-/// Memory of one pair while it is measured: its sums, its two Gaussians while they are counted, its result.
+/// Memory of one pair while it is measured, in bytes: its sums, its two Gaussians in the list of members, its result.
 pub const BYTES_PER_PAIR: usize = PAIR_BYTES + 8 + size_of::<f64>();
 
-/// Memory of one Gaussian of the pairs that are measured together, at most two per pair, beside what the reader of the
-/// source itself keeps: number and id, track, state at one frame, and the frames a reader holds.
+/// Returns the memory of one Gaussian of the pairs that are measured together (at most two per pair), in bytes, beside
+/// the memory of the source's own reader: index and id, track, state at one frame, and the frames that a reader holds.
 pub fn bytes_per_gaussian(frames_held: usize) -> usize {
     8 + NODE_BYTES + 16 * (1 + frames_held.min(FRAME_BLOCK))
 }
 
-/// Measures pairs of Gaussians of a source.
+/// Measurement of the motion similarity of pairs of Gaussians of a source.
 pub struct PairMeter<'a> {
-    /// Where they move.
+    /// Source of the trajectories.
     pub source: &'a dyn FrameSource,
-    /// What is life, and what is a step.
+    /// Scan parameters: `alpha_min`, which defines when a Gaussian is alive, and `motion`, which defines the steps that
+    /// count.
     pub scan: &'a recipe::ScanParams,
-    /// What makes a pair alike.
+    /// Thresholds of test 3.
     pub gate: MotionGate,
-    /// Frames that readers hold, and that are gathered together.
+    /// Number of frames that a reader holds and that are gathered together.
     pub frames_held: usize,
-    /// Folder for trajectories that have to wait.
+    /// Folder of the scratch file for trajectories.
     pub scratch: PathBuf,
-    /// Where progress goes.
+    /// Receiver of progress events.
     pub events: Events,
-    /// None at first.
+    /// Trajectories gathered so far; `None` at first.
     pub gathered: Option<Gathered>,
 }
 
-/// Trajectories that wait in voxel order.
+/// Trajectories in a scratch file, in voxel order.
 pub struct Gathered {
     trajectories: Trajectories,
-    /// Row of every place.
+    /// Row of the Gaussian at every place of the file.
     order: Vec<u32>,
-    /// Place of every row.
+    /// Place in the file of every row.
     place: Vec<u32>,
 }
 
 impl PairMeter<'_> {
-    /// The same, with nothing gathered.
+    /// Returns a meter with the same settings and no gathered trajectories.
     pub fn fresh(&self) -> Self {
         PairMeter { scratch: self.scratch.clone(), events: self.events.clone(), gathered: None, ..*self }
     }
 
-    /// How alike each of `pairs` (rows of `ids`, which increase) moves, in some order. `reference` `[3, M]` holds the
-    /// positions of `ids` at the reference frame; partners lie within about `reach` of each other there. Both are the
-    /// same at every call. `is_part`: other pairs were or will be asked for, so that gathering pays.
+    /// Measures the motion similarity of each of `pairs` (rows of `ids`, which increase) and returns it in some order.
+    /// `reference` `[3, M]` holds the positions of `ids` at the reference frame; the two Gaussians of a pair are at
+    /// most about `reach` apart there. `ids` and `reference` must be the same at every call. `is_part` says that other
+    /// pairs were or will be requested, so that gathering trajectories pays.
     ///
-    /// Memory: 16 bytes and [`BYTES_PER_PAIR`] for every pair, [`bytes_per_gaussian`] for everybody in one; and of a
-    /// part 8 bytes for each of `ids` and, while they are gathered, 12 more and their moments at the
-    /// frames held. Nothing grows with the number of frames. A sequence in which neither positions nor opacities vary is
-    /// measured by its first.
+    /// Memory: 16 bytes and [`BYTES_PER_PAIR`] for every pair, and [`bytes_per_gaussian`] for every Gaussian in a pair.
+    /// With gathered trajectories also 8 bytes for each of `ids` and, while gathering, 12 more and their samples at the
+    /// frames held. Nothing grows with the number of frames. A sequence in which neither positions nor opacities vary
+    /// is measured by its first frame alone.
     ///
     /// # Errors
-    /// Those of reading the source, and of writing and reading the scratch file, which is gone then.
+    /// Fails if reading the source or writing or reading the scratch file fails. The scratch file is gone then.
     pub fn measure(
         &mut self,
         ids: &[u32],
@@ -89,7 +92,7 @@ impl PairMeter<'_> {
         let Some(Gathered { trajectories, order, place }) = &mut self.gathered else {
             let rows = members(&pairs);
             let places = rows.iter().map(|&row| reference.row(row as usize));
-            let mut motion = PairMotion::new(local(&pairs, &rows), places, self.scan.motion);
+            let mut motion = PairMotion::new(local_indices(&pairs, &rows), places, self.scan.motion);
             self.play_source(&rows.iter().map(|&row| ids[row as usize]).collect::<Vec<u32>>(), &mut motion)?;
             let measured = motion.finish().map(|pair| self.gate.likeness(&pair));
             return Ok(pairs.iter().zip(measured).map(|(&(a, b), likeness)| (a, b, likeness)).collect());
@@ -101,7 +104,7 @@ impl PairMeter<'_> {
         pairs.par_sort_unstable();
         let places = members(&pairs);
         let at = places.iter().map(|&k| reference.row(order[k as usize] as usize));
-        let mut motion = PairMotion::new(local(&pairs, &places), at, self.scan.motion);
+        let mut motion = PairMotion::new(local_indices(&pairs, &places), at, self.scan.motion);
         trajectories.play(&places, |moments| {
             motion.frame(|node| {
                 let [x, y, z, logit] = moments[node];
@@ -109,19 +112,20 @@ impl PairMeter<'_> {
             });
         })?;
         let measured = motion.finish().map(|pair| self.gate.likeness(&pair));
-        let of_rows = |(&(i, j), likeness): (&(u32, u32), f64)| {
+        let by_row = |(&(i, j), likeness): (&(u32, u32), f64)| {
             let (a, b) = (order[i as usize], order[j as usize]);
             (a.min(b), a.max(b), likeness)
         };
-        Ok(pairs.iter().zip(measured).map(of_rows).collect())
+        Ok(pairs.iter().zip(measured).map(by_row).collect())
     }
 
-    /// The trajectories of all of `ids` in voxels of side `reach`.
+    /// Gathers the trajectories of all of `ids` in the order of voxels of side `reach`.
     fn gather(&self, ids: &[u32], reference: &Column, reach: f64) -> Result<Gathered> {
         let rows: Vec<u32> = (0..ids.len() as u32).collect();
         let order = voxel_order(&rows, |row| reference.row(row as usize), reach);
-        let of_order: Vec<u32> = order.iter().map(|&row| ids[row as usize]).collect();
-        let trajectories = Trajectories::gather(self.source, &of_order, self.frames_held, &self.scratch, &self.events)?;
+        let ordered_ids: Vec<u32> = order.iter().map(|&row| ids[row as usize]).collect();
+        let trajectories =
+            Trajectories::gather(self.source, &ordered_ids, self.frames_held, &self.scratch, &self.events)?;
         let mut place = rows;
         for (&row, k) in order.iter().zip(0u32..) {
             place[row as usize] = k;
@@ -129,7 +133,7 @@ impl PairMeter<'_> {
         Ok(Gathered { trajectories, order, place })
     }
 
-    /// Shows `motion` every frame of the Gaussians `ids`; the first alone if nothing varies.
+    /// Passes every frame of the Gaussians `ids` to `motion`; only the first frame if nothing varies.
     fn play_source(&self, ids: &[u32], motion: &mut PairMotion) -> Result<()> {
         let info = self.source.info();
         let varying = info.varying & NEEDED;
@@ -149,7 +153,7 @@ impl PairMeter<'_> {
     }
 }
 
-/// Everybody in a pair, increasing.
+/// Returns the Gaussians that occur in a pair, increasing.
 fn members(pairs: &[(u32, u32)]) -> Vec<u32> {
     let mut members = Vec::with_capacity(2 * pairs.len());
     members.extend(pairs.iter().flat_map(|&(a, b)| [a, b]));
@@ -159,8 +163,8 @@ fn members(pairs: &[(u32, u32)]) -> Vec<u32> {
     members
 }
 
-/// The pairs as places in `members`.
-fn local<'a>(pairs: &'a [(u32, u32)], members: &'a [u32]) -> impl ExactSizeIterator<Item = (u32, u32)> + 'a {
+/// Returns the pairs as indices into `members`.
+fn local_indices<'a>(pairs: &'a [(u32, u32)], members: &'a [u32]) -> impl ExactSizeIterator<Item = (u32, u32)> + 'a {
     let place = |member: u32| members.binary_search(&member).unwrap_or_default() as u32;
     pairs.iter().map(move |&(a, b)| (place(a), place(b)))
 }
@@ -175,10 +179,10 @@ mod tests {
     use crate::recipe::Recipe;
     use crate::source::BlockReader;
 
-    /// The reference frame of all tests.
+    /// Reference frame of all tests.
     const REFERENCE: usize = 3;
 
-    /// Every third Gaussian of a demo scene, and all pairs of them within `reach`.
+    /// Every third Gaussian of a demo scene, and all pairs of them that are at most `reach` apart.
     struct Case {
         scene: Scene,
         recipe: Recipe,
@@ -211,23 +215,23 @@ mod tests {
                 gathered: None,
             };
             let is_part = self.pairs.len() > pairs_together;
-            // No pairs are one part.
+            // An empty list of pairs is still one part.
             let starts = (0..self.pairs.len().max(1)).step_by(pairs_together);
-            let of_parts =
+            let parts =
                 starts.map(|start| &self.pairs[start..self.pairs.len().min(start.saturating_add(pairs_together))]);
             let found: Result<Vec<Vec<Likeness>>> =
-                of_parts.map(|part| meter.measure(&self.ids, &self.reference, part.to_vec(), reach, is_part)).collect();
+                parts.map(|part| meter.measure(&self.ids, &self.reference, part.to_vec(), reach, is_part)).collect();
             drop(meter);
             assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0, "scratch files are left");
-            // NaN is a finding too, so bits are compared.
+            // NaN is a valid result, so bits are compared.
             let mut found: Vec<(u32, u32, u64)> =
                 found?.into_iter().flatten().map(|(a, b, x)| (a, b, x.to_bits())).collect();
             found.sort_unstable();
             Ok(found)
         }
 
-        /// All frames of all Gaussians at once.
-        fn plainly(&self) -> Vec<(u32, u32, u64)> {
+        /// Measures all pairs from whole frames, without partitions.
+        fn measure_whole(&self) -> Vec<(u32, u32, u64)> {
             let gate = MotionGate::new(&self.recipe.merge, 4.0);
             let reference = (0..self.ids.len()).map(|i| self.reference.row(i));
             let mut motion = PairMotion::new(self.pairs.iter().copied(), reference, self.recipe.scan.motion);
@@ -242,10 +246,10 @@ mod tests {
     }
 
     #[test]
-    fn any_number_of_partitions_finds_what_one_look_at_everything_finds() {
+    fn partition_count_does_not_change_similarities() {
         let reach = 0.5;
         let case = Case::new(reach);
-        let (all, expected) = (case.pairs.len(), case.plainly());
+        let (all, expected) = (case.pairs.len(), case.measure_whole());
         assert!(all > 1000, "{all} pairs");
         let apart = expected.iter().filter(|(.., likeness)| f64::from_bits(*likeness).is_nan()).count();
         assert!(apart > 0 && apart + 100 < all, "{apart} of {all} drift apart");
@@ -256,22 +260,22 @@ mod tests {
     }
 
     #[test]
-    fn a_voxel_with_more_pairs_than_a_partition_holds_is_split() {
+    fn overfull_voxels_are_split() {
         let case = Case::new(0.3);
-        // Voxels wider than the scene: all pairs are led from one.
+        // Voxels wider than the scene: one voxel leads all pairs.
         let got = case.measure(&case.scene, case.pairs.len() / 5, 1e6).unwrap();
-        assert!(got == case.plainly());
+        assert!(got == case.measure_whole());
     }
 
     #[test]
-    fn no_pair_reads_nothing() {
+    fn without_pairs_nothing_is_read() {
         let case = Case { pairs: Vec::new(), ..Case::new(0.0) };
         let unreadable = Failing { scene: &case.scene, from: 0 };
         assert!(case.measure(&unreadable, 1, 0.3).unwrap().is_empty());
     }
 
     #[test]
-    fn a_source_that_fails_midway_leaves_no_scratch_file() {
+    fn a_failing_source_leaves_no_scratch_file() {
         let case = Case::new(0.3);
         let failing = Failing { scene: &case.scene, from: 6 };
         for pairs_together in [usize::MAX, 10] {
@@ -280,7 +284,7 @@ mod tests {
         }
     }
 
-    /// A scene whose frames cannot be read from one on.
+    /// A scene whose frames cannot be read from `from` on.
     struct Failing<'a> {
         scene: &'a Scene,
         from: usize,

@@ -1,14 +1,14 @@
-//! The nearest neighbors of every Gaussian, by a hash of voxels as wide as they may be apart.
+//! Nearest neighbors of every Gaussian, by a hash of voxels with sides as long as the maximum distance ε.
 //!
-//! In: positions. Out: for a Gaussian the at most K nearest others within ε, nearest first, ties by
-//! index. The answer is defined by (distance, index) alone, so it does not depend on voxels, hashes, threads or any
-//! partition of space.
+//! Input: positions. Output: for a Gaussian the at most K nearest others within ε, nearest first, ties by index. The
+//! result is defined by (distance, index) alone, so it does not depend on voxels, hashes, threads or any partition of
+//! space.
 //!
-//! Points stand in the order of their voxels, and a table tells where each voxel starts. What is within ε of a point is
-//! in its own voxel or in one of the 26 around it: those are looked up once for all points of a voxel, and skipped where
-//! they are farther than the worst neighbor kept. A voxel of very many points has a [`Tree`] over them, so that a crowd
-//! in one voxel, or an ε that reaches everywhere, costs what a tree costs.
-//! Memory: 16 bytes per point, and 13 bytes for each slot of the table, of which there are at most 16 for 7 voxels: at
+//! Points are sorted by voxel, and a hash table holds the start of each voxel. All points within ε of a point lie in
+//! its own voxel or in one of the 26 around it. These are looked up once for all points of a voxel, and skipped if they
+//! are farther away than the worst neighbor kept. A voxel with very many points has a [`Tree`] over them, so that many
+//! points in one voxel, or an ε that spans the scene, cost no more than a tree.
+//! Memory: 16 bytes per point, and 13 bytes for each slot of the table, which has at most 16 slots for 7 voxels: at
 //! most 46 bytes per point, 40 while points are sorted.
 //!
 //! Source: spatial hashing after M. Teschner et al., "Optimized spatial hashing for collision detection of deformable
@@ -23,20 +23,21 @@ use super::tree::{Nearest, Tree, TreePoint};
 use super::voxels::{Voxels, along, voxel_of};
 use crate::model::hash_id;
 
-/// Points in a voxel without a tree, at most. Trees in voxels of 8 to 64 points cost up to a third more among evenly
-/// strewn points and gain 7% among clusters.
-const SPARSE: usize = 64;
-/// Part of a voxel's side by which places may be wrong: they are up to 2²¹ sides, rounded to 53 bits a few times.
-const MARGIN: f64 = 1.0 / (1 << 20) as f64;
+/// Maximum number of points in a voxel without a tree. Trees in voxels of 8 to 64 points cost up to a third more for
+/// evenly distributed points and save 7% for clusters.
+const MAX_WITHOUT_TREE: usize = 64;
+/// Error bound of a position within the grid, as a fraction of a voxel's side: coordinates are up to 2²¹ sides, rounded
+/// to 53 bits a few times.
+const ROUNDING: f64 = 1.0 / (1 << 20) as f64;
 
-/// Finite points, to be asked for the neighbors of each within ε.
+/// Index of finite points that answers queries for the neighbors of each point within ε.
 #[derive(Debug)]
 pub struct PointIndex {
     epsilon: f64,
     voxels: Voxels,
-    /// By voxel.
+    /// Points sorted by voxel.
     points: Vec<TreePoint>,
-    /// Of the voxels that have one.
+    /// Trees of the voxels with more than [`MAX_WITHOUT_TREE`] points, in voxel order.
     trees: Vec<Tree>,
     table: HashTable<Occupied>,
 }
@@ -46,7 +47,7 @@ pub struct PointIndex {
 struct Occupied {
     start: u32,
     len: u32,
-    /// Its place among the trees; any beyond them if it has none.
+    /// Index of its tree; an index beyond all trees if it has none.
     tree: u32,
 }
 
@@ -57,24 +58,25 @@ impl Occupied {
 }
 
 impl PointIndex {
-    /// Indexes those of `points` that are finite, at most 2³² − 2, each of an index of its own.
+    /// Indexes the finite ones of `points`, at most 2³² − 2 points with different indices.
     ///
-    /// Edges: ε = 0 finds exact duplicates, an infinite ε reaches all points.
+    /// Edge cases: ε = 0 finds exact duplicates; an infinite ε reaches all points.
     pub fn new(mut points: Vec<TreePoint>, epsilon: f64) -> Self {
         points.retain(|point| point.at.iter().all(|x| x.is_finite()));
-        // Wider than ε, lest rounding put what is exactly ε away two voxels away.
-        let voxels = Voxels::around(points.iter().map(|point| point.at), epsilon * (1.0 + 2.0 * MARGIN));
+        // Sides are slightly longer than ε, so that rounding cannot put a point exactly ε away two voxels away.
+        let voxels = Voxels::around(points.iter().map(|point| point.at), epsilon * (1.0 + 2.0 * ROUNDING));
         let rows: Vec<u32> = (0..points.len() as u32).collect();
         let order = voxels.order(&rows, |row| points[row as usize].at);
         drop(rows);
         points = order.into_iter().map(|row| points[row as usize]).collect();
         let number = |point: &TreePoint| voxels.number(point.at);
-        let same = |a: &TreePoint, b: &TreePoint| number(a) == number(b);
-        let trees: Vec<Tree> = points.par_chunk_by_mut(same).filter(|all| all.len() > SPARSE).map(Tree::new).collect();
-        let mut table = HashTable::with_capacity(points.chunk_by(same).count());
+        let in_same_voxel = |a: &TreePoint, b: &TreePoint| number(a) == number(b);
+        let trees: Vec<Tree> =
+            points.par_chunk_by_mut(in_same_voxel).filter(|all| all.len() > MAX_WITHOUT_TREE).map(Tree::new).collect();
+        let mut table = HashTable::with_capacity(points.chunk_by(in_same_voxel).count());
         let (mut start, mut tree) = (0, 0);
-        for all in points.chunk_by(same) {
-            let is_sparse = all.len() <= SPARSE;
+        for all in points.chunk_by(in_same_voxel) {
+            let is_sparse = all.len() <= MAX_WITHOUT_TREE;
             let voxel = Occupied { start, len: all.len() as u32, tree: if is_sparse { u32::MAX } else { tree } };
             table.insert_unique(hash(number(&all[0])), voxel, |voxel| hash(number(&points[voxel.start as usize])));
             start += voxel.len;
@@ -83,59 +85,61 @@ impl PointIndex {
         PointIndex { epsilon, voxels, points, trees, table }
     }
 
-    /// All points, those of a voxel together: the fastest order to ask for their neighbors in.
+    /// Returns all points, sorted by voxel: the fastest order for neighbor queries.
     pub fn points(&self) -> &[TreePoint] {
         &self.points
     }
 
-    /// What asks for neighbors: one for each thread, to be used again.
+    /// Returns a reusable query state; each thread needs its own.
     pub fn search(&self) -> NeighborSearch<'_> {
-        NeighborSearch { index: self, entered: None, around: Vec::new(), nearest: Nearest::default() }
+        NeighborSearch { index: self, last_voxel: None, around: Vec::new(), nearest: Nearest::default() }
     }
 
-    fn find(&self, number: u64) -> Option<Occupied> {
-        let is_it = |voxel: &Occupied| self.voxels.number(self.points[voxel.start as usize].at) == number;
-        self.table.find(hash(number), is_it).copied()
+    fn find_voxel(&self, number: u64) -> Option<Occupied> {
+        let has_number = |voxel: &Occupied| self.voxels.number(self.points[voxel.start as usize].at) == number;
+        self.table.find(hash(number), has_number).copied()
     }
 }
 
-/// The hash of a voxel's number. Eight voxels that make up a cube follow one another in the table: what surrounds a
-/// voxel is then in 8 places of memory, not in 27. The table compares the highest bits first, so they differ too.
+/// Returns the hash of a voxel's number. The eight voxels of a 2×2×2 cube follow one another in the table, so that the
+/// 27 voxels around a position lie in 8 places of memory instead of 27. The table compares the highest bits first, so
+/// these differ within a cube too.
 fn hash(number: u64) -> u64 {
     let corner = number & 7;
     (hash_id(number >> 3) & !7 | corner) ^ corner << 60
 }
 
-/// Asks an index for neighbors, and remembers what surrounds the voxel asked about last.
+/// Query state that remembers the neighborhood of the voxel queried last.
 #[derive(Debug)]
 pub struct NeighborSearch<'a> {
     index: &'a PointIndex,
-    entered: Option<[u32; 3]>,
-    /// The occupied voxels around that one and itself, the step to each along the axes, as in [`STEPS`].
+    last_voxel: Option<[u32; 3]>,
+    /// Occupied voxels among the last queried voxel and its 26 neighbors, with the step to each along the axes as in
+    /// [`STEPS`].
     around: Vec<([u8; 3], Occupied)>,
     nearest: Nearest,
 }
 
 impl NeighborSearch<'_> {
-    /// The at most `k` nearest indexed points other than `query` whose distance to `at` is at most
-    /// ε, nearest first, equal distances by index; and whether there were more than `k`.
+    /// Returns the at most `k` nearest indexed points other than `query` whose distance to `at` is at most ε, nearest
+    /// first, equal distances by index; and whether there were more than `k`.
     ///
-    /// Squared distances are summed in f64 and compared with ε². Edges: a point that is not finite
-    /// has no neighbors.
+    /// Squared distances are summed in f64 and compared with ε². Edge case: a point that is not finite has no
+    /// neighbors.
     pub fn nearest(&mut self, query: u32, at: [f32; 3], k: usize) -> (impl ExactSizeIterator<Item = u32>, bool) {
         let index = self.index;
-        // One more than k tells whether the list was cut.
+        // One neighbor more than k shows whether the list was cut.
         self.nearest.start(query, at, k + 1, index.epsilon);
         if at.iter().all(|x| x.is_finite()) {
-            let place = index.voxels.place(at);
-            let voxel = voxel_of(place);
-            if self.entered != Some(voxel) {
-                self.enter(voxel);
+            let position = index.voxels.place(at);
+            let voxel = voxel_of(position);
+            if self.last_voxel != Some(voxel) {
+                self.look_up(voxel);
             }
-            // By step and axis, the least squared distance, which adds up over the axes.
-            let gap = |part: f64| ((part - MARGIN).max(0.0) * index.voxels.side()).powi(2);
+            // Smallest squared distance to the neighboring voxels, by step and axis; it adds up over the axes.
+            let gap = |part: f64| ((part - ROUNDING).max(0.0) * index.voxels.side()).powi(2);
             let gaps: [[f64; 3]; 3] = std::array::from_fn(|c| {
-                let inside = place[c] - f64::from(voxel[c]);
+                let inside = position[c] - f64::from(voxel[c]);
                 [0.0, gap(inside), gap(1.0 - inside)]
             });
             for &(step, occupied) in &self.around {
@@ -152,23 +156,23 @@ impl NeighborSearch<'_> {
         (found[..found.len().min(k)].iter().map(|&(_, index)| index), found.len() > k)
     }
 
-    /// Looks up what surrounds `voxel`.
-    fn enter(&mut self, voxel: [u32; 3]) {
-        self.entered = Some(voxel);
-        // The one below the first wraps to a number that is beyond the last.
+    /// Looks up the occupied voxels at and around `voxel`.
+    fn look_up(&mut self, voxel: [u32; 3]) {
+        self.last_voxel = Some(voxel);
+        // The number below 0 wraps to a number beyond the last voxel.
         let numbers: [[Option<u64>; 3]; 3] =
             std::array::from_fn(|c| [voxel[c], voxel[c].wrapping_sub(1), voxel[c] + 1].map(|number| along(c, number)));
         let index = self.index;
         self.around.clear();
         self.around.extend(STEPS.iter().filter_map(|&step| {
             let [x, y, z] = std::array::from_fn(|c| numbers[c][usize::from(step[c])]);
-            Some((step, index.find(x? | y? | z?)?))
+            Some((step, index.find_voxel(x? | y? | z?)?))
         }));
     }
 }
 
-/// To a voxel itself and the 26 around it, by axis: 0 stays, 1 goes down, 2 goes up. First itself, then those that
-/// share a side, an edge and a corner: the nearer they are, the sooner the farther ones can be skipped.
+/// Steps to a voxel itself and the 26 around it, by axis: 0 stays, 1 goes down, 2 goes up. The voxel itself comes
+/// first, then those that share a side, an edge and a corner: near voxels first let more of the far ones be skipped.
 const STEPS: [[u8; 3]; 27] = {
     let mut steps = [[0; 3]; 27];
     let (mut filled, mut moved) = (0, 0);
@@ -195,14 +199,14 @@ mod tests {
 
     use super::*;
 
-    fn named(points: &[[f32; 3]]) -> Vec<TreePoint> {
+    fn numbered(points: &[[f32; 3]]) -> Vec<TreePoint> {
         points.iter().zip(0..).map(|(&at, index)| TreePoint { at, index }).collect()
     }
 
-    fn indexed(points: &[[f32; 3]], k: usize, epsilon: f64) -> Vec<(Vec<u32>, bool)> {
-        let index = PointIndex::new(named(points), epsilon);
+    fn found_by_index(points: &[[f32; 3]], k: usize, epsilon: f64) -> Vec<(Vec<u32>, bool)> {
+        let index = PointIndex::new(numbered(points), epsilon);
         let mut search = index.search();
-        named(points)
+        numbered(points)
             .iter()
             .map(|point| {
                 let (found, truncated) = search.nearest(point.index, point.at, k);
@@ -235,18 +239,18 @@ mod tests {
             k in 1usize..9,
             epsilon in 0.0..1.5f64,
         ) {
-            prop_assert_eq!(indexed(&points, k, epsilon), brute_force(&points, k, epsilon));
+            prop_assert_eq!(found_by_index(&points, k, epsilon), brute_force(&points, k, epsilon));
         }
 
-        // A coarse lattice: many points coincide, most distances tie.
+        // A coarse grid: many points coincide, most distances tie.
         #[test]
-        fn neighbors_equal_brute_force_among_duplicates_and_ties(
+        fn duplicates_and_ties_equal_brute_force(
             cells in prop::collection::vec(prop::array::uniform3(0u8..3), 0..150),
             k in 1usize..9,
             epsilon in prop::sample::select(vec![0.0, 1.0, 2.0, 4.0]),
         ) {
             let points: Vec<[f32; 3]> = cells.iter().map(|cell| cell.map(f32::from)).collect();
-            prop_assert_eq!(indexed(&points, k, epsilon), brute_force(&points, k, epsilon));
+            prop_assert_eq!(found_by_index(&points, k, epsilon), brute_force(&points, k, epsilon));
         }
     }
 
@@ -255,52 +259,56 @@ mod tests {
 
         // Clusters far narrower and far wider than ε: voxels with and without trees, and borders between them.
         #[test]
-        fn neighbors_equal_brute_force_among_clusters_far_from_the_origin(
+        fn distant_clusters_equal_brute_force(
             centers in prop::collection::vec(prop::array::uniform3(-1.0..1.0f32), 1..5),
-            within in prop::collection::vec((0usize..5, prop::array::uniform3(-1.0..1.0f32)), 0..500),
+            offsets in prop::collection::vec((0usize..5, prop::array::uniform3(-1.0..1.0f32)), 0..500),
             width in prop::sample::select(vec![1e-3f32, 0.03, 1.0]),
             offset in prop::sample::select(vec![0.0f32, -3.0, 1e4, -1e7, 1e30]),
             k in 1usize..40,
             epsilon in prop::sample::select(vec![1e-30, 1e-3, 0.02, 0.25, 2.0, 1e6, f64::INFINITY]),
         ) {
             let center = |c: usize| centers[c % centers.len()];
-            let place = |(c, d): &(usize, [f32; 3])| std::array::from_fn(|x| offset + center(*c)[x] + width * d[x]);
-            let points: Vec<[f32; 3]> = within.iter().map(place).collect();
-            prop_assert_eq!(indexed(&points, k, epsilon), brute_force(&points, k, epsilon));
+            let position = |(c, d): &(usize, [f32; 3])| std::array::from_fn(|x| offset + center(*c)[x] + width * d[x]);
+            let points: Vec<[f32; 3]> = offsets.iter().map(position).collect();
+            prop_assert_eq!(found_by_index(&points, k, epsilon), brute_force(&points, k, epsilon));
         }
 
-        // One point at the edge of what f32 holds makes voxels wider than everything else.
+        // One point at the end of the range of f32 makes voxels wider than all other distances.
         #[test]
-        fn neighbors_equal_brute_force_beside_a_point_at_the_end_of_the_world(
+        fn extreme_coordinates_equal_brute_force(
             points in prop::collection::vec(prop::array::uniform3(-1.0..1.0f32), 0..150),
             k in 1usize..9,
             epsilon in 0.0..1.5f64,
         ) {
             let points = [vec![[f32::MAX, f32::MIN, 0.0]], points, vec![[f32::MIN; 3]]].concat();
-            prop_assert_eq!(indexed(&points, k, epsilon), brute_force(&points, k, epsilon));
+            prop_assert_eq!(found_by_index(&points, k, epsilon), brute_force(&points, k, epsilon));
         }
     }
 
-    // Neighbors exactly ε away, on the borders of voxels, wherever the grid begins and however wide ε is.
+    // Neighbors exactly ε away, on the borders of voxels, for several grid origins and values of ε.
     #[test]
-    fn what_is_exactly_epsilon_away_is_found() {
+    fn points_exactly_epsilon_away_are_found() {
         for unit in [1.0f32, 0.1, 3e-7, 7e9] {
             let points: Vec<[f32; 3]> = (0..1000u16).map(|i| [f32::from(i) * unit, unit, -unit]).collect();
             for steps in [1, 2, 3] {
                 let epsilon = f64::from(points[steps][0]);
-                assert_eq!(indexed(&points, 8, epsilon), brute_force(&points, 8, epsilon), "{steps} steps of {unit}");
+                assert_eq!(
+                    found_by_index(&points, 8, epsilon),
+                    brute_force(&points, 8, epsilon),
+                    "{steps} steps of {unit}"
+                );
             }
         }
     }
 
     #[test]
-    fn the_order_in_which_points_are_given_changes_nothing() {
+    fn input_order_changes_no_neighbors() {
         let points: Vec<[f32; 3]> = (0..2000).map(|i| [i % 7, i % 11, i % 13].map(|x| x as f32 * 0.1)).collect();
-        let mut turned = named(&points);
-        turned.reverse();
-        let (index, turned) = (PointIndex::new(named(&points), 0.15), PointIndex::new(turned, 0.15));
-        let (mut search, mut other) = (index.search(), turned.search());
-        for point in named(&points) {
+        let mut reversed = numbered(&points);
+        reversed.reverse();
+        let (index, reversed) = (PointIndex::new(numbered(&points), 0.15), PointIndex::new(reversed, 0.15));
+        let (mut search, mut other) = (index.search(), reversed.search());
+        for point in numbered(&points) {
             let (found, cut) = search.nearest(point.index, point.at, 5);
             let (expected, expected_cut) = other.nearest(point.index, point.at, 5);
             assert!(found.eq(expected) && cut == expected_cut, "{point:?}");
@@ -308,15 +316,15 @@ mod tests {
     }
 
     #[test]
-    fn points_that_are_not_finite_have_no_neighbors_and_are_none() {
+    fn non_finite_points_neither_have_nor_are_neighbors() {
         let points = [[0.0; 3], [f32::NAN, 0.0, 0.0], [0.0; 3], [f32::INFINITY; 3]];
-        let found = indexed(&points, 4, f64::MAX.sqrt());
+        let found = found_by_index(&points, 4, f64::MAX.sqrt());
         assert_eq!(found.iter().map(|(list, _)| list.clone()).collect::<Vec<_>>(), [vec![2], vec![], vec![0], vec![]]);
     }
 
     #[test]
-    fn excluded_points_do_not_take_a_place_among_the_k() {
-        let mut points = named(&[[0.0; 3], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0]]);
+    fn excluded_points_do_not_count_among_the_k() {
+        let mut points = numbered(&[[0.0; 3], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0]]);
         points.remove(1);
         let index = PointIndex::new(points, 5.0);
         let mut search = index.search();
@@ -324,22 +332,22 @@ mod tests {
         assert_eq!((found.collect::<Vec<_>>(), truncated), (vec![2], false));
     }
 
-    /// Seconds for all neighbors of `points`, and how many lists were cut.
-    fn timed(points: &[[f32; 3]], k: usize, epsilon: f64) -> (f64, usize) {
+    /// Returns the seconds taken by the queries for all neighbors of `points`, and how many lists were cut.
+    fn time_queries(points: &[[f32; 3]], k: usize, epsilon: f64) -> (f64, usize) {
         let start = Instant::now();
-        let index = PointIndex::new(named(points), epsilon);
-        let ask = |search: &mut NeighborSearch<'_>, point: &TreePoint| {
+        let index = PointIndex::new(numbered(points), epsilon);
+        let query_one = |search: &mut NeighborSearch<'_>, point: &TreePoint| {
             usize::from(search.nearest(point.index, point.at, k).1)
         };
-        let cut = index.points().par_iter().map_init(|| index.search(), ask).sum();
+        let cut = index.points().par_iter().map_init(|| index.search(), query_one).sum();
         (start.elapsed().as_secs_f64(), cut)
     }
 
     #[test]
-    fn a_crowd_at_one_point_costs_bounded_time_and_every_list_is_reported_cut() {
-        let (seconds, cut) = timed(&vec![[1.0, 2.0, 3.0]; 200_000], 32, 0.1);
+    fn coincident_points_take_bounded_time() {
+        let (seconds, cut) = time_queries(&vec![[1.0, 2.0, 3.0]; 200_000], 32, 0.1);
         assert_eq!(cut, 200_000);
-        // All pairs would be 4e10 distances; 60 s leaves a slow shared machine its share.
+        // All pairs would be 4e10 distances; 60 s leaves time for a slow shared machine.
         assert!(seconds < 60.0, "{seconds} s for 200,000 coincident points");
     }
 
@@ -347,13 +355,13 @@ mod tests {
     #[ignore = "ten million points: minutes and gigabytes; run with --release"]
     fn ten_million_points_in_one_voxel_cost_bounded_time() {
         let n = 10_000_000;
-        let place = |i: u64, salt: u64| {
+        let position = |i: u64, salt: u64| {
             let hash = xxhash_rust::xxh3::xxh3_64_with_seed(&i.to_le_bytes(), salt);
             (hash >> 40) as f32 / (1u64 << 24) as f32
         };
-        let spread: Vec<[f32; 3]> = (0..n).map(|i| [place(i, 0), place(i, 1), place(i, 2)]).collect();
+        let spread: Vec<[f32; 3]> = (0..n).map(|i| [position(i, 0), position(i, 1), position(i, 2)]).collect();
         for (name, points) in [("spread", spread), ("coincident", vec![[0.5; 3]; n as usize])] {
-            let (seconds, cut) = timed(&points, 32, 1.0);
+            let (seconds, cut) = time_queries(&points, 32, 1.0);
             eprintln!("{name}: {seconds:.1} s, {cut} lists cut");
             assert_eq!(cut, n as usize);
         }

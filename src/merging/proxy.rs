@@ -1,8 +1,8 @@
-//! The proxy: the one Gaussian that stands for a cluster.
+//! The proxy: the single Gaussian that replaces a cluster.
 //!
-//! In: states of all members at the reference frame and their weights. Out: a state in the stored
-//! encoding, one row per cluster. Memory: 1 KiB per cluster for at most 4096 of them at a time, beside
-//! the output; of a crowd at one place 220 bytes per member, less than the pairs that led to it may take.
+//! Input: states of all members at the reference frame, and their weights. Output: a state in the stored encoding, one
+//! row per cluster. Memory: 1 KiB per cluster for at most 4096 of them at a time, beside the output; for a large set of
+//! coincident Gaussians 220 bytes per member, less than the pairs that led to it may take.
 
 use glam::{DQuat, DVec3};
 use rayon::prelude::*;
@@ -13,31 +13,32 @@ use super::moments::{Ellipsoid, WeightedGaussian, align_axes, moments};
 use crate::model::{self, Columns, Gaussians};
 use crate::recipe::{self, Placement, ProxyOpacity, ShHigh};
 
-/// Clusters merged between two writes into the output planes.
+/// Number of clusters merged between two writes to the output planes.
 const BATCH: usize = 4096;
-/// Opacities of proxies stay within [this, 1 − this], where the logit is finite in f32.
+/// Distance of a proxy's opacity from 0 and 1: opacities stay within [this, 1 − this], where the logit is finite in
+/// f32.
 const OPACITY_MARGIN: f64 = 1.0 / (1u32 << 24) as f64;
-/// Exponent of Thomsen's surface formula (Knud Thomsen, 2004; see Michon, "Surface area of an
+/// Exponent of Thomsen's formula for the surface of an ellipsoid (Knud Thomsen, 2004; see Michon, "Surface area of an
 /// ellipsoid").
 const THOMSEN: f64 = 1.6075;
 
 /// State of a proxy at the reference frame, in the encoding of [`Gaussians`] but in f64.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ProxyState {
-    /// Scene units.
+    /// Center, in scene units.
     pub position: DVec3,
-    /// wxyz, unit; axes named as the leader's, sign nearest to the leader's quaternion.
+    /// Unit quaternion, wxyz; axes in the leader's order, sign nearest to the leader's quaternion.
     pub rotation: [f64; 4],
-    /// Natural log of scene units, finite.
+    /// Natural logarithms of the scales in scene units, finite.
     pub log_scale: [f64; 3],
-    /// Finite.
+    /// Logit of the opacity, finite.
     pub opacity_logit: f64,
-    /// Laid out as a row of [`Gaussians::sh`].
+    /// SH coefficients, laid out as a row of [`Gaussians::sh`].
     pub sh: Vec<f64>,
 }
 
 impl ProxyState {
-    /// Writes the columns `want` into row `row` of `out`, rounded to f32.
+    /// Writes the attributes `want` to row `row` of `out`, rounded to f32.
     pub fn write(&self, want: Columns, row: usize, out: &mut Gaussians) {
         for column in want.iter() {
             match column {
@@ -55,53 +56,54 @@ impl ProxyState {
     }
 }
 
-/// What makes a member weigh.
+/// Values that determine the weights of members, by id.
 #[derive(Debug, Clone, Copy)]
 pub struct Importance<'a> {
     /// Id of every row of the states.
     pub ids: &'a [u32],
-    /// C by id.
+    /// Contribution C by id.
     pub coverage: &'a [f64],
-    /// Vis by id.
+    /// Visibility Vis by id.
     pub visibility: &'a [f64],
 }
 
 impl Importance<'_> {
-    /// C of a row.
+    /// Returns C of a row.
     pub(super) fn coverage(&self, row: u32) -> f64 {
         self.coverage[self.ids[row as usize] as usize]
     }
 
-    /// C·Vis of a row.
-    fn seen(&self, row: u32) -> f64 {
+    /// Returns C·Vis of a row.
+    fn weighted_contribution(&self, row: u32) -> f64 {
         self.coverage(row) * self.visibility[self.ids[row as usize] as usize]
     }
 }
 
-/// Weights of the rows `members`, w ∝ C·Vis, summing to 1. Where that sum is not positive and finite
-/// w ∝ opacity × area, and where that fails too all weigh the same.
+/// Returns the weights of the rows `members`, w ∝ C·Vis, summing to 1. If that sum is not positive and finite, w ∝
+/// opacity × area; if that fails too, all weights are equal.
 pub fn weights(members: &[u32], importance: &Importance<'_>, states: &Gaussians) -> Vec<f64> {
-    let seen = |&i: &u32| importance.seen(i);
-    let covered = |&i: &u32| opacity(states, i) * mean_area(scales(states, i));
+    let weighted_contribution = |&i: &u32| importance.weighted_contribution(i);
+    let opaque_area = |&i: &u32| opacity(states, i) * mean_area(scales(states, i));
     let share = |weights: Vec<f64>| {
         let total: f64 = weights.iter().sum();
         let sound = total.is_normal() && weights.iter().all(|&w| w >= 0.0);
         sound.then(|| weights.into_iter().map(|w| w / total).collect())
     };
-    share(members.iter().map(seen).collect())
-        .or_else(|| share(members.iter().map(covered).collect()))
+    share(members.iter().map(weighted_contribution).collect())
+        .or_else(|| share(members.iter().map(opaque_area).collect()))
         .unwrap_or_else(|| vec![1.0 / members.len() as f64; members.len()])
 }
 
-/// The proxy of `members` — rows of `states` with weights that sum to 1, `leader` among them.
+/// Computes the proxy of `members`: rows of `states` with weights that sum to 1, `leader` among them.
 ///
-/// Mean and covariance are the mixture's; with [`Placement::Leader`] the proxy sits at the leader and
-/// takes the second moments about it. Base color is the weighted average, higher bands that or the
-/// heaviest member's (ties to the first). Opacity: [`ProxyOpacity`], an area being the mean over all
-/// directions of the ellipsoid's shadow. Exact duplicates give the leader's own position, axes,
-/// scales and color. A zero quaternion is the identity.
+/// Mean and covariance are the mixture's; with [`Placement::Leader`] the proxy has the leader's position and the second
+/// moments about it. The base color is the weighted average; higher SH degrees are the weighted average or the heaviest
+/// member's (ties to the first). Opacity follows [`ProxyOpacity`]; areas are the mean projected area of the ellipsoid
+/// over all directions. Exact duplicates give the leader's own position, axes, scales and color. A zero quaternion
+/// counts as the identity.
 ///
-/// Colors are left out unless `want` names them: they lie far apart, and most sequences have the same at every frame.
+/// Colors are computed only if `want` contains them: they are slow to read, and in most sequences they are the same at
+/// every frame.
 pub fn merge_state(
     members: &[(u32, f64)],
     states: &Gaussians,
@@ -109,8 +111,8 @@ pub fn merge_state(
     merge: &recipe::MergeParams,
     want: Columns,
 ) -> ProxyState {
-    // All in the leader's frame: coordinates far from the origin cancel once, and Jacobi starts from
-    // the leader's axes, so it turns them only as far as the other members ask.
+    // All values are relative to the leader's frame: coordinates far from the origin cancel once, and the Jacobi
+    // iteration starts from the leader's axes, so it rotates them only as far as the other members require.
     let origin = position(states, leader);
     let frame = unit_rotation(states.rotation.row(leader as usize));
     let part = |&(i, weight): &(u32, f64)| {
@@ -132,7 +134,7 @@ pub fn merge_state(
     ProxyState {
         position: origin + frame * local.mean,
         rotation: nearest_sign(frame * local.rotation, frame),
-        // A scale that underflowed is still a finite one.
+        // An underflowed scale is replaced by the smallest positive one, whose logarithm is finite.
         log_scale: local.scales.to_array().map(|scale| scale.max(f64::MIN_POSITIVE).ln()),
         opacity_logit: logit(merged_opacity(members, states, &local, merge.opacity)),
         sh: match want.contains(Columns::SH) {
@@ -142,7 +144,7 @@ pub fn merge_state(
     }
 }
 
-/// One row per group of more than one member, in their order: its proxy.
+/// Computes the proxy of every group of more than one member: one row per group, in their order.
 pub fn merge_groups(
     groups: &MergeGroups,
     importance: &Importance<'_>,
@@ -186,16 +188,16 @@ fn logit(opacity: f64) -> f64 {
     (opacity / (1.0 - opacity)).ln()
 }
 
-/// wxyz of a unit quaternion, in the sign nearest to `reference`.
+/// Returns the wxyz of a unit quaternion, in the sign nearest to `reference`.
 fn nearest_sign(rotation: DQuat, reference: DQuat) -> [f64; 4] {
     let rotation = rotation.normalize();
     let q = if rotation.dot(reference) < 0.0 { -rotation } else { rotation };
     [q.w, q.x, q.y, q.z]
 }
 
-/// Mean area of the shadow of an ellipsoid with these half axes over all directions: a quarter of
-/// its surface (Cauchy), by Thomsen's formula, within 1.1%. The plain mean of the three cross
-/// sections would call a pancake that thickens to 0.3 of its width 60% larger; it is 18% larger.
+/// Returns the mean projected area, over all directions, of an ellipsoid with these half axes. The area is a quarter of
+/// the surface (Cauchy), by Thomsen's formula, within 1.1%. The plain mean of the three cross sections would
+/// overestimate the growth of a flat Gaussian that thickens to 0.3 of its width: 60% instead of 18%.
 fn mean_area(scales: DVec3) -> f64 {
     let largest = scales.max_element();
     if largest <= 0.0 {
@@ -206,17 +208,18 @@ fn mean_area(scales: DVec3) -> f64 {
     std::f64::consts::PI * mean.powf(1.0 / THOMSEN) * largest * largest
 }
 
-/// Opacity of the proxy by `rule`, clamped so that its logit is finite.
+/// Returns the opacity of the proxy by `rule`, clamped so that its logit is finite.
 fn merged_opacity(members: &[(u32, f64)], states: &Gaussians, proxy: &Ellipsoid, rule: ProxyOpacity) -> f64 {
     let sum = || members.iter().map(|&(i, _)| opacity(states, i)).sum::<f64>();
     let opacity = match rule {
         ProxyOpacity::Sum => sum(),
         ProxyOpacity::Union => 1.0 - members.iter().map(|&(i, _)| 1.0 - opacity(states, i)).product::<f64>(),
         ProxyOpacity::Area => {
-            let covered: f64 = members.iter().map(|&(i, _)| opacity(states, i) * mean_area(scales(states, i))).sum();
+            let opaque_area: f64 =
+                members.iter().map(|&(i, _)| opacity(states, i) * mean_area(scales(states, i))).sum();
             let area = mean_area(proxy.scales);
-            // Scales that underflowed have no area to conserve.
-            if area.is_normal() { covered / area } else { sum() }
+            // Underflowed scales have no area to conserve.
+            if area.is_normal() { opaque_area / area } else { sum() }
         }
     };
     opacity.clamp(OPACITY_MARGIN, 1.0 - OPACITY_MARGIN)
@@ -228,7 +231,7 @@ fn merged_sh(members: &[(u32, f64)], states: &Gaussians, leader: u32, high: ShHi
         .fold((leader, f64::NEG_INFINITY), |best, &(i, weight)| if weight > best.1 { (i, weight) } else { best })
         .0;
     let average = |plane: &[f32]| {
-        // Differences from the leader: equal colors stay equal to the last bit.
+        // Averaging differences from the leader keeps equal colors equal to the last bit.
         let base = f64::from(plane[leader as usize]);
         base + members.iter().map(|&(i, weight)| weight * (f64::from(plane[i as usize]) - base)).sum::<f64>()
     };
@@ -250,7 +253,7 @@ mod tests {
         MergeParams { placement, opacity, ..Recipe::preset("default").unwrap().merge }
     }
 
-    /// `n` copies of a Gaussian of degree 1.
+    /// Returns `n` copies of a Gaussian of SH degree 1.
     fn copies(n: usize, log_scale: [f32; 3], rotation: [f32; 4]) -> Gaussians {
         let mut states = Gaussians::zeros(n, 1);
         for i in 0..n {
@@ -262,13 +265,13 @@ mod tests {
         states
     }
 
-    fn alike(n: u32) -> Vec<(u32, f64)> {
+    fn equal_weights(n: u32) -> Vec<(u32, f64)> {
         (0..n).map(|i| (i, 1.0 / f64::from(n))).collect()
     }
 
     #[test]
-    fn duplicates_merge_to_the_same_gaussian_with_opacity_by_the_rule() {
-        // (opacity of each, how many, rule, expected)
+    fn duplicates_merge_to_the_leader_with_opacity_by_rule() {
+        // Cases: (rule, expected opacity); three members of opacity 0.2 each.
         for (rule, expected) in
             [(ProxyOpacity::Sum, 0.6), (ProxyOpacity::Union, 1.0 - 0.8f64.powi(3)), (ProxyOpacity::Area, 0.6)]
         {
@@ -276,7 +279,7 @@ mod tests {
                 for scale in [[-3.0, -5.0, -4.0], [-4.0, -4.0, -9.0], [0.0; 3]] {
                     let mut states = copies(3, scale, [0.9, -1.3, 0.2, 0.4]);
                     states.opacity_logit.plane_mut(0).fill(logit(0.2) as f32);
-                    let got = merge_state(&alike(3), &states, 1, &recipe(placement, rule), Columns::all());
+                    let got = merge_state(&equal_weights(3), &states, 1, &recipe(placement, rule), Columns::all());
                     assert_eq!(got.position.to_array().map(|x| x as f32), states.position.row(1));
                     assert_eq!(got.log_scale.map(|x| x as f32), scale);
                     assert_eq!(got.sh.iter().map(|&x| x as f32).collect::<Vec<_>>(), states.sh.row::<12>(1));
@@ -297,21 +300,27 @@ mod tests {
             for logit in [f32::MIN, -200.0, 0.0, 200.0, f32::MAX, f32::INFINITY, f32::NEG_INFINITY] {
                 let mut states = copies(2, [0.0, -1.0, -2.0], [1.0, 0.0, 0.0, 0.0]);
                 states.opacity_logit.plane_mut(0).fill(logit);
-                let got =
-                    merge_state(&alike(2), &states, 0, &recipe(Placement::Mean, rule), Columns::all()).opacity_logit;
+                let got = merge_state(&equal_weights(2), &states, 0, &recipe(Placement::Mean, rule), Columns::all())
+                    .opacity_logit;
                 assert!(got.is_finite() && got.abs() < 17.0, "{rule:?} of {logit}: {got}");
             }
         }
     }
 
     #[test]
-    fn needle_of_1_to_1e12_and_scales_1e_12_and_1e6_survive_merging_with_their_duplicate() {
+    fn extreme_scales_survive_merging_with_duplicates() {
         let needle = [1e6f32.ln(), 1.0f32.ln(), 1e-6f32.ln()];
         for scale in
             [needle, [1e-12f32.ln(); 3], [1e6f32.ln(); 3], [1e6f32.ln(), 1e-12f32.ln(), 1e-12f32.ln()], [-800.0; 3]]
         {
             let states = copies(2, scale, [0.9, -1.3, 0.2, 0.4]);
-            let got = merge_state(&alike(2), &states, 0, &recipe(Placement::Mean, ProxyOpacity::Area), Columns::all());
+            let got = merge_state(
+                &equal_weights(2),
+                &states,
+                0,
+                &recipe(Placement::Mean, ProxyOpacity::Area),
+                Columns::all(),
+            );
             for (got, expected) in got.log_scale.iter().zip(scale.map(|x| f64::from(x).max(f64::MIN_POSITIVE.ln()))) {
                 assert!((got - expected).abs() < 1e-12, "got {got}, expected {expected}");
             }
@@ -321,13 +330,14 @@ mod tests {
     #[test]
     fn a_zero_quaternion_is_the_identity() {
         let states = copies(2, [0.0, -1.0, -2.0], [0.0; 4]);
-        let got = merge_state(&alike(2), &states, 0, &recipe(Placement::Mean, ProxyOpacity::Sum), Columns::all());
+        let got =
+            merge_state(&equal_weights(2), &states, 0, &recipe(Placement::Mean, ProxyOpacity::Sum), Columns::all());
         assert_eq!(got.rotation, [1.0, 0.0, 0.0, 0.0]);
     }
 
     #[test]
-    fn the_leader_keeps_its_place_names_of_axes_and_sign() {
-        // The second axis is the longest: canonical order would rename it.
+    fn the_leader_keeps_position_axis_order_and_sign() {
+        // The second axis is the longest, so the canonical order would permute the axes.
         let mut states = copies(2, [-3.0, -1.0, -5.0], [-0.9, 0.2, 0.1, 0.3]);
         states.position.set_row(1, [1000.3, -7.1, 0.12]);
         let got = merge_state(
@@ -354,7 +364,7 @@ mod tests {
     }
 
     #[test]
-    fn higher_bands_average_or_follow_the_heaviest() {
+    fn higher_sh_degrees_average_or_follow_the_heaviest() {
         let mut states = copies(2, [0.0; 3], [1.0, 0.0, 0.0, 0.0]);
         states.sh.set_row(0, [1.0f32; 12]);
         states.sh.set_row(1, [0.0f32; 12]);
@@ -366,7 +376,7 @@ mod tests {
     }
 
     #[test]
-    fn a_cluster_nobody_sees_weighs_by_opacity_and_area_then_evenly() {
+    fn unseen_clusters_weigh_by_opacity_and_area_then_evenly() {
         let mut states = copies(3, [0.0; 3], [1.0, 0.0, 0.0, 0.0]);
         states.log_scale.set_row(2, [2f32.sqrt().ln(); 3]);
         let by = |coverage: &[f64], states: &Gaussians| {
@@ -386,7 +396,7 @@ mod tests {
     fn mean_area_is_a_quarter_of_the_surface() {
         let pi = std::f64::consts::PI;
         assert!((mean_area(DVec3::ONE) - pi).abs() < 1e-12);
-        // A flat disc has two faces of πr²; Thomsen's formula is 1% off there.
+        // A flat disc has two faces of πr²; Thomsen's formula is off by 1% there.
         assert!((mean_area(DVec3::new(1.0, 1.0, 0.0)) / (pi / 2.0) - 1.0).abs() < 0.011);
         assert!((mean_area(DVec3::splat(1e6)) / (pi * 1e12) - 1.0).abs() < 1e-12);
         assert_eq!(mean_area(DVec3::ZERO), 0.0);
@@ -395,13 +405,13 @@ mod tests {
     proptest! {
         #[test]
         fn opacity_times_area_is_conserved_below_saturation(
-            spread in prop::array::uniform3(-0.1..0.1f32),
+            offset in prop::array::uniform3(-0.1..0.1f32),
             logits in prop::array::uniform2(-9.0..-2.0f32),
         ) {
             let mut states = copies(2, [-2.0, -3.0, -5.0], [0.5, 0.5, -0.1, 0.7]);
-            states.position.set_row(1, [1000.25 + spread[0], -7.125 + spread[1], 0.1 + spread[2]]);
+            states.position.set_row(1, [1000.25 + offset[0], -7.125 + offset[1], 0.1 + offset[2]]);
             states.opacity_logit.plane_mut(0).copy_from_slice(&logits);
-            let got = merge_state(&alike(2), &states, 0, &recipe(Placement::Mean, ProxyOpacity::Area), Columns::all());
+            let got = merge_state(&equal_weights(2), &states, 0, &recipe(Placement::Mean, ProxyOpacity::Area), Columns::all());
             let before: f64 = (0..2).map(|i| opacity(&states, i) * mean_area(scales(&states, i))).sum();
             let after = mean_area(DVec3::from(got.log_scale.map(f64::exp))) / (1.0 + (-got.opacity_logit).exp());
             prop_assert!((after / before - 1.0).abs() < 1e-12, "before {before}, after {after}");

@@ -1,4 +1,4 @@
-//! Claims about whole passes.
+//! Tests of whole merge passes.
 
 use std::convert::Infallible;
 
@@ -10,13 +10,13 @@ use super::*;
 use crate::model::Column;
 use crate::recipe::{MergeParams, MotionParams, Recipe};
 
-/// A number in [0, 1) for Gaussian `i`, another for every `salt`.
+/// Returns a number in [0, 1) for Gaussian `i`, different for every `salt`.
 fn uniform(i: usize, salt: u64) -> f64 {
     (xxh3_64_with_seed(&(i as u64).to_le_bytes(), salt) >> 11) as f64 / (1u64 << 53) as f64
 }
 
-/// Survivors that own what they point to.
-struct Scene {
+/// Survivors with all the data that [`Survivors`] borrows.
+struct TestScene {
     states: Gaussians,
     ids: Vec<u32>,
     coverage: Vec<f64>,
@@ -25,9 +25,9 @@ struct Scene {
     extent: f64,
 }
 
-impl Scene {
-    /// `n` similar Gaussians, strewn evenly over the unit cube.
-    fn strewn(n: usize) -> Self {
+impl TestScene {
+    /// Creates `n` similar Gaussians, evenly distributed in the unit cube.
+    fn uniform_cube(n: usize) -> Self {
         let mut states = Gaussians::zeros(n, 1);
         let size = 0.7 * (n.max(1) as f64).powf(-1.0 / 3.0);
         for i in 0..n {
@@ -38,7 +38,7 @@ impl Scene {
             states.opacity_logit.set_row(i, [4.0 * value(9) - 2.0]);
             states.sh.set_row::<12>(i, std::array::from_fn(|k| 0.5 + 0.1 * value(10 + k as u64)));
         }
-        Scene {
+        TestScene {
             states,
             ids: (0..n as u32).collect(),
             coverage: (0..n).map(|i| uniform(i, 30)).collect(),
@@ -48,7 +48,7 @@ impl Scene {
         }
     }
 
-    /// The default recipe with a reach of about two Gaussians here.
+    /// Returns the default recipe with an ε of about two Gaussians of this scene.
     fn recipe(&self) -> MergeParams {
         let mut merge = Recipe::preset("default").unwrap().merge;
         merge.passes[0].epsilon = 1.2 * (self.states.len() as f64).powf(-1.0 / 3.0);
@@ -60,39 +60,40 @@ impl Scene {
         self.merge_moving(recipe, limit, std::slice::from_ref(&self.states.position))
     }
 
-    /// Merges with everything alive and at `frames`, the first of which is the reference.
+    /// Merges with all Gaussians alive at `frames`, the first of which is the reference frame.
     fn merge_moving(&self, recipe: &MergeParams, limit: Option<usize>, frames: &[Column]) -> Merged {
         let rows: Vec<u32> = (0..self.states.len() as u32).collect();
         self.merge_rows(&rows, recipe, limit, frames)
     }
 
-    /// [`Scene::merge_moving`] of some rows.
+    /// Merges selected rows like [`TestScene::merge_moving`].
     fn merge_rows(&self, rows: &[u32], recipe: &MergeParams, limit: Option<usize>, frames: &[Column]) -> Merged {
-        self.merge_in_parts(rows, recipe, limit, frames, usize::MAX).0
+        self.merge_in_batches(rows, recipe, limit, frames, usize::MAX).0
     }
 
-    /// [`Scene::merge_rows`], `most_pairs` measured at a time; and how many were, each time.
-    fn merge_in_parts(
+    /// Merges like [`TestScene::merge_rows`] with `max_pairs` pairs measured at a time; also returns the number of
+    /// pairs in each call.
+    fn merge_in_batches(
         &self,
         rows: &[u32],
         recipe: &MergeParams,
         limit: Option<usize>,
         frames: &[Column],
-        most_pairs: usize,
+        max_pairs: usize,
     ) -> (Merged, Vec<usize>) {
-        let Scene { states, classes, extent, .. } = self;
+        let TestScene { states, classes, extent, .. } = self;
         let survivors = Survivors { states, rows, importance: self.importance(), classes, extent: *extent };
         let gate = MotionGate::new(recipe, recipe.length_unit.in_scene_units(*extent));
-        let mut parts = Vec::new();
-        let measure = |asked: RequestedPairs<'_>| {
-            parts.push(asked.pairs().len());
+        let mut batches = Vec::new();
+        let measure = |request: RequestedPairs<'_>| {
+            batches.push(request.pairs().len());
             let reference = (0..states.len()).map(|i| frames[0].row(i));
-            let mut motion = PairMotion::new(asked.pairs(), reference, MotionParams::Runs);
+            let mut motion = PairMotion::new(request.pairs(), reference, MotionParams::Runs);
             frames.iter().for_each(|frame| motion.frame(|i| (frame.row(i), true)));
             Ok::<_, Infallible>(motion.finish().map(|pair| gate.likeness(&pair)).collect())
         };
-        match run(&survivors, recipe, limit, most_pairs, measure) {
-            Ok(merged) => (merged, parts),
+        match run(&survivors, recipe, limit, max_pairs, measure) {
+            Ok(merged) => (merged, batches),
             Err(never) => match never {},
         }
     }
@@ -101,12 +102,12 @@ impl Scene {
         Importance { ids: &self.ids, coverage: &self.coverage, visibility: &self.visibility }
     }
 
-    /// The scene with every position and Gaussian turned, scaled and shifted.
-    fn moved(mut self, turn: DQuat, scale: f64, shift: DVec3) -> Self {
+    /// Returns the scene with every position and Gaussian rotated, scaled and shifted.
+    fn transformed(mut self, rotation: DQuat, scale: f64, shift: DVec3) -> Self {
         for i in 0..self.states.len() {
             let position = DVec3::from(self.states.position.row::<3>(i).map(f64::from));
-            self.states.position.set_row(i, (turn * position * scale + shift).to_array().map(|x| x as f32));
-            let q = turn * gates::unit_rotation(self.states.rotation.row(i));
+            self.states.position.set_row(i, (rotation * position * scale + shift).to_array().map(|x| x as f32));
+            let q = rotation * gates::unit_rotation(self.states.rotation.row(i));
             self.states.rotation.set_row(i, [q.w, q.x, q.y, q.z].map(|x| x as f32));
             let log_scale = self.states.log_scale.row::<3>(i).map(|s| s + scale.ln() as f32);
             self.states.log_scale.set_row(i, log_scale);
@@ -120,35 +121,38 @@ fn joins(merged: &Merged) -> usize {
     merged.passes.iter().map(|pass| pass.joins).sum()
 }
 
-/// The group of `row`.
+/// Returns the group of `row`.
 fn group_of(groups: &MergeGroups, row: u32) -> usize {
     (0..groups.len()).find(|&group| groups.members(group).contains(&row)).unwrap()
 }
 
 #[test]
-fn pairs_measured_in_parts_merge_to_the_same_bits() {
-    let scene = Scene::strewn(3000);
+fn batched_measurement_merges_to_the_same_bits() {
+    let scene = TestScene::uniform_cube(3000);
     let recipe = scene.recipe();
     let rows: Vec<u32> = (0..3000).collect();
     let frames = std::slice::from_ref(&scene.states.position);
-    let (whole, parts) = scene.merge_in_parts(&rows, &recipe, None, frames, usize::MAX);
-    let [pairs] = parts[..] else { panic!("{parts:?}") };
+    let (whole, batches) = scene.merge_in_batches(&rows, &recipe, None, frames, usize::MAX);
+    let [pairs] = batches[..] else { panic!("{batches:?}") };
     assert!(joins(&whole) > 300);
-    for (most, expected) in [(pairs, 1), (pairs.div_ceil(7), 7), (pairs.div_ceil(64), 64)] {
-        let (merged, parts) = scene.merge_in_parts(&rows, &recipe, None, frames, most);
-        assert!(parts.len() == expected && parts.iter().all(|&of_part| of_part <= most), "{most}: {parts:?}");
+    for (max_pairs, expected) in [(pairs, 1), (pairs.div_ceil(7), 7), (pairs.div_ceil(64), 64)] {
+        let (merged, batches) = scene.merge_in_batches(&rows, &recipe, None, frames, max_pairs);
+        assert!(
+            batches.len() == expected && batches.iter().all(|&batch| batch <= max_pairs),
+            "{max_pairs}: {batches:?}"
+        );
         assert!(merged.groups == whole.groups && merged.proxies == whole.proxies && merged.passes == whole.passes);
     }
 }
 
 #[test]
-fn static_neighbors_merge_and_movers_apart_do_not() {
-    let scene = Scene::strewn(2000);
+fn static_neighbors_merge_diverging_ones_do_not() {
+    let scene = TestScene::uniform_cube(2000);
     let still = scene.merge(&scene.recipe(), None);
     assert!(joins(&still) > 300, "{:?}", still.passes);
     assert_eq!(still.groups.len(), 2000 - joins(&still));
     assert_eq!(still.proxies.len(), still.groups.clusters().count());
-    // Every other Gaussian flies up, the rest down.
+    // Every other Gaussian moves up, the rest down.
     let mut later = scene.states.position.clone();
     for (i, y) in later.plane_mut(1).iter_mut().enumerate() {
         *y += if i % 2 == 0 { 0.5 } else { -0.5 };
@@ -162,35 +166,35 @@ fn static_neighbors_merge_and_movers_apart_do_not() {
 }
 
 #[test]
-fn scene_translated_rotated_and_scaled_merges_alike() {
-    let scene = Scene::strewn(1500);
+fn moving_and_scaling_the_scene_changes_no_group() {
+    let scene = TestScene::uniform_cube(1500);
     let expected = scene.merge(&scene.recipe(), None).groups;
-    let turn = DQuat::from_xyzw(0.3, -0.5, 0.2, 0.7).normalize();
-    for (turn, scale, shift) in [
+    let rotation = DQuat::from_xyzw(0.3, -0.5, 0.2, 0.7).normalize();
+    for (rotation, scale, shift) in [
         (DQuat::IDENTITY, 1.0, DVec3::new(8.0, -4.0, 2.0)),
-        (turn, 1.0, DVec3::ZERO),
+        (rotation, 1.0, DVec3::ZERO),
         (DQuat::IDENTITY, 1024.0, DVec3::ZERO),
-        (turn, 1e-3, DVec3::new(0.002, 0.0, -0.001)),
+        (rotation, 1e-3, DVec3::new(0.002, 0.0, -0.001)),
     ] {
-        let moved = Scene::strewn(1500).moved(turn, scale, shift);
+        let transformed = TestScene::uniform_cube(1500).transformed(rotation, scale, shift);
         assert_eq!(
-            moved.merge(&scene.recipe(), None).groups,
+            transformed.merge(&scene.recipe(), None).groups,
             expected,
-            "turn {turn:?}, scale {scale}, shift {shift:?}"
+            "rotation {rotation:?}, scale {scale}, shift {shift:?}"
         );
     }
 }
 
 #[test]
 fn exact_duplicates_merge_to_one() {
-    let mut scene = Scene::strewn(60);
+    let mut scene = TestScene::uniform_cube(60);
     for column in Columns::all().iter() {
         for c in 0..scene.states.column(column).width() {
             let plane = scene.states.column_mut(column).plane_mut(c);
             (0..60).for_each(|i| plane[i] = plane[i % 20]);
         }
     }
-    // A reach of zero: nothing but duplicates.
+    // With ε = 0 only duplicates are neighbors.
     let mut recipe = scene.recipe();
     recipe.passes[0].epsilon = 0.0;
     let merged = scene.merge(&recipe, None);
@@ -206,10 +210,10 @@ fn exact_duplicates_merge_to_one() {
 }
 
 #[test]
-fn a_crowd_of_any_number_at_one_place_is_one_before_it_meets_its_neighbors() {
+fn coincident_gaussians_merge_before_their_neighbors() {
     for count in [34, 100, 5000] {
-        // Two crowds of different colors at one place, of which the others are near; one other alone.
-        let mut scene = Scene::strewn(2 * count + 1);
+        // Two sets of coincident Gaussians of different colors at one position, and one other Gaussian near them.
+        let mut scene = TestScene::uniform_cube(2 * count + 1);
         let places: Vec<u32> = (0..=2 * count as u32).map(|i| if i == 0 { 0 } else { 1 + i % 2 }).collect();
         scene.states = scene.states.pick(&places);
         for (i, &place) in places.iter().enumerate() {
@@ -226,14 +230,14 @@ fn a_crowd_of_any_number_at_one_place_is_one_before_it_meets_its_neighbors() {
         let limited = scene.merge(&recipe, Some(count));
         assert_eq!(limited.groups.len(), count + 1);
         let (rows, frame) = ((0..=2 * count as u32).collect::<Vec<u32>>(), [scene.states.position.clone()]);
-        let (parts, _) = scene.merge_in_parts(&rows, &recipe, None, &frame, 7);
-        assert!(parts.groups == merged.groups && parts.proxies == merged.proxies);
+        let (batches, _) = scene.merge_in_batches(&rows, &recipe, None, &frame, 7);
+        assert!(batches.groups == merged.groups && batches.proxies == merged.proxies);
     }
 }
 
 #[test]
-fn one_giant_background_gaussian_swallows_nothing_and_stays_alone() {
-    let mut scene = Scene::strewn(500);
+fn a_giant_background_gaussian_stays_single() {
+    let mut scene = TestScene::uniform_cube(500);
     scene.states.position.set_row(7, [0.5; 3]);
     scene.states.log_scale.set_row(7, [100f32.ln(); 3]);
     scene.coverage[7] = 1e9;
@@ -242,8 +246,8 @@ fn one_giant_background_gaussian_swallows_nothing_and_stays_alone() {
 }
 
 #[test]
-fn what_is_not_finite_or_not_mergeable_stays_alone() {
-    let mut scene = Scene::strewn(400);
+fn non_finite_or_unmergeable_gaussians_stay_single() {
+    let mut scene = TestScene::uniform_cube(400);
     scene.classes[11] = None;
     scene.states.opacity_logit.set_row(12, [f32::NAN]);
     scene.states.sh.plane_mut(11)[13] = f32::INFINITY;
@@ -256,7 +260,7 @@ fn what_is_not_finite_or_not_mergeable_stays_alone() {
 
 #[test]
 fn thread_count_changes_no_byte() {
-    let scene = Scene::strewn(5000);
+    let scene = TestScene::uniform_cube(5000);
     let recipe = scene.recipe();
     let with = |threads| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
@@ -270,27 +274,28 @@ fn thread_count_changes_no_byte() {
 #[test]
 fn order_of_rows_changes_no_cluster() {
     let n = 1500;
-    let (scene, mut turned) = (Scene::strewn(n), Scene::strewn(n));
+    let (scene, mut shuffled) = (TestScene::uniform_cube(n), TestScene::uniform_cube(n));
     let new_row = |row: usize| (row * 7 + 3) % n;
     for row in 0..n {
         for column in Columns::all().iter() {
             for c in 0..scene.states.column(column).width() {
-                turned.states.column_mut(column).plane_mut(c)[new_row(row)] = scene.states.column(column).plane(c)[row];
+                shuffled.states.column_mut(column).plane_mut(c)[new_row(row)] =
+                    scene.states.column(column).plane(c)[row];
             }
         }
-        turned.ids[new_row(row)] = scene.ids[row];
+        shuffled.ids[new_row(row)] = scene.ids[row];
     }
     let leaders = |groups: &MergeGroups, place: &dyn Fn(usize) -> usize| -> Vec<u32> {
         (0..n).map(|row| groups.leaders()[group_of(groups, place(row) as u32)]).collect()
     };
     let straight = leaders(&scene.merge(&scene.recipe(), None).groups, &|row| row);
-    let shuffled = leaders(&turned.merge(&scene.recipe(), None).groups, &new_row);
+    let shuffled = leaders(&shuffled.merge(&scene.recipe(), None).groups, &new_row);
     assert_eq!(straight.iter().map(|&row| new_row(row as usize) as u32).collect::<Vec<_>>(), shuffled);
 }
 
 #[test]
 fn the_limit_counts_joins_over_all_passes_exactly() {
-    let scene = Scene::strewn(2000);
+    let scene = TestScene::uniform_cube(2000);
     let mut recipe = scene.recipe();
     recipe.passes.push(recipe::MergePass { epsilon: 1.5 * recipe.passes[0].epsilon, ..recipe.passes[0] });
     let all = scene.merge(&recipe, None);
@@ -303,8 +308,8 @@ fn the_limit_counts_joins_over_all_passes_exactly() {
 }
 
 #[test]
-fn a_proxy_of_two_passes_is_made_from_its_original_members() {
-    let scene = Scene::strewn(2000);
+fn two_pass_proxies_come_from_original_members() {
+    let scene = TestScene::uniform_cube(2000);
     let mut recipe = scene.recipe();
     recipe.passes.push(recipe::MergePass { epsilon: 2.0 * recipe.passes[0].epsilon, d0: 3.0, ..recipe.passes[0] });
     let merged = scene.merge(&recipe, None);
@@ -315,18 +320,18 @@ fn a_proxy_of_two_passes_is_made_from_its_original_members() {
 #[test]
 fn no_survivors_and_one_survivor_pass_through() {
     for n in [0, 1] {
-        let scene = Scene::strewn(n);
+        let scene = TestScene::uniform_cube(n);
         let merged = scene.merge(&Recipe::preset("default").unwrap().merge, None);
         assert_eq!((merged.groups.len(), merged.proxies.len()), (n, 0));
     }
 }
 
 #[test]
-fn rows_left_out_change_nothing_as_if_they_were_not_there() {
-    let scene = Scene::strewn(1500);
+fn unselected_rows_have_no_effect() {
+    let scene = TestScene::uniform_cube(1500);
     let recipe = scene.recipe();
     let rows: Vec<u32> = (0..1500).filter(|row| row % 3 != 0).collect();
-    let part = Scene {
+    let part = TestScene {
         states: scene.states.pick(&rows),
         ids: rows.clone(),
         coverage: scene.coverage.clone(),

@@ -1,17 +1,17 @@
-//! Positions and opacities of some Gaussians in a scratch file, in an order of their own: what is read together lies
-//! together, so that a piece is read without the rest.
+//! Positions and opacities of selected Gaussians in a scratch file. The order of the Gaussians in the file is chosen so
+//! that those read together are stored together.
 //!
-//! The source is read once, block of Gaussians by block of Gaussians in the order of ids, some frames at a time:
-//! what holds tiles decodes each once if they span no more frames, and opening a file costs once per block.
-//! The file is read by the calling thread with plain reads: it has no index and leaves no mapped pages, either of which
+//! The source is read once, in blocks of Gaussians in the order of ids and a few frames at a time. A tiled source
+//! decodes each tile once if the tile spans no more frames than that, and files are opened once per block. The scratch
+//! file is read by the calling thread with plain reads: it has no index and leaves no mapped pages, either of which
 //! would grow with the number of frames.
 //!
-//! The file: x, y, z and opacity logit of every Gaussian at the first frame, `[N, 4]`; then for every block of F frames,
-//! of which the last may be shorter, what varies of these, `[N, F, W]` with W = 4, 3 or 1, or nothing. All f32 as this
-//! machine has them.
+//! Layout of the file: x, y, z and opacity logit of every Gaussian at the first frame, `[N, 4]`; then for every block
+//! of F frames (the last may be shorter) the values that vary, `[N, F, W]` with W = 4, 3 or 1, or nothing. All values
+//! are f32 in the byte order of this machine.
 //!
-//! Memory while gathering, per Gaussian: 8 bytes, and what varies of 16 for each of F frames; for every thread two
-//! blocks of as many frames.
+//! Memory while gathering, per Gaussian: 8 bytes, and the varying ones of 16 bytes for each of F frames; for every
+//! thread two blocks of as many frames.
 
 use std::ops::Range;
 use std::path::Path;
@@ -26,34 +26,34 @@ use crate::passes::BLOCK;
 use crate::progress::Events;
 use crate::source::{FrameSource, Ids, ReadPlan};
 
-/// What test 3 reads of a Gaussian at one frame: x, y, z, opacity logit.
+/// Values that test 3 reads of a Gaussian at one frame: x, y, z, opacity logit.
 pub(crate) type TrajectorySample = [f32; 4];
 
-/// The columns of a [`TrajectorySample`].
+/// Attributes of a [`TrajectorySample`].
 pub(crate) const NEEDED: Columns = Columns::POSITION.union(Columns::OPACITY);
 
-/// Gaussians between two that are wanted which are rather read than skipped.
+/// Maximum distance in the file between two requested Gaussians that are read together with the ones between them.
 const GAP: u32 = 32;
-/// Gaussians read at a time, at most.
+/// Maximum number of Gaussians in one read.
 const RUN: u32 = 2048;
 
-/// Trajectories in a nameless file that lasts as long as this.
+/// Trajectories in an unnamed file that is deleted when this value is dropped.
 pub(crate) struct Trajectories {
     file: Spill,
     count: usize,
     frames: usize,
-    /// Frames of a block.
+    /// Number of frames in a block.
     block: usize,
-    /// Which numbers of a moment vary.
+    /// Range of the values of a sample that vary.
     varying: Range<usize>,
 }
 
 impl Trajectories {
-    /// Gathers the Gaussians `ids` of `source`, all different and in that order, in a file in `folder`. Takes at most
+    /// Gathers the Gaussians `ids` of `source` (all different) in this order in a file in `folder`. Reads at most
     /// `frames_together` frames at a time.
     ///
     /// # Errors
-    /// Those of reading `source` and of writing the file, which is gone then.
+    /// Fails if reading `source` or writing the file fails. The file is gone then.
     pub(crate) fn gather(
         source: &dyn FrameSource,
         ids: &[u32],
@@ -69,26 +69,27 @@ impl Trajectories {
         let progress = events.task("merge", "frames", frames as u64);
         let mut values = Vec::new();
         if frames > 0 {
-            take(source, &places, 0..1, NEEDED, &mut values)?;
+            read_frames(source, &places, 0..1, NEEDED, &mut values)?;
             file.write(bytemuck::cast_slice(&values))?;
         }
         for start in (0..frames).step_by(block).take_while(|_| !columns.is_empty()) {
-            let of_block = start..frames.min(start + block);
-            take(source, &places, of_block.clone(), columns, &mut values)?;
+            let block_frames = start..frames.min(start + block);
+            read_frames(source, &places, block_frames.clone(), columns, &mut values)?;
             file.write(bytemuck::cast_slice(&values))?;
-            progress.advance(of_block.len() as u64);
+            progress.advance(block_frames.len() as u64);
         }
         let file = file.finish()?;
-        let varying = numbers(columns);
+        let varying = value_range(columns);
         Ok(Trajectories { file, count: ids.len(), frames, block, varying })
     }
 
-    /// Shows the moments of the Gaussians at `places` (increasing) frame after frame; only once if none varies.
+    /// Passes the samples of the Gaussians at `places` (increasing) to `show`, frame after frame; only once if nothing
+    /// varies.
     ///
-    /// Memory: of every one its moment, what varies of it for the frames of a block, and a bounded buffer.
+    /// Memory: for every Gaussian its sample, its varying values for the frames of a block, and a bounded buffer.
     ///
     /// # Errors
-    /// Those of reading the file.
+    /// Fails if reading the file fails.
     pub(crate) fn play(&self, places: &[u32], mut show: impl FnMut(&[TrajectorySample])) -> Result<()> {
         if self.frames == 0 {
             return Ok(());
@@ -115,16 +116,16 @@ impl Trajectories {
         Ok(())
     }
 
-    /// Reads rows of `width` numbers at `places` of a table that begins with number `first` of the file.
+    /// Reads rows of `width` numbers at `places` of a table that starts at number `first` of the file.
     fn read(&self, first: usize, width: usize, places: &[u32], mut out: &mut [f32]) -> Result<()> {
         let mut values: Vec<f32> = Vec::new();
-        for near in places.chunk_by(|a, b| b - a <= GAP && a / RUN == b / RUN) {
-            let low = near[0] as usize;
-            let rows = near[near.len() - 1] as usize + 1 - low;
+        for run in places.chunk_by(|a, b| b - a <= GAP && a / RUN == b / RUN) {
+            let low = run[0] as usize;
+            let rows = run[run.len() - 1] as usize + 1 - low;
             values.resize(rows * width, 0.0);
             self.file.read(4 * (first + low * width) as u64, bytemuck::cast_slice_mut(&mut values))?;
-            let (of_run, rest) = out.split_at_mut(near.len() * width);
-            for (to, &place) in of_run.chunks_exact_mut(width).zip(near) {
+            let (run_out, rest) = out.split_at_mut(run.len() * width);
+            for (to, &place) in run_out.chunks_exact_mut(width).zip(run) {
                 to.copy_from_slice(&values[(place as usize - low) * width..][..width]);
             }
             out = rest;
@@ -133,14 +134,14 @@ impl Trajectories {
     }
 }
 
-/// The numbers of a [`TrajectorySample`] that `columns` are.
-fn numbers(columns: Columns) -> Range<usize> {
+/// Returns the range of the values in a [`TrajectorySample`] that belong to `columns`.
+fn value_range(columns: Columns) -> Range<usize> {
     let start = if columns.contains(Columns::POSITION) { 0 } else { 3 };
     start..if columns.contains(Columns::OPACITY) { 4 } else { 3 }
 }
 
-/// Reads `frames` of `columns` of the Gaussians (id, place), which come by id, into `values`: `[N, frames, W]` by place.
-fn take(
+/// Reads `frames` of `columns` of the Gaussians (id, place), sorted by id, into `values`: `[N, frames, W]` by place.
+fn read_frames(
     source: &dyn FrameSource,
     places: &[(u32, u32)],
     frames: Range<usize>,
@@ -161,7 +162,7 @@ fn take(
         };
         frames.clone().map(at).collect()
     };
-    // One batch of blocks at a time bounds what waits to be put in its place.
+    // Processing one batch of blocks at a time bounds the memory of states that are not yet copied to `values`.
     for batch in places.chunks(2 * rayon::current_num_threads() * BLOCK) {
         let blocks: Vec<Vec<Gaussians>> = batch.par_chunks(BLOCK).map(read).collect::<Result<_>>()?;
         for (block, states) in batch.chunks(BLOCK).zip(&blocks) {
@@ -185,67 +186,67 @@ mod tests {
     use crate::model::SequenceInfo;
     use crate::source::BlockReader;
 
-    /// A scene that says of fewer columns that they vary, and keeps the others as they are at frame 0.
-    struct Still(Scene, SequenceInfo);
+    /// A scene that declares fewer attributes as varying and keeps the others as they are at frame 0.
+    struct PartlyStatic(Scene, SequenceInfo);
 
-    impl Still {
-        fn new(varying: Columns) -> Still {
+    impl PartlyStatic {
+        fn new(varying: Columns) -> PartlyStatic {
             let scene = Scene::new(3000, 7);
             let info = SequenceInfo { varying, ..scene.info().clone() };
-            Still(scene, info)
+            PartlyStatic(scene, info)
         }
     }
 
-    impl FrameSource for Still {
+    impl FrameSource for PartlyStatic {
         fn info(&self) -> &SequenceInfo {
             &self.1
         }
 
         fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>> {
-            Ok(Box::new(StillReader { reader: self.0.open(ids)?, varying: self.1.varying }))
+            Ok(Box::new(PartlyStaticReader { reader: self.0.open(ids)?, varying: self.1.varying }))
         }
     }
 
-    struct StillReader<'a> {
+    struct PartlyStaticReader<'a> {
         reader: Box<dyn BlockReader + 'a>,
         varying: Columns,
     }
 
-    impl BlockReader for StillReader<'_> {
+    impl BlockReader for PartlyStaticReader<'_> {
         fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
             self.reader.read(0, want, out)?;
             self.reader.read(frame, want & self.varying, out)
         }
     }
 
-    fn moments(source: &dyn FrameSource, ids: &[u32], frame: usize) -> Vec<TrajectorySample> {
+    fn samples(source: &dyn FrameSource, ids: &[u32], frame: usize) -> Vec<TrajectorySample> {
         let mut state = Gaussians::zeros(0, source.info().sh_degree);
         source.open(Ids::List(ids)).unwrap().read(frame, NEEDED, &mut state).unwrap();
-        let moment = |i| {
+        let sample = |i| {
             let [x, y, z] = state.position.row(i);
             [x, y, z, state.opacity_logit.plane(0)[i]]
         };
-        (0..ids.len()).map(moment).collect()
+        (0..ids.len()).map(sample).collect()
     }
 
     #[test]
-    fn played_trajectories_are_those_of_the_source_whatever_varies_and_however_many_frames_are_taken_together() {
+    fn trajectories_equal_the_source_for_any_block_size() {
         let folder = tempfile::tempdir().unwrap();
         let ids: Vec<u32> = (0..2500).map(|k| (k * 1171 + 5) % 3000).collect();
-        // Neighbors, gaps narrow and wide, both ends.
+        // Neighbors, narrow and wide gaps, both ends.
         let places: Vec<u32> = (0..5).chain([9, 40, 300]).chain(1000..2400).chain([2499]).collect();
-        let of_places: Vec<u32> = places.iter().map(|&place| ids[place as usize]).collect();
+        let ids_at_places: Vec<u32> = places.iter().map(|&place| ids[place as usize]).collect();
         for varying in [NEEDED, Columns::POSITION, Columns::OPACITY, Columns::empty()] {
-            let source = Still::new(varying);
+            let source = PartlyStatic::new(varying);
             for frames_together in [1, 3, usize::MAX] {
                 let gathered =
                     Trajectories::gather(&source, &ids, frames_together, folder.path(), &Events::IGNORED).unwrap();
-                let mut shown = Vec::new();
-                gathered.play(&places, |moments| shown.push(moments.to_vec())).unwrap();
+                let mut played = Vec::new();
+                gathered.play(&places, |samples| played.push(samples.to_vec())).unwrap();
                 let frames = if varying.is_empty() { 1 } else { 7 };
                 let expected: Vec<Vec<TrajectorySample>> =
-                    (0..frames).map(|t| moments(&source, &of_places, t)).collect();
-                assert!(shown == expected, "{varying:?} vary, {frames_together} frames together");
+                    (0..frames).map(|t| samples(&source, &ids_at_places, t)).collect();
+                assert!(played == expected, "{varying:?} vary, {frames_together} frames together");
             }
         }
         assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0, "scratch files are left");

@@ -1,35 +1,37 @@
-//! A k-d tree that stays fast when points coincide, and the list of the nearest points found so far.
+//! A k-d tree that stays fast if points coincide, and the list of the nearest points found so far.
 //!
-//! In: points. Out: the nearest of them, by (distance, index) alone. Memory: 28 bytes per node, two nodes for every 4 to
-//! 8 points: 7 to 14 bytes per point.
+//! Input: points. Output: the nearest of them, by (distance, index) alone. Memory: 28 bytes per node, two nodes for
+//! every 4 to 8 points, that is 7 to 14 bytes per point.
 //!
-//! Every node knows the smallest index below it, and a subtree is skipped unless it can hold a pair (distance, index)
-//! below the worst one kept. With ten million points at one place all distances are equal, the K smallest indices are
-//! found at once and all else is skipped; a tree that prunes by distance alone visits every point for every point.
+//! Every node stores the smallest index below it, and a subtree is skipped unless it can hold a pair (distance, index)
+//! below the worst one kept. With ten million points at one position all distances are equal, the K smallest indices
+//! are found at once and all other points are skipped; a tree that prunes by distance alone would visit every point for
+//! every query.
 
-/// Points in a leaf, at most.
-const LEAF: usize = 8;
-/// Subtrees smaller than this are built by one thread.
-const PARALLEL: usize = 1 << 14;
+/// Maximum number of points in a leaf.
+const MAX_LEAF_POINTS: usize = 8;
+/// Number of points below which a subtree is built by one thread.
+const MIN_PARALLEL_POINTS: usize = 1 << 14;
 
-/// A point and the index by which it is known.
+/// A point and its index.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TreePoint {
-    /// Its position.
+    /// Position of the point.
     pub at: [f32; 3],
-    /// Decides between equal distances.
+    /// Index of the point; decides between equal distances.
     pub index: u32,
 }
 
-/// A candidate: squared distance as bits, whose order is that of the values (≥ 0), then index.
+/// A candidate: squared distance (≥ 0) as bits, which have the same order as the values, then the index.
 type NeighborCandidate = (u64, u32);
 
-/// The nearest points found so far around a place, no more than are wanted.
+/// The nearest points found so far around a position, up to the number requested.
 ///
-/// Twice as many wait unsorted before the farther half goes: a heap moves about log K of them for each one found.
+/// The list holds up to twice as many unsorted candidates before the farther half is dropped. A heap would move about
+/// log K candidates for each one found.
 #[derive(Debug, Default)]
 pub struct Nearest {
-    own: u32,
+    query: u32,
     at: [f64; 3],
     wanted: usize,
     worst: NeighborCandidate,
@@ -37,43 +39,43 @@ pub struct Nearest {
 }
 
 impl Nearest {
-    /// Starts anew: the `wanted` nearest points other than `own` whose distance to `at` is at most `epsilon`.
+    /// Starts a query for the `wanted` nearest points other than `query` whose distance to `at` is at most `epsilon`.
     ///
     /// Squared distances are summed in f64 and compared with ε².
-    pub fn start(&mut self, own: u32, at: [f32; 3], wanted: usize, epsilon: f64) {
+    pub fn start(&mut self, query: u32, at: [f32; 3], wanted: usize, epsilon: f64) {
         self.found.clear();
-        (self.own, self.at, self.wanted) = (own, at.map(f64::from), wanted);
+        (self.query, self.at, self.wanted) = (query, at.map(f64::from), wanted);
         self.worst = ((epsilon * epsilon).to_bits(), u32::MAX);
     }
 
-    /// Looks at every one of `points`.
+    /// Compares every one of `points` with the candidates kept.
     pub fn scan(&mut self, points: &[TreePoint]) {
         for point in points {
             let found = (squared(std::array::from_fn(|c| f64::from(point.at[c]) - self.at[c])), point.index);
-            if found <= self.worst && point.index != self.own {
+            if found <= self.worst && point.index != self.query {
                 self.found.push(found);
                 if self.found.len() == 2 * self.wanted {
-                    self.cut();
+                    self.drop_far();
                 }
             }
         }
     }
 
-    /// Whether a point whose squared distance is at least `bound` can still be among the nearest.
+    /// Returns whether a point whose squared distance is at least `bound` can still be among the nearest.
     pub fn reaches(&self, bound: f64) -> bool {
         bound.to_bits() <= self.worst.0
     }
 
-    /// What was found, nearest first, equal distances by index.
+    /// Returns the points found, nearest first, equal distances by index.
     pub fn sorted(&mut self) -> &[(u64, u32)] {
         if self.found.len() > self.wanted {
-            self.cut();
+            self.drop_far();
         }
         self.found.sort_unstable();
         &self.found
     }
 
-    fn cut(&mut self) {
+    fn drop_far(&mut self) {
         self.worst = *self.found.select_nth_unstable(self.wanted - 1).1;
         self.found.truncate(self.wanted);
     }
@@ -94,16 +96,16 @@ pub struct Tree {
 }
 
 impl Tree {
-    /// Brings `points` into the order of a tree over them.
+    /// Builds a tree over `points`, which are reordered.
     pub fn new(points: &mut [TreePoint]) -> Self {
-        let depth = points.len().div_ceil(LEAF).next_power_of_two().trailing_zeros();
+        let depth = points.len().div_ceil(MAX_LEAF_POINTS).next_power_of_two().trailing_zeros();
         let empty = Node { low: [f32::INFINITY; 3], high: [f32::NEG_INFINITY; 3], smallest: u32::MAX };
         let mut nodes = vec![empty; (2usize << depth) - 1];
         build(points, &mut nodes);
         Tree { nodes, depth }
     }
 
-    /// Looks at those of `points`, in the order of the tree, that can be among the `nearest`.
+    /// Scans those of `points`, in the order of the tree, that can be among the `nearest`.
     pub fn search(&self, points: &[TreePoint], nearest: &mut Nearest) {
         self.visit(0, self.depth, points, self.nodes[0].nearest_possible(nearest.at), nearest);
     }
@@ -131,8 +133,8 @@ impl Tree {
 }
 
 impl Node {
-    /// A lower bound of (distance, index) below this node. Each step of the sum is monotone in f64,
-    /// so rounding cannot lift the bound above the distance of a point in the box.
+    /// Returns a lower bound of (distance, index) below this node. Each step of the sum is monotone in f64, so rounding
+    /// cannot raise the bound above the distance of a point in the box.
     fn nearest_possible(&self, at: [f64; 3]) -> NeighborCandidate {
         let outside = |c: usize| (f64::from(self.low[c]) - at[c]).max(at[c] - f64::from(self.high[c])).max(0.0);
         (squared(std::array::from_fn(outside)), self.smallest)
@@ -143,8 +145,8 @@ fn squared(d: [f64; 3]) -> u64 {
     (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]).to_bits()
 }
 
-/// Fills `nodes`, the preorder of a perfect subtree over `points`, splitting at the median of the
-/// widest side; equal coordinates split by index, so that low indices are met first.
+/// Fills `nodes`, the preorder of a perfect subtree over `points`. Splits at the median of the widest side; equal
+/// coordinates are split by index, so that low indices are found first.
 fn build(points: &mut [TreePoint], nodes: &mut [Node]) {
     let Some((node, below)) = nodes.split_first_mut() else { return };
     for point in points.iter() {
@@ -163,7 +165,7 @@ fn build(points: &mut [TreePoint], nodes: &mut [Node]) {
     points.select_nth_unstable_by(middle, |a, b| a.at[widest].total_cmp(&b.at[widest]).then(a.index.cmp(&b.index)));
     let (left, right) = points.split_at_mut(middle);
     let (left_nodes, right_nodes) = below.split_at_mut(below.len() / 2);
-    if left.len() >= PARALLEL {
+    if left.len() >= MIN_PARALLEL_POINTS {
         rayon::join(|| build(left, left_nodes), || build(right, right_nodes));
     } else {
         build(left, left_nodes);

@@ -1,16 +1,17 @@
-//! A grid of voxels: cubes of one side, in Morton order (G. M. Morton, "A computer oriented geodetic data base", 1966).
+//! A grid of voxels: cubes of equal size, in Morton order (G. M. Morton, "A computer oriented geodetic data base",
+//! 1966).
 //!
-//! In that order Gaussians that lie together follow one another. A piece of it together with what lies within a voxel's
-//! side of it, its ghosts, is all that the pairs led from the piece consist of. Only the speed of reading depends on the
-//! order, no result does.
-//! Memory of ordering: 20 bytes per Gaussian beside the output.
+//! In that order Gaussians that are close in space are mostly close in the list. A consecutive part of the list and its
+//! ghosts, the Gaussians within one voxel side of it, contain all pairs led from that part. The order affects only the
+//! speed of reading, never a result.
+//! Memory of sorting: 20 bytes per Gaussian beside the output.
 
 use rayon::prelude::*;
 
-/// Voxels along an axis, at most: three of their numbers make up 63 bits.
-const MOST: u32 = 1 << 21;
+/// Maximum number of voxels along an axis: three 21-bit numbers form a 63-bit code.
+const MAX_PER_AXIS: u32 = 1 << 21;
 
-/// The voxels around some points.
+/// Grid of voxels around a set of points.
 #[derive(Debug, Clone, Copy)]
 pub struct Voxels {
     low: [f64; 3],
@@ -19,9 +20,9 @@ pub struct Voxels {
 }
 
 impl Voxels {
-    /// Voxels of that `side` from the lowest coordinates of `points` on, or wider ones where there would be more than
-    /// 2²¹ along an axis. Edges: points all at one place and a side of zero, one voxel. Coordinates that are not finite
-    /// are passed over.
+    /// Creates voxels of side `side` that start at the lowest coordinates of `points`, or wider ones if there would be
+    /// more than 2²¹ along an axis. Edge cases: if all points are at one position and the side is zero, there is one
+    /// voxel. Coordinates that are not finite are ignored.
     pub fn around(points: impl Iterator<Item = [f32; 3]>, side: f64) -> Self {
         let (mut low, mut high) = ([f64::INFINITY; 3], [f64::NEG_INFINITY; 3]);
         for point in points {
@@ -31,27 +32,28 @@ impl Voxels {
             }
         }
         let widest = (0..3).map(|c| high[c] - low[c]).fold(0.0, f64::max);
-        let side = side.max(widest / f64::from(MOST));
+        let side = side.max(widest / f64::from(MAX_PER_AXIS));
         Voxels { low, side, per_unit: side.recip() }
     }
 
-    /// Their side, scene units.
+    /// Returns the side of a voxel in scene units.
     pub fn side(&self) -> f64 {
         self.side
     }
 
-    /// Where `at` is, in voxels from the corner where they start.
+    /// Returns the position of `at` in units of voxels from the corner where the grid starts.
     pub fn place(&self, at: [f32; 3]) -> [f64; 3] {
         std::array::from_fn(|c| (f64::from(at[c]) - self.low[c]) * self.per_unit)
     }
 
-    /// The number in Morton order of the voxel that holds `at`.
+    /// Returns the Morton code of the voxel that holds `at`.
     pub fn number(&self, at: [f32; 3]) -> u64 {
         let voxel = voxel_of(self.place(at));
         (0..3).filter_map(|c| along(c, voxel[c])).sum()
     }
 
-    /// `rows` by the voxel they lie in, `at` telling their positions, scene units; ties by row.
+    /// Returns `rows` sorted by the Morton code of their voxel; `at` returns the position of a row in scene units; ties
+    /// by row.
     pub fn order(&self, rows: &[u32], at: impl Fn(u32) -> [f32; 3] + Sync) -> Vec<u32> {
         let mut keyed: Vec<(u64, u32)> = rows.par_iter().map(|&row| (self.number(at(row)), row)).collect();
         keyed.par_sort_unstable();
@@ -59,25 +61,26 @@ impl Voxels {
     }
 }
 
-/// [`Voxels::order`] of `rows` among voxels of that `side` around themselves.
+/// Returns `rows` in the [`Voxels::order`] of voxels of side `side` around themselves.
 pub fn voxel_order(rows: &[u32], at: impl Fn(u32) -> [f32; 3] + Sync, side: f64) -> Vec<u32> {
     Voxels::around(rows.iter().map(|&row| at(row)), side).order(rows, at)
 }
 
-/// The voxel at a [place](Voxels::place), by its number along each axis; outside of all, the nearest one. What is not a
-/// number is in the first.
+/// Returns the voxel at a [place](Voxels::place), by its number along each axis; outside of the grid, the nearest one.
+/// NaN gives the first voxel.
 pub fn voxel_of(place: [f64; 3]) -> [u32; 3] {
-    // A cast takes what is beyond the range to its end, and NaN, which 0·∞ is, to 0.
-    place.map(|x| (x as u32).min(MOST - 1))
+    // A saturating cast maps values beyond the range to its ends, and NaN (from 0·∞) to 0.
+    place.map(|x| (x as u32).min(MAX_PER_AXIS - 1))
 }
 
-/// What being the `number`-th along `axis` adds to a voxel's number in Morton order; none where there is no such voxel.
+/// Returns the part of a voxel's Morton code that belongs to coordinate `number` along `axis`; `None` if there is no
+/// such voxel.
 pub fn along(axis: usize, number: u32) -> Option<u64> {
-    (number < MOST).then(|| spread(number.into()) << axis)
+    (number < MAX_PER_AXIS).then(|| spread_bits(number.into()) << axis)
 }
 
-/// Bit k of the lowest 21 moved to bit 3k.
-fn spread(x: u64) -> u64 {
+/// Moves bit k of the lowest 21 bits to bit 3k.
+fn spread_bits(x: u64) -> u64 {
     let x = (x | x << 32) & 0x001f_0000_0000_ffff;
     let x = (x | x << 16) & 0x001f_0000_ff00_00ff;
     let x = (x | x << 8) & 0x100f_00f0_0f00_f00f;
@@ -89,22 +92,22 @@ fn spread(x: u64) -> u64 {
 mod tests {
     use super::*;
     #[test]
-    fn spreading_moves_every_bit_to_its_place() {
+    fn spread_bits_moves_bit_k_to_3k() {
         for k in 0..21 {
-            assert_eq!(spread(1 << k), 1 << (3 * k), "bit {k}");
+            assert_eq!(spread_bits(1 << k), 1 << (3 * k), "bit {k}");
         }
     }
 
     #[test]
-    fn the_eight_voxels_of_a_cube_follow_one_another_and_ties_go_by_row() {
-        // Two points in each voxel of a 4³ lattice, x fastest.
-        let lattice = |i: usize| [i % 4, i / 4 % 4, i / 16 % 4].map(|k| k as f32 + 0.25);
-        let points: Vec<[f32; 3]> = (0..128).map(lattice).collect();
+    fn voxels_of_a_cube_are_consecutive_and_ties_go_by_row() {
+        // Two points in each voxel of a 4³ grid, x fastest.
+        let grid = |i: usize| [i % 4, i / 4 % 4, i / 16 % 4].map(|k| k as f32 + 0.25);
+        let points: Vec<[f32; 3]> = (0..128).map(grid).collect();
         let rows: Vec<u32> = (0..128).rev().collect();
         let order = voxel_order(&rows, |row| points[row as usize], 1.0);
-        for (cube, of_cube) in order.chunks(16).enumerate() {
+        for (cube, cube_rows) in order.chunks(16).enumerate() {
             let corner = [cube & 1, cube >> 1 & 1, cube >> 2].map(|k| 2.0 * k as f32);
-            for pair in of_cube.chunks(2) {
+            for pair in cube_rows.chunks(2) {
                 let at = points[pair[0] as usize];
                 assert!((0..3).all(|c| at[c] >= corner[c] && at[c] < corner[c] + 2.0), "{at:?} in cube {cube}");
                 assert_eq!(pair[1], pair[0] + 64, "both of one voxel, the lower row first");
@@ -113,15 +116,15 @@ mod tests {
     }
 
     #[test]
-    fn any_extent_and_side_give_an_order_of_all_rows() {
+    fn every_extent_and_side_orders_all_rows() {
         let points = [[0.0; 3], [f32::MAX; 3], [f32::MIN, 0.0, 1.0], [0.0; 3]];
-        let far = |row: u32| points[row as usize];
+        let position_of = |row: u32| points[row as usize];
         for side in [0.0, 1e-30, 1.0, f64::INFINITY] {
-            let mut order = voxel_order(&[0, 1, 2, 3], far, side);
+            let mut order = voxel_order(&[0, 1, 2, 3], position_of, side);
             order.sort_unstable();
             assert_eq!(order, [0, 1, 2, 3], "side {side}");
-            assert_eq!(voxel_order(&[3, 0], far, side), [0, 3], "one place, side {side}");
-            assert!(voxel_order(&[], far, side).is_empty());
+            assert_eq!(voxel_order(&[3, 0], position_of, side), [0, 3], "one place, side {side}");
+            assert!(voxel_order(&[], position_of, side).is_empty());
         }
     }
 }

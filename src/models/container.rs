@@ -1,4 +1,4 @@
-//! Containers (`.gseq`) as a family.
+//! Containers (`.gseq`) as a model format.
 
 use gseq::{Encoding, Reader, TileId};
 
@@ -9,7 +9,7 @@ use crate::files::container::Container;
 use crate::models::input_model::{ColumnInfo, InputModel, MemoryProfile, ModelFormat, Timing};
 use crate::source::FrameSource;
 
-/// A container.
+/// Container of frame states (`.gseq`).
 pub(super) const ENTRY: ModelFormat = ModelFormat {
     recognizes: |found| found.is_file_of(&gseq::MAGIC, "gseq"),
     open: |path, options| {
@@ -50,7 +50,7 @@ impl InputModel for Container {
 
     fn residence(&self) -> MemoryProfile {
         let layout = self.reader().layout();
-        // The tiles decide what is decoded together.
+        // The tiles of the file determine which Gaussians are decoded together.
         MemoryProfile {
             gaussian_block: layout.gaussian_block.into(),
             columns: layout.columns.len() as u64,
@@ -68,7 +68,10 @@ impl InputModel for Container {
     }
 
     fn with_times(self: Box<Self>, _: Vec<f64>) -> Result<Box<dyn InputModel>> {
-        Err(Error::usage(format!("{}: a container says itself when its frames are", self.path().shown())))
+        Err(Error::usage(format!(
+            "{}: a container stores the times of its frames; no other times can be given",
+            self.path().shown()
+        )))
     }
 
     fn columns(&self) -> Result<Vec<ColumnInfo>> {
@@ -76,6 +79,7 @@ impl InputModel for Container {
     }
 }
 
+/// Collects the statistics of every column from the tile index.
 fn columns(reader: &Reader) -> Result<Vec<ColumnInfo>> {
     let layout = reader.layout();
     let mut out = Vec::new();

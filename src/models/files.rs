@@ -1,4 +1,4 @@
-//! Files that a result has as they are.
+//! Copies of files that an output takes over unchanged.
 
 use std::fs::File;
 use std::io;
@@ -7,7 +7,7 @@ use std::path::Path;
 use crate::error::{Error, Result};
 use crate::files::open::open_file;
 
-/// Copies the bytes, not the permissions: a result of a read-only model can be replaced.
+/// Copies the bytes of a file but not its permissions, so that the output of a read-only model can be replaced.
 pub(super) fn copy(from: &Path, to: &Path) -> Result<()> {
     let mut source = open_file(from)?;
     let mut target = File::create(to).map_err(Error::io("create", to))?;

@@ -1,6 +1,6 @@
-//! Models that are known and not read: what they are, and the way that works.
+//! Models that are recognized but not read. Their error says which model it is and how to convert it.
 //!
-//! What renders at any time a PLY or a frame stream can hold; so every message says to write one.
+//! Any renderer can export frames as PLY files or a frame stream, so every message suggests that.
 
 use std::path::Path;
 
@@ -9,56 +9,60 @@ use crate::files::checkpoint::{Checkpoint, Pickle};
 use crate::limits::ReadLimit;
 use crate::models::input_model::ModelFormat;
 
-/// The way that works with every renderer.
-const WAY: &str = "write its frames as PLY files, one per frame and all with the same Gaussians in the same order, or as a \
-                   frame stream, with its own renderer, and give those";
+/// Advice that works for every renderer.
+const ADVICE: &str = "export its frames with its own renderer, either as PLY files (one per frame, with the same \
+                      Gaussians in the same order) or as a frame stream, and give those";
 
-/// A checkpoint of another kind, or a folder of one.
+/// Checkpoint of an unsupported trainer, or a folder of one.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
     recognizes: |found| match found.is_folder {
-        true => in_folder(found.path).is_some(),
+        true => describe_folder(found.path).is_some(),
         false => found.is_checkpoint(),
     },
     open: |path, options| {
-        let what = if path.is_dir() { in_folder(path).unwrap_or(UNKNOWN) } else { in_file(path, options.memory)? };
-        Err(Error::input(path, "", "a model of a family that is read", what).hint(WAY))
+        let description = if path.is_dir() {
+            describe_folder(path).unwrap_or(UNKNOWN)
+        } else {
+            describe_checkpoint(path, options.memory)?
+        };
+        Err(Error::input(path, "", "a supported model format", description).hint(ADVICE))
     },
 };
 
-const UNKNOWN: &str = "a checkpoint of another kind, such as Ex4DGS, Gaussian-Flow, MEGA or OMG4 write";
+const UNKNOWN: &str = "an unsupported checkpoint, such as those of Ex4DGS, Gaussian-Flow, MEGA or OMG4";
 const ROTOR: &str = "a 4D-Rotor model of nerfstudio";
 
-/// What a folder is, by names that no other family's has.
-fn in_folder(folder: &Path) -> Option<&'static str> {
+/// Returns the description of an unsupported model folder, recognized by file names that no other format uses.
+fn describe_folder(folder: &Path) -> Option<&'static str> {
     let has = |name: &str| folder.join(name).exists();
     if has("nerfstudio_models") {
         return Some(ROTOR);
     }
     if has("NTC.pth") || has("frame000001/NTC.pth") {
-        return Some("a 3DGStream model, of a network per frame");
+        return Some("a 3DGStream model (one network per frame)");
     }
     None
 }
 
-/// What a checkpoint is, by its tree.
+/// Returns the description of an unsupported checkpoint, recognized by the names in its tree.
 ///
 /// # Errors
-/// A file that is no checkpoint.
-fn in_file(path: &Path, memory: ReadLimit) -> crate::error::Result<&'static str> {
+/// Fails if the file is not a checkpoint.
+fn describe_checkpoint(path: &Path, memory: ReadLimit) -> crate::error::Result<&'static str> {
     let checkpoint = Checkpoint::open(path, memory)?;
     let pickle = checkpoint.pickle();
     let has = |name: &str| pickle.item(pickle.root(), name).is_some();
-    let named = |part: &str| names(pickle).any(|name| name.contains(part));
+    let named = |part: &str| tensor_names(pickle).any(|name| name.contains(part));
     Ok(match () {
         () if has("pipeline") && named("gauss_params.scales_t") => ROTOR,
         () if has("pipeline") => "a nerfstudio model",
-        () if named("hash_encoder") || named("encoding.embeddings") => "a network of hash grids, as Grid4D's",
+        () if named("hash_encoder") || named("encoding.embeddings") => "a network with hash grids, such as Grid4D",
         () => UNKNOWN,
     })
 }
 
-/// Names of tensors, of dicts in the root and in its values.
-fn names(pickle: &Pickle) -> impl Iterator<Item = &str> {
+/// Iterates over the tensor names of dictionaries in the root and in its values.
+fn tensor_names(pickle: &Pickle) -> impl Iterator<Item = &str> {
     let root = pickle.root();
     let inner = pickle.items(root).into_iter().flatten().map(|(_, id)| id);
     let parts = pickle.elements(root).unwrap_or_default().iter().copied();
@@ -75,9 +79,9 @@ mod tests {
     use crate::models::OpenOptions;
 
     #[test]
-    fn others_are_named_with_the_way_that_works() {
+    fn unsupported_models_are_named_with_advice() {
         let folder = tempfile::tempdir().unwrap();
-        let said = |path: &Path| models::open(path, &OpenOptions::default()).err().unwrap().to_string();
+        let error_message = |path: &Path| models::open(path, &OpenOptions::default()).err().unwrap().to_string();
         let file = folder.path().join("step-000029999.ckpt");
         let one = || Made::Tensor(tensor(0, &[1], &[0.0]));
         let pipeline = |name| Made::Dict(named(vec![("pipeline", Made::Dict(named(vec![(name, one())])))]));
@@ -85,16 +89,16 @@ mod tests {
             (pipeline("_model.gauss_params.scales_t"), "4D-Rotor"),
             (pipeline("_model.gauss_params.means"), "nerfstudio"),
             (Made::Tuple(vec![Made::Ordered(named(vec![("hash_encoder.params", one())]))]), "Grid4D"),
-            (Made::Int(7), "another kind"),
+            (Made::Int(7), "unsupported checkpoint"),
         ] {
             fs::write(&file, made.file()).unwrap();
-            let message = said(&file);
+            let message = error_message(&file);
             let parts = ["step-000029999.ckpt", expected, "PLY", "frame stream"];
             assert!(parts.iter().all(|part| message.contains(part)), "{message}");
         }
         for (name, expected) in [("a/nerfstudio_models", "4D-Rotor"), ("b/frame000001/NTC.pth", "3DGStream")] {
             fs::create_dir_all(folder.path().join(name)).unwrap();
-            let message = said(&folder.path().join(&name[..1]));
+            let message = error_message(&folder.path().join(&name[..1]));
             assert!(message.contains(expected) && message.contains("PLY"), "{message}");
         }
     }

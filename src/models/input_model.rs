@@ -1,4 +1,4 @@
-//! What a kind of input can do.
+//! The interface of every model format.
 
 use std::path::{Path, PathBuf};
 
@@ -20,127 +20,129 @@ use crate::progress::Events;
 use crate::recipe::MergeParams;
 use crate::source::FrameSource;
 
-/// An open input of some kind.
+/// Open input of some model format.
 ///
-/// What has a body here is right for explicit trajectories, of which each state stands in every frame; a family whose
-/// frames follow from raw parameters has its own.
+/// The default methods suit explicit trajectories, whose frame states are stored for every frame. Formats that derive
+/// frames from raw parameters override them.
 pub trait InputModel: Send + Sync {
-    /// What it is, for people.
+    /// Returns the name of the model format, shown to users.
     fn kind(&self) -> &'static str;
 
-    /// Its frames.
+    /// Returns the source of frame states.
     fn source(&self) -> &dyn FrameSource;
 
-    /// Hash over the bytes read.
+    /// Returns a hash of the bytes read.
     ///
     /// # Errors
-    /// A file that cannot be read.
+    /// Fails if a file cannot be read.
     fn digest(&self) -> Result<String>;
 
-    /// Bytes of everything that a renderer opens of the model; of a stream, those that arrived.
+    /// Returns the bytes of all files that a renderer opens; for a stream, the bytes received.
     ///
     /// # Errors
-    /// A file that is not there any more.
+    /// Fails if a file no longer exists.
     fn bytes(&self) -> Result<u64>;
 
-    /// The same by part.
+    /// Returns [`InputModel::bytes`] divided by part.
     ///
     /// # Errors
-    /// Those of [`InputModel::bytes`].
+    /// Fails if a file no longer exists.
     fn size(&self) -> Result<Size> {
         Ok(Size::of_frames(self.bytes()?))
     }
 
-    /// Bytes, by part, of what [`InputModel::write`] wrote to `path` as a result of `kind`, with nothing beside it yet.
+    /// Returns the bytes, by part, that [`InputModel::write`] wrote to `path` as `kind`. No other files may have been
+    /// added yet.
     ///
     /// # Errors
-    /// A file that is not there any more.
+    /// Fails if a file no longer exists.
     fn size_written(&self, kind: OutputKind, path: &Path) -> Result<Size> {
         let _ = kind;
         Ok(Size::of_frames(bytes_below(path)?))
     }
 
-    /// Bytes of the files that its frames are read from.
+    /// Returns the bytes of the files that frames are read from.
     ///
     /// # Errors
-    /// A file that is not there any more.
+    /// Fails if a file no longer exists.
     fn stored_bytes(&self) -> Result<u64> {
         self.bytes()
     }
 
-    /// What it keeps in memory, and how it is read.
+    /// Returns the memory that the input takes and the costs of reading it.
     fn residence(&self) -> MemoryProfile;
 
-    /// Lets values that were decoded stay in memory, where [`MemoryProfile::decoded`] says that they can.
+    /// Allows decoded values to stay in memory if [`MemoryProfile::decoded`] is not 0.
     fn hold_decoded(&self) {}
 
-    /// Where its frames get their times.
+    /// Returns how frames get their times.
     fn timing(&self) -> Timing;
 
-    /// What its time counts, where cameras say when its frames are.
+    /// Returns the unit of camera times if cameras give the times of frames.
     fn clock(&self) -> Clock {
         Clock::Normalized
     }
 
-    /// How long it lasts in its own time, where nothing says when its frames are.
+    /// Returns the duration of the model in its own time unit. Used if no times are given.
     fn span(&self) -> f64 {
         1.0
     }
 
-    /// The same input with frames at `times`; refused where [`Timing::Stamped`].
+    /// Returns the input with frames at `times`. Inputs with [`Timing::Stamped`] refuse.
     ///
     /// # Errors
-    /// Times that are not finite or do not increase; another number of them than there are frames.
+    /// Fails if times are not finite or do not increase, or if their number differs from a fixed number of frames.
     fn with_times(self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn InputModel>>;
 
-    /// Things a person should know of it.
+    /// Returns notes for the user, such as repairs or guesses made while opening.
     fn notes(&self) -> Vec<String> {
         Vec::new()
     }
 
-    /// Folder of the data it was trained on, as the input names it, where it does: there cameras may be.
+    /// Returns the folder of the training data if the input names it. The cameras may be found there.
     fn data_folder(&self) -> Option<&str> {
         None
     }
 
-    /// Frames of that data it was trained on, where the input says how many: the last is one step before the end of its time.
+    /// Returns the number of training frames if the input gives it. The last of them is one step before the end of the
+    /// time span.
     fn data_frames(&self) -> Option<usize> {
         None
     }
 
-    /// Color behind the scene that it was trained with, where it names one.
+    /// Returns the background color used in training if the input names it.
     fn background(&self) -> Option<[f32; 3]> {
         None
     }
 
-    /// To what a Gaussian belongs: those of different classes never merge.
+    /// Returns the merge class of a Gaussian. Gaussians of different classes never merge.
     fn class(&self, id: u32) -> u8 {
         let _ = id;
         0
     }
 
-    /// The raw parameters that all frames follow from, of a family that has such.
+    /// Returns the raw parameters that all frames are computed from, if the format has any.
     fn canonical(&self) -> Option<&Gaussians> {
         None
     }
 
-    /// What its container holds, column by column; empty where it is no container.
+    /// Returns a description of each column of a container; empty for other inputs.
     ///
     /// # Errors
-    /// An index that cannot be read.
+    /// Fails if the index cannot be read.
     fn columns(&self) -> Result<Vec<ColumnInfo>> {
         Ok(Vec::new())
     }
 
-    /// The kind of a result to which neither the user nor its name gives one.
+    /// Returns the kind of output to write if neither the user nor the output path specifies one.
     fn own_output(&self) -> OutputKind {
         OWN_OUTPUT
     }
 
-    /// Confirms that a result can be of `kind`, written to `path`.
+    /// Checks that this input can be written as `kind` to `path`.
     ///
     /// # Errors
-    /// A kind that this input cannot be written as, naming those that it can.
+    /// Fails if it cannot; the message lists kinds that work.
     fn check_output(&self, kind: OutputKind, path: &Path) -> Result<()> {
         match kind {
             OutputKind::Archive if self.archives_frames() => Ok(()),
@@ -148,75 +150,77 @@ pub trait InputModel: Send + Sync {
         }
     }
 
-    /// Raw parameters of the proxies that `clusters` become, compared at `reference`. A family without raw
-    /// parameters has nothing to solve: its proxies follow from their members frame by frame.
+    /// Computes the raw parameters of the proxies of `clusters`, compared at `reference`. The default returns no
+    /// proxies: without raw parameters, a proxy follows from its members in each frame.
     ///
     /// # Errors
-    /// Frames that cannot be read.
+    /// Fails if frames cannot be read.
     fn solve(&self, clusters: &[Cluster], reference: Reference, rule: &MergeParams) -> Result<Proxies> {
         let _ = (clusters, reference, rule);
         Ok(Proxies::default())
     }
 
-    /// Whether a model of it has a field that can be written in half precision.
+    /// Returns whether the model has a deformation field that can be written in half precision.
     ///
     /// # Errors
-    /// A field that cannot be read any more.
+    /// Fails if the field can no longer be read.
     fn can_round_field(&self) -> Result<bool> {
         Ok(false)
     }
 
-    /// Why harmonics of every degree have to stay, if they have to.
+    /// Returns the reason why SH coefficients of every degree must be kept; `None` if the degree may be lowered.
     fn needs_all_bands(&self) -> Option<&'static str> {
         None
     }
 
-    /// What an archive of what `reduction` leaves holds.
+    /// Returns the content of an archive of the compressed model `reduction`.
     ///
     /// # Errors
-    /// An input that no archive holds; files that cannot be read.
+    /// Fails if the input cannot be archived or its files cannot be read.
     fn content(&self, reduction: &CompressedModel) -> Result<Content> {
         let _ = reduction;
         Err(Error::usage(NO_ARCHIVE))
     }
 
-    /// The frames of `content`, of this input or of what is left of it, at this input's times.
+    /// Returns the frames that `content` decodes to, at the times of this input. `content` is an archive of this input
+    /// or of a compressed model of it.
     ///
     /// # Errors
-    /// A content of another kind.
+    /// Fails if `content` belongs to another kind of input.
     fn decode_frames<'a>(&'a self, content: &Content) -> Result<Box<dyn FrameSource + 'a>> {
         let _ = content;
         Err(Error::usage(NO_ARCHIVE))
     }
 
-    /// Whether it says which Gaussian is which and can be linked all the same.
+    /// Returns whether the input already identifies Gaussians across frames and can still be linked anew.
     fn may_be_linked(&self) -> bool {
         false
     }
 
-    /// Whether every Gaussian's state stands in every frame, so that it may change along time ([`CompressedModel::course`]).
+    /// Returns whether the state of every Gaussian is stored for every frame, so that refinement may add a delta that
+    /// varies in time ([`CompressedModel::course`]).
     fn has_explicit_frames(&self) -> bool {
         false
     }
 
-    /// Whether an archive of it is one of its frames: a container within bounds.
+    /// Returns whether an archive of this input is a lossy container of its frames (`.gseq` within error bounds).
     fn archives_frames(&self) -> bool {
         self.has_explicit_frames()
     }
 
-    /// The frames of what `reduction` leaves, as they will be once it is written.
+    /// Returns the frames of the compressed model `reduction`, as they will be after writing.
     ///
     /// # Errors
-    /// A field that cannot be evaluated.
+    /// Fails if the deformation field cannot be evaluated.
     fn reduced<'a>(&'a self, reduction: &'a CompressedModel) -> Result<Box<dyn FrameSource + 'a>> {
         Ok(reduced_trajectories(self.source(), reduction))
     }
 
-    /// Writes what `reduction` leaves to `path`, a new file or an empty folder; gives things a person should know.
-    /// What waits in memory to be written keeps to `limits`. Progress goes to `events`.
+    /// Writes the compressed model `reduction` to `path`, a new file or an empty folder, and returns notes for the
+    /// user. Write buffers stay within `limits`. Progress is reported to `events`.
     ///
     /// # Errors
-    /// Frames that cannot be read, a failed write.
+    /// Fails if frames cannot be read or a write fails.
     fn write(
         &self,
         reduction: &CompressedModel,
@@ -229,48 +233,50 @@ pub trait InputModel: Send + Sync {
     }
 }
 
-/// Where frames get their times.
+/// Source of frame times.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Timing {
-    /// Any instant can be a frame.
+    /// Continuous in time: a frame can be at any time.
     Continuous,
-    /// There are so many frames; cameras may say when.
+    /// Fixed number of frames; their times may come from cameras.
     Numbered,
-    /// The input says when its frames are.
+    /// Frame times stored in the input.
     Stamped,
 }
 
-/// What an open input keeps in memory, and how it is read.
+/// Memory of an open input and costs of reading it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MemoryProfile {
-    /// Bytes per Gaussian that are resident while it is open.
+    /// Bytes per Gaussian that are resident while the input is open.
     pub per_gaussian: u64,
-    /// Bytes per Gaussian while it is opened, beside these.
+    /// Additional bytes per Gaussian while the input is being opened.
     pub opening: u64,
-    /// Bytes per Gaussian of an open reader, beside the frames it holds.
+    /// Bytes per Gaussian of an open reader, in addition to the frames it holds.
     pub reader: u64,
-    /// Bytes per Gaussian of a reduced copy of it, of which frames are read.
+    /// Bytes per Gaussian of a compressed copy from which frames are read.
     pub reduced: u64,
-    /// Bytes per Gaussian of how states change with what is stored, where that is by more than a sum; else 0.
+    /// Bytes per Gaussian of the Jacobian of frame states with respect to stored parameters; 0 if changes are simply
+    /// added.
     pub jacobian: u64,
-    /// Bytes per Gaussian of a file that is mapped while it is read whole.
+    /// Bytes per Gaussian of a memory-mapped file that is read whole.
     pub file: u64,
-    /// Bytes however many Gaussians there are.
+    /// Bytes that do not depend on the number of Gaussians.
     pub fixed: u64,
-    /// Frames that are decoded together, so that a reader may hold some; 0 where each is read by itself.
+    /// Number of frames that are decoded together, so that a reader may hold several; 0 if each frame is read by
+    /// itself.
     pub frame_block: u64,
-    /// Gaussians that are decoded together.
+    /// Number of Gaussians that are decoded together.
     pub gaussian_block: u64,
-    /// Columns of a container.
+    /// Number of columns of a container.
     pub columns: u64,
-    /// Seconds of one processor that a state (a Gaussian at a frame) takes to read, about.
+    /// Approximate CPU seconds on one core to read one state (one Gaussian at one frame).
     pub seconds_per_state: f64,
-    /// Bytes of all values of a container, decoded; 0 where nothing is decoded, or where it cannot be kept.
+    /// Bytes of all decoded values of a container; 0 if nothing is decoded or the values cannot be kept.
     pub decoded: u64,
 }
 
 impl MemoryProfile {
-    /// Of a container in tiles of `frame_block` frames.
+    /// Returns the profile of a container whose tiles hold `frame_block` frames.
     pub fn of_tiles(frame_block: u64) -> MemoryProfile {
         MemoryProfile {
             per_gaussian: 0,
@@ -283,143 +289,146 @@ impl MemoryProfile {
             frame_block,
             gaussian_block: GAUSSIAN_BLOCK as u64,
             columns: Columns::all().iter().count() as u64,
-            // Decoding, of tiles that are read whole (`benches/scan.rs`).
+            // Decoding time of tiles that are read whole (`benches/scan.rs`).
             seconds_per_state: 5e-8,
             decoded: 0,
         }
     }
 }
 
-/// One column of a container.
+/// Statistics of one column of a container.
 #[derive(Debug, Serialize)]
 pub struct ColumnInfo {
-    /// Its name.
+    /// Name of the column.
     pub name: String,
-    /// f32 components per Gaussian.
+    /// Number of f32 components per Gaussian.
     pub width: u32,
-    /// How far values may be off those that were packed, in the column's unit; 0: not one bit.
+    /// Maximum absolute error against the packed values, in the unit of the column; 0 means exact to the bit.
     pub max_error: f64,
     /// Number of tiles.
     pub tiles: usize,
-    /// Of those, tiles that hold one frame for all.
+    /// Number of these tiles that store one frame for all frames.
     pub constant_tiles: usize,
-    /// Of those, tiles stored as they are.
+    /// Number of these tiles stored without compression.
     pub raw_tiles: usize,
-    /// Bytes stored, of shared tiles once.
+    /// Stored bytes; shared tiles count once.
     pub stored_bytes: u64,
     /// Bytes of the same values as one f32 per frame, component and Gaussian.
     pub raw_bytes: u64,
-    /// Smallest finite value; none if there is no finite value.
+    /// Smallest finite value; `None` without finite values.
     pub min: Option<f32>,
-    /// Largest finite value; none if there is no finite value.
+    /// Largest finite value; `None` without finite values.
     pub max: Option<f32>,
 }
 
-/// How a family takes part.
+/// Entry of a model format: how its files are recognized and opened.
 pub(super) struct ModelFormat {
-    /// Whether a path is of this family, told by what is there.
+    /// Returns whether the input has this format, judged by its content.
     pub(super) recognizes: fn(&FoundInput) -> bool,
-    /// Opens it; without frames where [`Timing::Continuous`].
+    /// Opens the input; without frames if its timing is [`Timing::Continuous`].
     pub(super) open: fn(&Path, &OpenOptions) -> Result<Box<dyn InputModel>>,
 }
 
-/// What lies at a path.
+/// Path to open and its type.
 pub(super) struct FoundInput<'a> {
     pub(super) path: &'a Path,
     pub(super) is_folder: bool,
-    /// The first bytes of a file.
+    /// First 16 bytes of a file.
     pub(super) head: Vec<u8>,
-    /// Memory that looking at it may take.
+    /// Maximum memory for recognizing the format.
     pub(super) memory: ReadLimit,
 }
 
 impl FoundInput<'_> {
-    /// Whether a file looks like one of `torch.save`: an archive that is not numpy's.
+    /// Returns whether a file looks like one of `torch.save`: a ZIP archive that is not an `.npz` of NumPy.
     pub(super) fn is_checkpoint(&self) -> bool {
-        let of_numpy = self.path.extension().is_some_and(|found| found.eq_ignore_ascii_case("npz"));
-        !self.is_folder && self.head.starts_with(b"PK") && !of_numpy
+        let is_npz = self.path.extension().is_some_and(|found| found.eq_ignore_ascii_case("npz"));
+        !self.is_folder && self.head.starts_with(b"PK") && !is_npz
     }
 
-    /// Whether a file begins with `magic`, or, where it is so damaged that it does not, has that extension.
+    /// Returns whether a file begins with `magic` or has `extension`. The extension also catches files with damaged
+    /// heads.
     pub(super) fn is_file_of(&self, magic: &[u8], extension: &str) -> bool {
         let named = || self.path.extension().is_some_and(|found| found.eq_ignore_ascii_case(extension));
         !self.is_folder && (self.head.starts_with(magic) || named())
     }
 }
 
-/// What a user may say about an input beside its path.
+/// Options of opening an input.
 #[derive(Debug, Clone, Default)]
 pub struct OpenOptions {
-    /// Training iteration of a model folder; none: the largest.
+    /// Training iteration of a model folder; `None` selects the largest.
     pub iteration: Option<u32>,
-    /// Whether frames may be missing from a folder of them.
+    /// Whether a folder of frames may have missing frames.
     pub allow_gaps: bool,
     /// Whether frames are linked.
     pub link: Link,
-    /// Folder for what an archive decodes to and linked frames are packed into, while they are open; none: the system's
-    /// for such files.
+    /// Folder for scratch files (decoded archives, linked frames) while the input is open; `None` selects the temporary
+    /// folder of the system.
     pub scratch: Option<PathBuf>,
-    /// What its files do not say.
+    /// Training conventions that the files do not record.
     pub conventions: Conventions,
-    /// Memory that opening it may take.
+    /// Maximum memory for opening the input.
     pub memory: ReadLimit,
-    /// Where the progress of opening goes.
+    /// Receiver of progress events while opening.
     pub events: Events,
 }
 
-/// What the files of some families do not say of how their models were trained, or what to do where they are unclear.
+/// Training conventions that the files of some formats do not record, and how to treat ambiguous values.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct Conventions {
-    /// Length of `time_duration`, after which colors repeat; none: the family's guess, with a note.
+    /// Length of `time_duration`, the period after which colors repeat; `None` uses the guess of the model format and
+    /// adds a note.
     pub time_duration: Option<f64>,
-    /// Whether rotations of four dimensions are those of before 15 September 2024, without the reversal of axes.
+    /// Whether 4D rotations use the convention before 15 September 2024, without the reversal of axes.
     pub rot4d_unflipped: bool,
-    /// What becomes of zero quaternions of a `.splatv`; none: [`ZeroRotation::Drop`].
+    /// Treatment of zero quaternions of a `.splatv`; `None` means [`ZeroRotation::Drop`].
     pub zero_rotation: Option<ZeroRotation>,
 }
 
-/// Whether frames are linked, so that they say which Gaussian is which.
+/// Whether frames are linked to identify the same Gaussian across frames.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Link {
-    /// Those of a folder where they have different numbers of Gaussians, or their order does not tell.
+    /// Links a folder of frames only if their numbers of Gaussians differ or their order does not identify Gaussians.
     #[default]
     Auto,
-    /// Whatever their order tells, or a container or stream.
+    /// Always links, also frames in a common order, containers and streams.
     Always,
-    /// Whatever their order tells; lives that seem to be one stay apart, and what hardly changes along them is not held.
+    /// Always links, but neither joins tracks that seem to be one Gaussian nor makes nearly constant attributes
+    /// constant.
     Apart,
-    /// The same place means the same Gaussian.
+    /// Never links: the same index means the same Gaussian.
     Never,
 }
 
 impl Link {
-    /// Whether frames are linked that say which Gaussian is which.
+    /// Returns whether inputs that already identify Gaussians across frames are linked as well.
     pub fn is_asked(self) -> bool {
         matches!(self, Link::Always | Link::Apart)
     }
 
-    /// Whether lives are joined that are one.
+    /// Returns whether tracks of the same Gaussian are joined.
     pub fn joins(self) -> bool {
         self != Link::Apart
     }
 }
 
 impl OpenOptions {
-    /// Folder for scratch files.
+    /// Returns the folder for scratch files.
     pub(super) fn scratch(&self) -> PathBuf {
         self.scratch.clone().unwrap_or_else(std::env::temp_dir)
     }
 
-    /// How PLY files of the input are read.
+    /// Returns the options for reading the PLY files of the input.
     pub(crate) fn ply(&self) -> PlyOptions {
         PlyOptions { scratch: self.scratch(), memory: self.memory, events: self.events.clone() }
     }
 
-    /// Refuses what only model folders take.
+    /// Refuses `--iteration` for an input that is not a model folder.
     pub(super) fn refuse_for(&self, path: &Path) -> Result<()> {
         match self.iteration {
-            Some(_) => Err(Error::usage(format!("{}: --iteration is for model folders", path.shown()))),
+            Some(_) => Err(Error::usage(format!("{}: --iteration applies to model folders only", path.shown()))),
             None => Ok(()),
         }
     }

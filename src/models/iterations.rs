@@ -1,15 +1,15 @@
-//! Folders `iteration_K` of a model, as 3DGS and what came of it name them.
+//! Folders `iteration_K` of a model, as written by 3DGS and trainers derived from it.
 
 use std::fs;
 use std::path::{Path, PathBuf};
 
 use crate::error::{Error, Result};
 
-/// K of the folders `iteration_K` in `within`, increasing.
+/// Returns the number K of each folder `iteration_K` in `within`, in increasing order.
 ///
 /// # Errors
-/// A folder that cannot be listed.
-pub(super) fn numbers(within: &Path) -> Result<Vec<u32>> {
+/// Fails if the folder cannot be listed.
+pub(super) fn iteration_numbers(within: &Path) -> Result<Vec<u32>> {
     let entries = fs::read_dir(within).map_err(Error::io("open", within))?;
     let mut found = Vec::new();
     for entry in entries {
@@ -21,12 +21,12 @@ pub(super) fn numbers(within: &Path) -> Result<Vec<u32>> {
     Ok(found)
 }
 
-/// K and the folder `iteration_K` in `within`: the one that is asked for, else the largest.
+/// Returns K and the path of the folder `iteration_K` in `within`: the requested K, or the largest.
 ///
 /// # Errors
-/// A folder that cannot be listed, or has no such one.
-pub(super) fn iteration(within: &Path, asked: Option<u32>) -> Result<(u32, PathBuf)> {
-    let found = numbers(within)?;
+/// Fails if the folder cannot be listed or the requested iteration does not exist; the message lists those that do.
+pub(super) fn find_iteration(within: &Path, asked: Option<u32>) -> Result<(u32, PathBuf)> {
+    let found = iteration_numbers(within)?;
     let chosen = asked.map_or(found.last().copied(), |k| found.contains(&k).then_some(k));
     let Some(k) = chosen else {
         let names: Vec<String> = found.iter().map(|k| format!("iteration_{k}")).collect();

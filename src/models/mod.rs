@@ -1,6 +1,7 @@
-//! Model formats: each can be recognized, read as frames, reduced and written back.
+//! Model formats: recognizes, opens, evaluates and writes back the output of each supported trainer.
 //!
-//! A family is one module here and one line of `MODEL_FORMATS`; outside its module nobody asks which one it is.
+//! A model format is one module here and one line of `MODEL_FORMATS`. Code outside its module never asks which format
+//! an input has.
 
 pub mod archive;
 mod container;
@@ -41,7 +42,7 @@ use crate::error::{Error, Result, ShowPath};
 use crate::files::open::open_file;
 use crate::models::input_model::{FoundInput, ModelFormat};
 
-/// Every family that lies in files; the first that recognizes a path opens it.
+/// Model formats that are read from files. The first entry that recognizes a path opens it.
 const MODEL_FORMATS: [ModelFormat; 14] = [
     spacetime_gaussians::ENTRY,
     spacetime_gaussians::SPLATV,
@@ -59,18 +60,21 @@ const MODEL_FORMATS: [ModelFormat; 14] = [
     archive::ENTRY,
 ];
 
-/// Color behind the scene that a model was trained with in whose folder `cameras` is, or which it is: white where the
-/// `cfg_args` there says so, as those of 3DGS and of what derives from it do; none where it does not, or cannot be read.
+/// Returns the background color that a model was trained with. `cameras` is the model folder or a file in it.
+///
+/// The result is white if `cfg_args` in that folder says so, as 3DGS and trainers derived from it write it. Returns
+/// `None` if it does not say so or cannot be read.
 pub fn trained_background(cameras: &Path) -> Option<[f32; 3]> {
     let folder = if cameras.is_dir() { cameras } else { cameras.parent()? };
     let arguments = Arguments::read(&folder.join("cfg_args")).ok()?;
     arguments.get("white_background").bool(false).ok()?.then_some([1.0; 3])
 }
 
-/// Opens a path by what is there. Frames of a family that is continuous in time are still to be chosen.
+/// Opens the model, frames or container at `path`, recognized by its content. Formats that are continuous in time have
+/// no frames until [`InputModel::with_times`] is called.
 ///
 /// # Errors
-/// Nothing there, or of no family; whatever is wrong with it.
+/// Fails if the path does not exist, has no known format, or holds a damaged file.
 pub fn open(path: &Path, options: &OpenOptions) -> Result<Box<dyn InputModel>> {
     let is_folder = fs::metadata(path).map_err(Error::io("open", path))?.is_dir();
     let mut head = Vec::new();
@@ -89,23 +93,24 @@ pub fn open(path: &Path, options: &OpenOptions) -> Result<Box<dyn InputModel>> {
     }
 }
 
-/// Refuses a folder inside a model folder, naming that one.
+/// Refuses a folder inside a model folder. The error names the model folder.
 fn refuse_inside_a_model(path: &Path) -> Result<()> {
-    // A `.` has no name of its own.
+    // A path such as `.` has no file name, so resolve it first.
     let Ok(real) = fs::canonicalize(path) else { return Ok(()) };
     let iteration = |folder: &Path| folder.file_name()?.to_str()?.strip_prefix("iteration_")?.parse::<u32>().ok();
-    let is_clouds = |folder: &Path| folder.file_name().is_some_and(|name| name == "point_cloud");
-    // A PLY that stands for itself in such a folder is a model of its own.
-    let is_part = |folder: &Path| {
-        folder.join("deformation.pth").exists() || spacetime_gaussians::is_marked(&folder.join("point_cloud.ply"))
+    let is_point_cloud_folder = |folder: &Path| folder.file_name().is_some_and(|name| name == "point_cloud");
+    // A PLY without deformation in such a folder is a model by itself.
+    let is_deformed_model = |folder: &Path| {
+        folder.join("deformation.pth").exists()
+            || spacetime_gaussians::has_marker_property(&folder.join("point_cloud.ply"))
     };
-    let (below, number) = match (iteration(&real), real.parent()) {
-        (Some(number), Some(clouds)) if is_clouds(clouds) && is_part(&real) => (2, Some(number)),
-        _ if is_clouds(&real) => (1, None),
+    let (levels, number) = match (iteration(&real), real.parent()) {
+        (Some(number), Some(clouds)) if is_point_cloud_folder(clouds) && is_deformed_model(&real) => (2, Some(number)),
+        _ if is_point_cloud_folder(&real) => (1, None),
         _ => return Ok(()),
     };
-    let Some(root) = real.ancestors().nth(below).filter(|root| root.join("cfg_args").exists()) else { return Ok(()) };
+    let Some(root) = real.ancestors().nth(levels).filter(|root| root.join("cfg_args").exists()) else { return Ok(()) };
     let option = number.map_or_else(String::new, |number| format!(" --iteration {number}"));
-    Err(Error::input(path, "", "a model folder", "a folder inside of one")
+    Err(Error::input(path, "", "a model folder", "a folder inside a model folder")
         .hint(format!("give the folder above: {}{option}", root.shown())))
 }

@@ -1,7 +1,7 @@
-//! Frames in PLY files: a folder with one for each, or a single one. Where they do not say which Gaussian is which, they
-//! are [linked](super::linked).
+//! Frames in PLY files: a folder with one file per frame, or a single file. Frames that do not identify Gaussians
+//! across frames are [linked](super::linked).
 //!
-//! What is written back has the properties, comments and names that the files had.
+//! Output files keep the properties, comments and names of the input files.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -29,7 +29,7 @@ use crate::progress::Events;
 use crate::source::{FrameSource, Ids};
 use crate::tracking::{OrderDifference, identity};
 
-/// A folder with one PLY per frame.
+/// Folder with one PLY per frame.
 pub(super) const FOLDER: ModelFormat = ModelFormat {
     recognizes: |found| found.is_folder && has_ply(found.path),
     open: |path, options| {
@@ -45,54 +45,56 @@ fn has_ply(folder: &Path) -> bool {
         .map_or(true, |mut entries| entries.any(|entry| entry.map_or(true, |entry| is_ply(&entry.path()))))
 }
 
-/// One PLY.
+/// Single PLY file.
 pub(super) const FILE: ModelFormat = ModelFormat {
     recognizes: |found| found.is_file_of(b"ply", "ply"),
     open: |path, options| open_frames(PlyFrames::single(path, &options.ply())?, path, options),
 };
 
-/// Opens frames as they are if the same place means the same Gaussian in all of them, else linked.
+/// Opens frames unchanged if the same index means the same Gaussian in all of them, else links them.
 fn open_frames(frames: PlyFrames, path: &Path, options: &OpenOptions) -> Result<Box<dyn InputModel>> {
     options.refuse_for(path)?;
     let order = match options.link {
-        _ if frames.paths().len() == 1 => FrameOrder::Believed,
-        link if link.is_asked() => FrameOrder::Lost("as asked".to_owned()),
-        Link::Auto => order(&frames)?,
-        _ => FrameOrder::Believed,
+        _ if frames.paths().len() == 1 => FrameOrder::Assumed,
+        link if link.is_asked() => FrameOrder::Lost("as requested".to_owned()),
+        Link::Auto => measure_order(&frames)?,
+        _ => FrameOrder::Assumed,
     };
     match order {
-        FrameOrder::Believed => Ok(Box::new(PlySequence::new(frames)?)),
-        FrameOrder::Kept(note) => Ok(Box::new(PlySequence::new(frames)?.with_note(note))),
+        FrameOrder::Assumed => Ok(Box::new(PlySequence::new(frames)?)),
+        FrameOrder::Confirmed(note) => Ok(Box::new(PlySequence::new(frames)?.with_note(note))),
         FrameOrder::Lost(why) => {
             Ok(Box::new(LinkedFrames::open(frames, path, &why, options.link.joins(), &options.ply())?))
         }
     }
 }
 
-/// Pairs of frames whose order is measured.
-const MEASURED: usize = 5;
+/// Maximum number of pairs of frames whose order is measured.
+const MAX_MEASURED_PAIRS: usize = 5;
 
-/// Whether the order of frames tells which Gaussian is which.
+/// Whether the order of Gaussians in frames identifies them.
 enum FrameOrder {
-    /// Nobody looked.
-    Believed,
-    /// It does, as the note says.
-    Kept(String),
-    /// It does not, and why.
+    /// Order trusted without measurement.
+    Assumed,
+    /// Order that identifies Gaussians; the note gives the measured differences.
+    Confirmed(String),
+    /// Order that does not identify Gaussians, with the reason.
     Lost(String),
 }
 
-/// Whether order tells which Gaussian is which: it does where it holds in most pairs of neighboring frames, of five that
-/// are evenly spread.
-fn order(frames: &PlyFrames) -> Result<FrameOrder> {
+/// Measures whether the index identifies Gaussians. It does if it holds in at least half of up to five evenly spread
+/// pairs of neighboring frames.
+///
+/// Frames with different numbers of Gaussians have no common order.
+fn measure_order(frames: &PlyFrames) -> Result<FrameOrder> {
     if let Some(other) = frames.other_count() {
         let (counts, name) = (frames.counts(), shown_name(&frames.paths()[other]));
-        return Ok(FrameOrder::Lost(format!("{name} has {} Gaussians, the first {}", counts[other], counts[0])));
+        return Ok(FrameOrder::Lost(format!("{name} has {} Gaussians, the first frame {}", counts[other], counts[0])));
     }
     let pairs = frames.paths().len() - 1;
     let mut found = Vec::new();
-    for k in 0..pairs.min(MEASURED) {
-        let first = k * pairs / pairs.min(MEASURED);
+    for k in 0..pairs.min(MAX_MEASURED_PAIRS) {
+        let first = k * pairs / pairs.min(MAX_MEASURED_PAIRS);
         let state = |frame: usize| -> Result<Gaussians> {
             let mut state = Gaussians::zeros(0, frames.sh_degree());
             frames.frame(frame)?.gaussians(0..frames.counts()[frame] as usize, Columns::all(), &mut state)?;
@@ -105,16 +107,17 @@ fn order(frames: &PlyFrames) -> Result<FrameOrder> {
     let Some(OrderDifference { moved, apart, unlike, strangers, .. }) =
         found.iter().find(|found| found.holds != is_lost)
     else {
-        return Ok(FrameOrder::Believed);
+        return Ok(FrameOrder::Assumed);
     };
-    let apart = format!("({moved:.1} sizes, {apart:.1})");
+    let apart = format!("({moved:.1} vs. {apart:.1} sizes)");
     Ok(match is_lost {
         true => FrameOrder::Lost(format!(
-            "those of the same place are as far apart as strangers {apart} or look as different ({unlike:.2}, {strangers:.2})"
+            "Gaussians of the same index are as far apart as unrelated ones {apart} or as different in appearance \
+             ({unlike:.2} vs. {strangers:.2})"
         )),
-        false => FrameOrder::Kept(format!(
-            "frames are in one order: those of the same place are nearer than strangers {apart} and look more alike \
-             ({unlike:.2}, {strangers:.2})"
+        false => FrameOrder::Confirmed(format!(
+            "frames have a common order: Gaussians of the same index are nearer than unrelated ones {apart} and more \
+             alike in appearance ({unlike:.2} vs. {strangers:.2})"
         )),
     })
 }
@@ -155,7 +158,7 @@ impl InputModel for PlySequence {
             reader: 4,
             reduced: 0,
             jacobian: 0,
-            // Normals and the like stand beside the values.
+            // Normals and other extra properties are stored beside the attributes.
             file: state_bytes(self.info().sh_degree, Columns::all()) + 24,
             fixed: 0,
             frame_block: 0,
@@ -212,7 +215,7 @@ impl InputModel for PlySequence {
     }
 }
 
-/// Writes every frame's file again with the properties, comments and names it had.
+/// Writes the file of every frame again with its original properties, comments and name.
 fn write_files(
     sequence: &PlySequence,
     reduction: &CompressedModel,
@@ -236,7 +239,7 @@ fn write_files(
         progress.advance(1);
         Ok(())
     };
-    // A batch at a time: a thread that waits for proxies would begin another frame.
+    // Work in batches: while a thread waits for proxies, it would otherwise begin another frame.
     let all: Vec<usize> = (0..sequence.paths().len()).collect();
     all.chunks(rayon::current_num_threads()).try_for_each(|batch| batch.par_iter().try_for_each(write))
 }

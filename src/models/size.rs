@@ -1,4 +1,4 @@
-//! How large a model is on disk, by part.
+//! Size of a model on disk, by part.
 
 use std::fs;
 use std::path::Path;
@@ -8,16 +8,16 @@ use serde::{Deserialize, Serialize};
 use crate::archive::ArchiveSize;
 use crate::error::{Error, Result};
 
-/// Bytes of everything that a renderer opens of a model, by part. What only training reads is no part of it.
+/// Bytes of all files that a renderer opens of a model, by part. Files that only training reads are not counted.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Size {
-    /// Gaussians from which frames follow.
+    /// Bytes of the canonical Gaussians.
     pub cloud: u64,
-    /// What deforms them.
+    /// Bytes of the deformation field.
     pub field: u64,
-    /// States of Gaussians, frame by frame.
+    /// Bytes of states stored frame by frame.
     pub frames: u64,
-    /// Everything else.
+    /// Bytes of everything else.
     pub rest: u64,
 }
 
@@ -28,29 +28,29 @@ impl From<ArchiveSize> for Size {
 }
 
 impl Size {
-    /// Of frames and nothing else.
+    /// Returns the size of a model that consists of `frames` bytes of frame states only.
     pub fn of_frames(frames: u64) -> Size {
         Size { frames, ..Size::default() }
     }
 
-    /// All parts together.
+    /// Returns the sum of all parts, bytes.
     pub fn whole(&self) -> u64 {
         self.cloud + self.field + self.frames + self.rest
     }
 
-    /// Parts with a name each.
+    /// Returns each part with its name.
     pub fn named(&self) -> [(&'static str, u64); 4] {
         [("cloud", self.cloud), ("field", self.field), ("frames", self.frames), ("rest", self.rest)]
     }
 
-    /// The parts, for a person: `cloud 248, field 1000`.
+    /// Formats the parts that are not 0 for messages: `cloud 248, field 1000`.
     pub fn parts(&self) -> String {
         let parts = self.named().into_iter().filter(|part| part.1 > 0);
         parts.map(|(name, bytes)| format!("{name} {bytes}")).collect::<Vec<_>>().join(", ")
     }
 
-    /// The parts as parts of those of `before`, for a person: `cloud 248 of 2480 (10.0%)`. A part that one of both lacks
-    /// is compared with nothing.
+    /// Formats the parts relative to the parts of `before` for messages: `cloud 248 of 2480 (10.0%)`. A part that
+    /// exists on one side only is compared with `none`.
     pub fn parts_of(&self, before: &Size) -> String {
         let part = |((name, after), (_, before)): ((_, u64), (_, u64))| match (after, before) {
             (0, 0) => None,
@@ -61,28 +61,32 @@ impl Size {
         self.named().into_iter().zip(before.named()).filter_map(part).collect::<Vec<_>>().join(", ")
     }
 
-    /// Why this, made of what takes `before`, takes more bytes; none if it does not.
+    /// Returns a message that explains why this output of an input of size `before` is larger; `None` if it is not
+    /// larger.
     pub fn why_larger_than(&self, before: &Size) -> Option<String> {
         let (after, whole) = (self.whole(), before.whole());
         let why = match (self.frames > 0, before.frames > 0) {
-            (true, false) => "it holds the states of every frame, the input what all frames follow from",
-            _ => "the input holds its values in fewer bytes than this kind of result does",
+            (true, false) => {
+                "it holds the states of every frame, while the input holds parameters from which all \
+                              frames are computed"
+            }
+            _ => "the input stores its values in fewer bytes than this output format",
         };
-        (after > whole).then(|| format!("the result is larger than its input, {after} bytes of {whole}: {why}"))
+        (after > whole).then(|| format!("the result is larger than its input, {after} bytes instead of {whole}: {why}"))
     }
 }
 
-/// So many bytes of so many, with what part that is.
+/// Formats bytes as `{after} of {before}` with a percentage.
 pub fn compared(after: u64, before: u64) -> String {
     format!("{after} of {before} ({:.1}%)", 100.0 * after as f64 / before.max(1) as f64)
 }
 
-/// Sum of the sizes of files, bytes.
+/// Returns the sum of the sizes of files, bytes. Fails if one cannot be read.
 pub(super) fn bytes_of<'a>(paths: impl IntoIterator<Item = &'a Path>) -> Result<u64> {
     paths.into_iter().map(|path| Ok(fs::metadata(path).map_err(Error::io("read", path))?.len())).sum()
 }
 
-/// Bytes of a file, or of all files below a folder.
+/// Returns the bytes of a file, or of all files below a folder.
 pub(super) fn bytes_below(path: &Path) -> Result<u64> {
     let found = fs::metadata(path).map_err(Error::io("read", path))?;
     if !found.is_dir() {
@@ -97,7 +101,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_bytes_of_a_folder_are_those_of_all_its_files() {
+    fn folder_size_is_the_sum_of_its_files() {
         let folder = tempfile::tempdir().unwrap();
         fs::create_dir(folder.path().join("a")).unwrap();
         fs::write(folder.path().join("a/b"), [0; 7]).unwrap();
@@ -107,7 +111,7 @@ mod tests {
     }
 
     #[test]
-    fn parts_are_compared_with_parts_of_their_own_kind() {
+    fn each_part_is_compared_with_its_counterpart() {
         let model = Size { cloud: 1000, field: 4000, rest: 10, ..Size::default() };
         let small = Size { cloud: 100, field: 2000, rest: 10, ..Size::default() };
         assert_eq!(small.whole(), 2110);
@@ -123,11 +127,11 @@ mod tests {
     }
 
     #[test]
-    fn only_what_is_larger_has_a_reason_and_it_is_that_of_its_parts() {
+    fn only_larger_results_are_explained() {
         let model = Size { cloud: 1000, field: 4000, ..Size::default() };
         assert_eq!(Size::of_frames(5000).why_larger_than(&model), None);
         let why = Size::of_frames(5001).why_larger_than(&model).unwrap();
-        assert!(why.contains("5001 bytes of 5000") && why.contains("every frame"), "{why}");
+        assert!(why.contains("5001 bytes instead of 5000") && why.contains("every frame"), "{why}");
         let why = Size::of_frames(3).why_larger_than(&Size::of_frames(2)).unwrap();
         assert!(why.contains("fewer bytes"), "{why}");
     }

@@ -1,14 +1,14 @@
-//! Model folders of 3D Gaussian Splatting: a cloud that nothing deforms.
+//! Model folders of 3D Gaussian Splatting: Gaussians without a deformation field.
 //!
-//! In: `<root>/point_cloud/iteration_K/point_cloud.ply`, of the largest K unless one is named. Out: a folder of the same layout
-//! with fewer rows, `cfg_args` and `cameras.json`.
+//! Input: `<root>/point_cloud/iteration_K/point_cloud.ply` with the largest K unless one is chosen. Output: a folder of
+//! the same layout with fewer rows, `cfg_args` and `cameras.json`.
 
 use std::fs;
 use std::path::{Path, PathBuf};
 
 use super::files::copy;
 use super::four_d_gaussians::cfg_args;
-use super::iterations::iteration;
+use super::iterations::find_iteration;
 use super::size::{Size, bytes_below, bytes_of};
 use crate::archive::Content;
 use crate::compressed_model::CompressedModel;
@@ -20,55 +20,62 @@ use crate::outputs::kind::OutputKind;
 use crate::progress::Events;
 use crate::source::FrameSource;
 
-const CLOUDS: &str = "point_cloud";
-const CLOUD: &str = "point_cloud.ply";
+/// Name of the folder of iterations.
+const POINT_CLOUD_FOLDER: &str = "point_cloud";
+/// Name of the point cloud file in an iteration folder.
+const POINT_CLOUD_FILE: &str = "point_cloud.ply";
 
-/// A model folder with a cloud, and nothing that deforms it.
+/// Model folder with a point cloud file and no deformation field.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
     recognizes: |found| {
-        let is_whole = |folder: &Path| folder.join(CLOUD).is_file() && !folder.join("deformation.pth").exists();
-        let whole = iteration(&found.path.join(CLOUDS), None).is_ok_and(|(_, folder)| is_whole(&folder));
-        found.is_folder && whole && !deforms(found.path)
+        let is_static =
+            |folder: &Path| folder.join(POINT_CLOUD_FILE).is_file() && !folder.join("deformation.pth").exists();
+        let is_static_model =
+            find_iteration(&found.path.join(POINT_CLOUD_FOLDER), None).is_ok_and(|(_, folder)| is_static(&folder));
+        found.is_folder && is_static_model && !has_deformation(found.path)
     },
-    open: |path, options| Ok(Box::new(Static::open(path, options)?)),
+    open: |path, options| Ok(Box::new(StaticModel::open(path, options)?)),
 };
 
-/// Whether a model's folder says that its cloud is deformed, even where the file that does it is missing.
-fn deforms(root: &Path) -> bool {
+/// Returns whether a model folder says that its Gaussians are deformed, even if the deformation file is missing.
+fn has_deformation(root: &Path) -> bool {
     let arguments = cfg_args::read(&root.join("cfg_args")).unwrap_or_default();
     root.join("deform").exists() || ["kplanes_config", "defor_depth"].iter().any(|name| arguments.contains(name))
 }
 
-/// Files of the root that a result has too.
-const BESIDE: [&str; 2] = ["cfg_args", "cameras.json"];
+/// Files of the model folder that are copied to the output.
+const COPIED_FILES: [&str; 2] = ["cfg_args", "cameras.json"];
 
-/// A model folder.
-struct Static {
+/// Open model folder of 3DGS.
+struct StaticModel {
     root: PathBuf,
     iteration: u32,
     cloud: PlySequence,
 }
 
-impl Static {
-    fn open(root: &Path, options: &OpenOptions) -> Result<Static> {
-        let (iteration, folder) = iteration(&root.join(CLOUDS), options.iteration)?;
-        Ok(Static {
+impl StaticModel {
+    /// Opens the requested iteration of the model folder `root`, or the largest.
+    fn open(root: &Path, options: &OpenOptions) -> Result<StaticModel> {
+        let (iteration, folder) = find_iteration(&root.join(POINT_CLOUD_FOLDER), options.iteration)?;
+        Ok(StaticModel {
             root: root.to_owned(),
             iteration,
-            cloud: PlySequence::single(&folder.join(CLOUD), &options.ply())?,
+            cloud: PlySequence::single(&folder.join(POINT_CLOUD_FILE), &options.ply())?,
         })
     }
 
-    fn beside(&self) -> impl Iterator<Item = PathBuf> {
-        BESIDE.iter().map(|name| self.root.join(name)).filter(|path| path.is_file())
+    /// Returns the paths of existing files that are copied to the output.
+    fn copied_files(&self) -> impl Iterator<Item = PathBuf> {
+        COPIED_FILES.iter().map(|name| self.root.join(name)).filter(|path| path.is_file())
     }
 
-    fn cloud_in(&self, root: &Path) -> PathBuf {
-        root.join(CLOUDS).join(format!("iteration_{}", self.iteration)).join(CLOUD)
+    /// Returns the path of the point cloud file in a model folder `root`.
+    fn cloud_path(&self, root: &Path) -> PathBuf {
+        root.join(POINT_CLOUD_FOLDER).join(format!("iteration_{}", self.iteration)).join(POINT_CLOUD_FILE)
     }
 }
 
-impl InputModel for Static {
+impl InputModel for StaticModel {
     fn kind(&self) -> &'static str {
         "3D Gaussian Splatting model"
     }
@@ -86,7 +93,7 @@ impl InputModel for Static {
     }
 
     fn size(&self) -> Result<Size> {
-        let rest = self.beside().collect::<Vec<_>>();
+        let rest = self.copied_files().collect::<Vec<_>>();
         let (cloud, rest) = (InputModel::bytes(&self.cloud)?, bytes_of(rest.iter().map(PathBuf::as_path))?);
         Ok(Size { cloud, rest, ..Size::default() })
     }
@@ -94,7 +101,7 @@ impl InputModel for Static {
     fn size_written(&self, kind: OutputKind, path: &Path) -> Result<Size> {
         match kind {
             OutputKind::Model => {
-                let cloud = bytes_of([&*self.cloud_in(path)])?;
+                let cloud = bytes_of([&*self.cloud_path(path)])?;
                 Ok(Size { cloud, rest: bytes_below(path)?.saturating_sub(cloud), ..Size::default() })
             }
             _ => self.cloud.size_written(kind, path),
@@ -110,7 +117,7 @@ impl InputModel for Static {
     }
 
     fn with_times(self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn InputModel>> {
-        Ok(Box::new(Static { cloud: self.cloud.with_times(times)?, ..*self }))
+        Ok(Box::new(StaticModel { cloud: self.cloud.with_times(times)?, ..*self }))
     }
 
     fn own_output(&self) -> OutputKind {
@@ -125,7 +132,7 @@ impl InputModel for Static {
     }
 
     fn needs_all_bands(&self) -> Option<&'static str> {
-        self.root.join("cfg_args").exists().then_some("cfg_args says how many there are")
+        self.root.join("cfg_args").exists().then_some("cfg_args fixes the SH degree")
     }
 
     fn content(&self, reduction: &CompressedModel) -> Result<Content> {
@@ -151,10 +158,10 @@ impl InputModel for Static {
         if kind != OutputKind::Model {
             return self.cloud.write(reduction, kind, path, limits, events);
         }
-        let to = self.cloud_in(path);
+        let to = self.cloud_path(path);
         let folder = to.parent().unwrap_or(path);
         fs::create_dir_all(folder).map_err(Error::io("create", folder))?;
-        for file in self.beside() {
+        for file in self.copied_files() {
             copy(&file, &path.join(file.file_name().unwrap_or_default()))?;
         }
         self.cloud.write(reduction, OutputKind::Ply, &to, limits, events)
@@ -171,7 +178,7 @@ mod tests {
     use crate::recipe::Recipe;
 
     #[test]
-    fn a_folder_without_a_field_is_a_static_model_and_is_written_as_one() {
+    fn folder_without_a_field_is_read_and_written_as_static() {
         let folder = tempfile::tempdir().unwrap();
         let root = folder.path().join("model");
         for k in [7000, 30_000] {
@@ -198,7 +205,7 @@ mod tests {
         let first = gather_all(open(&root, Some(7000)).unwrap().source(), 0, Columns::POSITION).unwrap();
         assert_eq!(first.position.row::<1>(0), [7000.0]);
         assert!(open(&root, Some(8)).err().unwrap().to_string().contains("iteration_7000, iteration_30000"));
-        // A field that is missing is no static model.
+        // A model whose deformation file is missing is not a static model.
         fs::write(root.join("cfg_args"), "Namespace(sh_degree=3, defor_depth=1)").unwrap();
         assert!(open(&root, None).err().unwrap().to_string().contains("deformation.pth"));
     }

@@ -1,7 +1,9 @@
-//! A frame stream (format/STREAM.md) as a family: packed into a container as it arrives, then read from that.
+//! Frame stream (format/STREAM.md) as a model format: packed into a container as it arrives, then read from that
+//! container.
 //!
-//! Memory, with b the bytes of one Gaussian's varying columns: frames held N·b·F, at most 64 MiB or one frame;
-//! two more on their way in; the constant columns; 24 bytes per frame that has arrived. A thread reads ahead while the frames before are encoded.
+//! Memory, with N Gaussians, b bytes of varying columns per Gaussian, and F frames per block: N·b·F for held frames, at
+//! most 64 MiB or one frame; two more frames in transit; the constant columns; 24 bytes per received frame. A thread
+//! reads ahead while earlier frames are encoded.
 
 use std::collections::BTreeMap;
 use std::io::Read;
@@ -22,28 +24,28 @@ use crate::passes::HeldFrames;
 use crate::progress::Events;
 use crate::source::FrameSource;
 
-/// Most bytes of frames that are held together, if that is one frame at least.
+/// Maximum bytes of frames that are held together; at least one frame is held.
 const HELD_BYTES: u64 = 64 << 20;
-/// Frames that may be on their way from the reading thread.
+/// Maximum number of frames in transit from the reading thread.
 pub const AHEAD: usize = 2;
-/// How the scratch container is stored: as `pack` does, so that the digest of the input is the same.
+/// Compression of the scratch container. Equals that of `pack`, so that the digest of the input is the same.
 const COMPRESSION: Compression = Compression::Zstd(1);
 
-/// What a stream has become.
+/// Received frame stream.
 pub struct Streamed {
-    /// Its frames.
+    /// Container of the received frames.
     container: Container,
-    /// Bytes that arrived.
+    /// Number of bytes received.
     received: u64,
-    /// Keeps the container's file until nobody reads it any more.
+    /// Owner of the container's file, which is deleted when the stream is dropped.
     _scratch: ScratchFile,
 }
 
 impl Streamed {
-    /// Packs a stream into a scratch file in `folder`. `take` sees the frames of every frame block, in order.
+    /// Packs a stream into a scratch file in `folder`. Calls `take` with the frames of each frame block, in order.
     ///
     /// # Errors
-    /// What is wrong with the stream; a failed write.
+    /// Fails if the stream is damaged or a write fails.
     pub fn receive(
         stream: FrameStream<impl Read + Send + 'static>,
         folder: &Path,
@@ -99,12 +101,12 @@ impl InputModel for Streamed {
     }
 
     fn with_times(self: Box<Self>, _: Vec<f64>) -> Result<Box<dyn InputModel>> {
-        Err(Error::usage("a frame stream says itself when its frames are"))
+        Err(Error::usage("a frame stream contains the times of its frames; no other times can be given"))
     }
 }
 
-/// Writes a stream to the container `path`; gives the number of bytes that arrived. `take` sees the frames
-/// of every frame block, in order.
+/// Writes a stream to the container `path` and returns the number of bytes received. Calls `take` with the frames of
+/// each frame block, in order.
 pub fn pack_stream(
     mut stream: FrameStream<impl Read + Send + 'static>,
     path: &Path,
@@ -117,19 +119,20 @@ pub fn pack_stream(
     let mut writer = ContainerWriter::create(path, count, sh_degree, block, packing, BTreeMap::new())?;
     let mut held = HeldFrames::new(count, sh_degree, varying, stream.take_constant());
     let progress = events.counting_task("receive", "frames");
-    let mut put = |held: &mut HeldFrames| -> Result<Vec<Gaussians>> {
+    let mut flush = |held: &mut HeldFrames| -> Result<Vec<Gaussians>> {
         writer.append(held, 0..held.len(), |_| ())?;
         take(held)?;
         Ok(held.drain().collect())
     };
 
-    // Every buffer there will ever be goes round: empty to the reader, filled to the packer.
+    // A fixed set of buffers circulates: empty ones go to the reader, filled ones to the packer.
     let (to_fill, empty) = bounded(block + AHEAD);
     for _ in 0..block + AHEAD {
         let _ = to_fill.send(Gaussians::zeros(0, sh_degree));
     }
     let (filled, arrived) = bounded(AHEAD);
-    // Not joined on failure: it may wait for a program that writes nothing more, and ends at its next frame.
+    // The thread is not joined on failure: it may be waiting for a program that writes no more. It ends at its next
+    // frame.
     let reader = thread::spawn(move || {
         while let Ok(mut state) = empty.recv() {
             let frame = stream.next_frame(&mut state).map(|time| time.map(|time| (time, state)));
@@ -145,20 +148,20 @@ pub fn pack_stream(
         held.push(time, state);
         progress.advance(1);
         if held.len() == block {
-            for state in put(&mut held)? {
+            for state in flush(&mut held)? {
                 let _ = to_fill.send(state);
             }
         }
     }
     if !held.is_empty() {
-        put(&mut held)?;
+        flush(&mut held)?;
     }
     writer.finish()?;
     reader.join().map_err(|_| Error::internal("the thread that reads standard input failed"))
 }
 
-/// Frames that are held together, which the container's tiles are made of: as many as fit [`HELD_BYTES`], from 1
-/// to [`FRAME_BLOCK`]. The header alone decides, so that the bytes of the container depend on nothing else.
+/// Returns the number of frames per tile of the container: as many as fit [`HELD_BYTES`], between 1 and
+/// [`FRAME_BLOCK`]. Depends on the header only, so that the bytes of the container do too.
 pub fn frame_block(header: &StreamHeader) -> usize {
     (HELD_BYTES / header.frame_bytes().max(1)).clamp(1, FRAME_BLOCK as u64) as usize
 }

@@ -1,5 +1,5 @@
-//! What families of explicit trajectories share: each Gaussian's state stands in every frame, so that a proxy is the
-//! moment match of its members frame by frame, and nothing has to be solved.
+//! Functions shared by formats of explicit trajectories. The state of each Gaussian is stored for every frame, so a
+//! proxy is the moment match of its members in each frame and no parameters have to be solved for.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -22,28 +22,28 @@ use crate::passes::{Changed, HeldFrames, States, gather_all};
 use crate::progress::Events;
 use crate::source::{FrameSource, ReadPlan};
 
-/// zstd level of containers that are a result: higher ones gain about 1% on trained models.
-const LEVEL: i32 = 1;
+/// zstd level of output containers. Higher levels gain about 1% on trained models.
+const ZSTD_LEVEL: i32 = 1;
 
-/// The kind of a result of explicit trajectories to which nothing else gives one.
+/// Default kind of output of explicit trajectories.
 pub const OWN_OUTPUT: OutputKind = OutputKind::PlySequence;
 
-/// Why most inputs cannot become an archive.
-pub(super) const NO_ARCHIVE: &str = "only a 4DGaussians or 3DGS model, a PLY, or frames can be written as an archive\n  \
-                                     pack it into a .gseq first, or write one";
+/// Message for inputs that cannot be written as an archive.
+pub(super) const NO_ARCHIVE: &str = "only a 4DGaussians or 3DGS model, a PLY, or frames can be written as an \
+                                     archive\n  write a .gseq instead, or pack the input into a .gseq first";
 
-/// Bytes of the columns `of` of one Gaussian at one frame.
-pub fn state_bytes(sh_degree: usize, of: Columns) -> u64 {
-    of.iter().map(|column| 4 * column.width(sh_degree) as u64).sum()
+/// Returns the bytes of the `columns` of one Gaussian at one frame.
+pub fn state_bytes(sh_degree: usize, columns: Columns) -> u64 {
+    columns.iter().map(|column| 4 * column.width(sh_degree) as u64).sum()
 }
 
-/// What is left of `source`, merged.
+/// Returns the frames of `source` with Gaussians removed and merged as `reduction` says.
 pub(super) fn merged<'a>(source: &'a dyn FrameSource, reduction: &'a CompressedModel) -> MergedSequence<'a> {
     let members = reduction.clusters.iter().map(|cluster| (cluster.output, &cluster.members[..]));
     MergedSequence::new(source, &reduction.kept, members, &reduction.rule)
 }
 
-/// What is left of `source`, merged and changed, with what stays of its harmonics.
+/// Returns the frames of `source` with Gaussians removed and merged, parameter deltas added and the SH degree lowered.
 pub(super) fn reduced_trajectories<'a>(
     source: &'a dyn FrameSource,
     reduction: &'a CompressedModel,
@@ -52,7 +52,7 @@ pub(super) fn reduced_trajectories<'a>(
     Box::new(Changed::new(Box::new(merged(source, reduction)), change, course, *sh_degree))
 }
 
-/// Confirms that a sequence of so many frames can be written as `kind`.
+/// Checks that a sequence of `frames` frames can be written as `kind`.
 pub(super) fn check_output(frames: usize, kind: OutputKind, path: &Path) -> Result<()> {
     match kind {
         OutputKind::Model => Err(Error::usage(
@@ -67,7 +67,7 @@ pub(super) fn check_output(frames: usize, kind: OutputKind, path: &Path) -> Resu
     }
 }
 
-/// Writes what is left of `source` as `kind`, to `path`; gives things a person should know.
+/// Writes the compressed model of `source` as `kind` to `path` and returns notes for the user.
 pub(super) fn write_trajectories(
     source: &dyn FrameSource,
     reduction: &CompressedModel,
@@ -83,21 +83,21 @@ pub(super) fn write_trajectories(
     write_sequence(&*reduced_trajectories(source, reduction), kind, path, limits.frames_held, events)
 }
 
-/// A container with proxies, whose members lie anywhere: a frame block at a time, of as many Gaussians together as
-/// `most` allows.
+/// Writes a container with proxies, whose members can be anywhere in the source. Works by frame block and by groups of
+/// Gaussians made of about `max_gaussians` source Gaussians.
 fn write_merged(
     source: &dyn FrameSource,
     reduction: &CompressedModel,
     path: &Path,
-    most: usize,
+    max_gaussians: usize,
     events: &Events,
 ) -> Result<()> {
     let merged = merged(source, reduction);
     let SequenceInfo { count, times, sh_degree, varying } = merged.info();
-    let (compression, left) = (Compression::Zstd(LEVEL), reduction.sh_degree.min(*sh_degree));
+    let (compression, left) = (Compression::Zstd(ZSTD_LEVEL), reduction.sh_degree.min(*sh_degree));
     let mut writer = ContainerWriter::create(path, *count, left, FRAME_BLOCK, compression, BTreeMap::new())?;
     let progress = events.task("emit", "states", (count * times.len()) as u64);
-    let parts = parts(&merged, most);
+    let parts = block_ranges(&merged, max_gaussians);
     for start in (0..times.len()).step_by(FRAME_BLOCK) {
         let of_block = start..times.len().min(start + FRAME_BLOCK);
         writer.begin(&times[of_block.clone()])?;
@@ -116,7 +116,7 @@ fn write_merged(
             drop(frames);
             let places: Vec<u32> = (part.start as u32..part.end as u32).collect();
             let change = reduction.change.pick(&places);
-            // Where there are proxies there is no course.
+            // Models with proxies have no trajectory delta.
             let course = TrajectoryDelta::default();
             let held = Changed::new(Box::new(held), &change, &course, reduction.sh_degree);
             writer.add(&held, part.start, 0..of_block.len(), |done| progress.advance(done))?;
@@ -125,28 +125,29 @@ fn write_merged(
     writer.finish()
 }
 
-/// The Gaussians of `merged` in whole blocks, each part made of about `most` Gaussians of the source at most.
-fn parts(merged: &MergedSequence<'_>, most: usize) -> Vec<Range<usize>> {
+/// Divides the Gaussians of `merged` into ranges of whole blocks. Each range is made of at most `max_gaussians` Gaussians of the
+/// source, or is a single block.
+fn block_ranges(merged: &MergedSequence<'_>, max_gaussians: usize) -> Vec<Range<usize>> {
     let count = merged.info().count;
-    let (mut parts, mut start, mut made_of) = (Vec::new(), 0, 0);
+    let (mut parts, mut start, mut source_gaussians) = (Vec::new(), 0, 0);
     for block in (0..count).step_by(GAUSSIAN_BLOCK) {
-        let of_block = block..count.min(block + GAUSSIAN_BLOCK);
-        let members: usize = of_block.map(|place| merged.members(place)).sum();
-        if made_of > 0 && made_of + members > most {
+        let places = block..count.min(block + GAUSSIAN_BLOCK);
+        let members: usize = places.map(|place| merged.members(place)).sum();
+        if source_gaussians > 0 && source_gaussians + members > max_gaussians {
             parts.push(start..block);
-            (start, made_of) = (block, 0);
+            (start, source_gaussians) = (block, 0);
         }
-        made_of += members;
+        source_gaussians += members;
     }
     parts.push(start..count);
     parts
 }
 
-/// Writes every frame of `source` as any kind that is made of frames; gives things a person should know. Readers of whole
-/// frames hold at most `held` of those they decode together.
+/// Writes every frame of `source` as a kind of output that consists of frames, and returns notes for the user. Readers
+/// of whole frames keep at most `held` of the frames that are decoded together.
 ///
 /// # Errors
-/// Frames that cannot be read, a failed write.
+/// Fails if frames cannot be read or a write fails.
 pub fn write_sequence(
     source: &dyn FrameSource,
     kind: OutputKind,
@@ -160,11 +161,11 @@ pub fn write_sequence(
         OutputKind::FourDgs => return Ok(vec![write_four_dgs(source, path, events)?]),
         OutputKind::Spz => {
             let off = write_spz(&gather_all(source, 0, Columns::all())?, path)?;
-            return Ok(vec![format!("positions are {off:.2e} scene units off at most")]);
+            return Ok(vec![format!("maximum position error: {off:.2e} scene units")]);
         }
         OutputKind::Gseq => {
             let progress = events.task("emit", "states", info.count as u64 * info.times.len() as u64);
-            let compression = Compression::Zstd(LEVEL);
+            let compression = Compression::Zstd(ZSTD_LEVEL);
             write_container(source, path, compression, BTreeMap::new(), |done| progress.advance(done))?;
             return Ok(Vec::new());
         }

@@ -1,8 +1,8 @@
-//! Any sequence into a container, frame block by frame block, tile by tile.
+//! Writes any sequence to a container: frame block by frame block, tile by tile.
 //!
-//! Memory: for every thread one tile of every column, [`GAUSSIAN_BLOCK`] × frames of a block values of
-//! each of its components, and as much again while it is encoded (of a column with a bound, four times its tile); 80 bytes per column and block of Gaussians,
-//! 16 per frame.
+//! Memory: for every thread one tile of every column ([`GAUSSIAN_BLOCK`] × frames of a block values of each of its
+//! components), and as much again while it is encoded (four times the tile for a column with an error bound); 80 bytes
+//! per column and block of Gaussians, 16 per frame.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -17,15 +17,15 @@ use crate::error::Result;
 use crate::model::{Columns, Gaussians};
 use crate::source::{FrameSource, Ids};
 
-/// Gaussians per tile: what one task of a scan reads. Fixed, so that the bytes depend on nothing but
-/// the content.
+/// Number of Gaussians per tile, which one task of a scan reads. Fixed, so that the bytes depend on nothing but the
+/// content.
 pub const GAUSSIAN_BLOCK: usize = 1024;
-/// Frames per tile, but for streams whose frames are large.
+/// Number of frames per tile, except for streams with large frames.
 pub const FRAME_BLOCK: usize = 32;
-/// Frames per tile within bounds, of which the first takes as much as all others together.
+/// Number of frames per tile with error bounds, where the first frame takes as much space as all others together.
 pub const BOUNDED_FRAME_BLOCK: usize = 64;
 
-/// How a container stores its values.
+/// Encoding of the values in a container.
 #[derive(Debug, Clone, Copy)]
 pub struct Packing {
     compression: Compression,
@@ -33,46 +33,46 @@ pub struct Packing {
 }
 
 impl From<Compression> for Packing {
-    /// Every bit of every value.
+    /// Returns the lossless encoding with `compression`.
     fn from(compression: Compression) -> Packing {
         Packing { compression, bounds: Bounds::default() }
     }
 }
 
 impl Packing {
-    /// Values within `bounds`, by zstd at `level`.
+    /// Returns the encoding with errors within `bounds`, compressed by zstd at `level`.
     pub fn within(bounds: Bounds, level: i32) -> Packing {
         Packing { compression: Compression::Zstd(level), bounds }
     }
 
-    /// Frames per tile.
+    /// Returns the number of frames per tile.
     pub fn frame_block(&self) -> usize {
         if self.bounds == Bounds::default() { FRAME_BLOCK } else { BOUNDED_FRAME_BLOCK }
     }
 
-    /// How many frame blocks `source` has.
+    /// Returns the number of frame blocks of `source`.
     pub fn frame_blocks(&self, source: &dyn FrameSource) -> usize {
         source.info().times.len().div_ceil(self.frame_block())
     }
 
-    /// Frames of one of them.
+    /// Returns the frames of frame block `block`.
     pub fn frames(&self, source: &dyn FrameSource, block: usize) -> Range<usize> {
         let start = block * self.frame_block();
         start..source.info().times.len().min(start + self.frame_block())
     }
 
-    /// What tiles follow from, beside their values.
+    /// Returns the cache key of this encoding; the values are not included.
     pub fn key(&self) -> CacheKey {
-        let of_column = |column| match self.column(column) {
+        let column_key = |column| match self.column(column) {
             Compression::Raw => (0, 0.0, 0),
             Compression::Zstd(level) => (1, 0.0, level),
             Compression::Bounded { max_error, level } => (2, max_error, level),
         };
-        let columns: Vec<(u8, f64, i32)> = Columns::all().iter().map(of_column).collect();
+        let columns: Vec<(u8, f64, i32)> = Columns::all().iter().map(column_key).collect();
         CacheKey::new(&(GAUSSIAN_BLOCK, self.frame_block(), columns))
     }
 
-    /// How a column is encoded.
+    /// Returns the encoding of one attribute.
     fn column(&self, column: Columns) -> Compression {
         match (self.compression, self.bounds.column(column)) {
             (Compression::Zstd(level), max_error) if max_error != 0.0 => Compression::Bounded { max_error, level },
@@ -81,8 +81,8 @@ impl Packing {
     }
 }
 
-/// Writes `source` to the container `path`, which appears complete or not at all. `advance` is told
-/// the number of Gaussian frames done.
+/// Writes `source` to the container `path`, which appears complete or not at all. `advance` is called with the number
+/// of Gaussian states encoded since the last call.
 pub fn write_container(
     source: &dyn FrameSource,
     path: &Path,
@@ -98,11 +98,11 @@ pub fn write_container(
     writer.finish()
 }
 
-/// Encodes some frame blocks of `source` and writes them to `to`, for [`join_container`]: a record of every tile, in
-/// order, which is empty if it is the tile of the block before.
+/// Encodes the frame blocks `blocks` of `source` and writes them to `to`, for [`join_container`]: one record per tile,
+/// in order. An empty record repeats the tile of the block before.
 ///
 /// # Errors
-/// Frames that cannot be read; a failed write.
+/// Fails if a frame cannot be read or written.
 pub fn spill_blocks(
     source: &dyn FrameSource,
     packing: Packing,
@@ -111,19 +111,19 @@ pub fn spill_blocks(
     advance: impl Fn(u64) + Sync,
 ) -> Result<()> {
     for block in blocks {
-        let lives = all_blocks(source, block == 0);
-        encode_frames(source, packing.frames(source, block), &lives, &packing, &advance, |_, _, tile| {
+        let presence = uniform_presence(source, block == 0);
+        encode_frames(source, packing.frames(source, block), &presence, &packing, &advance, |_, _, tile| {
             to.write_record(&tile.map_or(Vec::new(), EncodedTile::to_bytes))
         })?;
     }
     Ok(())
 }
 
-/// The container that [`write_container`] writes, of all frame blocks, encoded by [`spill_blocks`]. Memory: a tile, and
-/// what a container has.
+/// Writes the container that [`write_container`] would write from the frame blocks that [`spill_blocks`] encoded.
+/// `spills` must hold all frame blocks, in order. Memory: a tile, and the index of the container.
 ///
 /// # Errors
-/// What cannot be read back; a failed write.
+/// Fails if a spill cannot be read back or the container cannot be written.
 pub fn join_container(
     source: &dyn FrameSource,
     path: &Path,
@@ -142,7 +142,7 @@ pub fn join_container(
                 for column in 0..Columns::all().iter().count() {
                     at = spill.read_record(at, &mut bytes)?;
                     let tile = if bytes.is_empty() { None } else { Some(EncodedTile::from_bytes(&bytes)?) };
-                    writer.put(gaussian_block as u32, column as u32, tile.as_ref())?;
+                    writer.write_tile(gaussian_block as u32, column as u32, tile.as_ref())?;
                 }
             }
         }
@@ -150,7 +150,8 @@ pub fn join_container(
     writer.finish()
 }
 
-/// A container that grows by one frame block at a time. Dropped unfinished, it leaves nothing.
+/// Writer of a container, one frame block at a time. If it is dropped before [`ContainerWriter::finish`], no file
+/// remains.
 pub struct ContainerWriter {
     writer: Writer,
     packing: Packing,
@@ -158,7 +159,7 @@ pub struct ContainerWriter {
 }
 
 impl ContainerWriter {
-    /// Starts the container `path` of `count` Gaussians in blocks of `frame_block` frames.
+    /// Creates the container `path` of `count` Gaussians in blocks of `frame_block` frames.
     pub fn create(
         path: &Path,
         count: usize,
@@ -183,7 +184,7 @@ impl ContainerWriter {
         Ok(ContainerWriter { writer: Writer::create(path, layout)?, packing, frame_blocks: 0 })
     }
 
-    /// Starts that of `source`.
+    /// Creates the container of `source`.
     fn from_source(
         source: &dyn FrameSource,
         path: &Path,
@@ -194,8 +195,8 @@ impl ContainerWriter {
         ContainerWriter::create(path, info.count, info.sh_degree, packing.frame_block(), packing, attributes)
     }
 
-    /// Adds the next frame block: `frames` of `source`, as many as a block has; fewer end the sequence.
-    /// Columns that do not vary must hold what they held in the blocks before.
+    /// Adds the next frame block: `frames` of `source`, as many as a block has; a block with fewer frames ends the
+    /// sequence. Attributes that do not vary must have the same values as in the blocks before.
     pub fn append(
         &mut self,
         source: &dyn FrameSource,
@@ -206,15 +207,15 @@ impl ContainerWriter {
         self.add(source, 0, frames, advance)
     }
 
-    /// Begins the next frame block, to which [`ContainerWriter::add`] adds all Gaussians, part by part.
+    /// Begins the next frame block, to which [`ContainerWriter::add`] adds all Gaussians in several parts.
     pub fn begin(&mut self, times: &[f64]) -> Result<()> {
         self.writer.append_times(times)?;
         self.frame_blocks += 1;
         Ok(())
     }
 
-    /// Adds to the frame block the Gaussians of `source` at its `frames`: they are those of the container from number
-    /// `first` on, a multiple of [`GAUSSIAN_BLOCK`].
+    /// Adds Gaussians to the frame block: those of `source` at its `frames`, which are Gaussians `first` and following
+    /// of the container. `first` is a multiple of [`GAUSSIAN_BLOCK`].
     pub fn add(
         &mut self,
         source: &dyn FrameSource,
@@ -223,28 +224,36 @@ impl ContainerWriter {
         advance: impl Fn(u64) + Sync,
     ) -> Result<()> {
         let (first, packing) = ((first / GAUSSIAN_BLOCK) as u32, self.packing);
-        let lives = all_blocks(source, self.frame_blocks == 1);
-        encode_frames(source, frames, &lives, &packing, advance, |gaussian_block, column, tile| {
-            self.put(first + gaussian_block, column, tile)
+        let presence = uniform_presence(source, self.frame_blocks == 1);
+        encode_frames(source, frames, &presence, &packing, advance, |gaussian_block, column, tile| {
+            self.write_tile(first + gaussian_block, column, tile)
         })
     }
 
-    /// [`ContainerWriter::append`] of `frames` of `source` at `times`, where `lives` says of every block of Gaussians
-    /// whether it changes: what does not is read and encoded once for all frames, or not at all.
+    /// Adds a frame block, `frames` of `source` at `times`, like [`ContainerWriter::append`]. `presence` says for every
+    /// block of Gaussians whether it changes. A block that does not change is read and encoded once for all frames, or
+    /// not at all.
     pub fn append_lives(
         &mut self,
         source: &dyn FrameSource,
         frames: Range<usize>,
         times: &[f64],
-        lives: &[BlockPresence],
+        presence: &[BlockPresence],
     ) -> Result<()> {
         self.begin(times)?;
         let packing = self.packing;
-        encode_frames(source, frames, lives, &packing, |_| (), |block, column, tile| self.put(block, column, tile))
+        encode_frames(
+            source,
+            frames,
+            presence,
+            &packing,
+            |_| (),
+            |block, column, tile| self.write_tile(block, column, tile),
+        )
     }
 
-    /// Adds a tile to the frame block; none: it is that of the block before.
-    fn put(&mut self, gaussian_block: u32, column: u32, tile: Option<&EncodedTile>) -> Result<()> {
+    /// Writes a tile of the frame block; `None` repeats the tile of the block before.
+    fn write_tile(&mut self, gaussian_block: u32, column: u32, tile: Option<&EncodedTile>) -> Result<()> {
         let at = TileId { column, gaussian_block, frame_block: self.frame_blocks as u32 - 1 };
         match tile {
             Some(tile) => self.writer.write_tile(at, tile)?,
@@ -253,60 +262,60 @@ impl ContainerWriter {
         Ok(())
     }
 
-    /// Completes the container and gives it its name.
+    /// Completes the container, which then appears under its name.
     pub fn finish(self) -> Result<()> {
         self.writer.finish()?;
         Ok(())
     }
 }
 
-/// How a block of Gaussians goes through a block of frames.
+/// Change of a block of Gaussians within a block of frames.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum BlockPresence {
-    /// It changes in its columns that vary; others are those of the frame block before.
+    /// Varying attributes change; the others are those of the frame block before.
     Varying,
-    /// It changes in its columns that vary, and others are new.
+    /// Varying attributes change; the others are written anew.
     New,
-    /// It is as in the first of the frames.
+    /// Every frame is equal to the first one.
     Still,
-    /// It is as in the frame block before, where it was still.
+    /// Every frame is equal to the frame block before, in which every frame was equal.
     Repeating,
 }
 
-/// Every block of Gaussians of `source`, in the first block of frames or a later one.
-fn all_blocks(source: &dyn FrameSource, is_first: bool) -> Vec<BlockPresence> {
-    // A column that never varies is encoded for the first block alone.
-    let lives = if is_first { BlockPresence::New } else { BlockPresence::Varying };
-    vec![lives; source.info().count.div_ceil(GAUSSIAN_BLOCK)]
+/// Returns the change of every block of Gaussians of `source`, in the first block of frames or a later one.
+fn uniform_presence(source: &dyn FrameSource, is_first: bool) -> Vec<BlockPresence> {
+    // An attribute that never varies is encoded for the first block only.
+    let presence = if is_first { BlockPresence::New } else { BlockPresence::Varying };
+    vec![presence; source.info().count.div_ceil(GAUSSIAN_BLOCK)]
 }
 
-/// The Gaussians of a block, of `count`.
+/// Returns the Gaussians of block `block`, of `count` Gaussians.
 pub fn of_block(count: usize, block: usize) -> Range<usize> {
     let start = block * GAUSSIAN_BLOCK;
     start..count.min(start + GAUSSIAN_BLOCK)
 }
 
-/// Encodes `source` at the `frames` of a block, of which `lives` says how each block of Gaussians goes through it, and hands
-/// every tile to `each` in the order of the container, with its block of Gaussians and its column; none: it is that of the
-/// block before.
+/// Encodes `source` at the `frames` of a block; `presence` gives the change of each block of Gaussians. Passes every
+/// tile to `each` in the order of the container, with its block of Gaussians and its column; `None` stands for the tile
+/// of the block before.
 fn encode_frames(
     source: &dyn FrameSource,
     frames: Range<usize>,
-    lives: &[BlockPresence],
+    presence: &[BlockPresence],
     packing: &Packing,
     advance: impl Fn(u64) + Sync,
     mut each: impl FnMut(u32, u32, Option<&EncodedTile>) -> Result<()>,
 ) -> Result<()> {
     let info = source.info();
     let blocks: Vec<u32> = (0..info.count.div_ceil(GAUSSIAN_BLOCK) as u32).collect();
-    // One batch of blocks at a time bounds the tiles that wait for the writer.
+    // Processing one batch of blocks at a time bounds the number of tiles that wait for the writer.
     for batch in blocks.chunks(2 * rayon::current_num_threads()) {
         let tiles: Vec<Vec<Option<EncodedTile>>> = batch
             .par_iter()
             .map(|&block| {
                 let gaussians = of_block(info.count, block as usize);
                 let count = gaussians.len();
-                let (columns, frames) = match lives[block as usize] {
+                let (columns, frames) = match presence[block as usize] {
                     BlockPresence::New => (Columns::all(), frames.clone()),
                     BlockPresence::Varying => (info.varying, frames.clone()),
                     BlockPresence::Still => (Columns::all(), frames.start..frames.start + 1),
@@ -326,10 +335,11 @@ fn encode_frames(
     Ok(())
 }
 
-/// Bytes that every column takes of some `blocks` of Gaussians of `source` over `frames`, those of a block.
+/// Returns the bytes of every column for the blocks `blocks` of Gaussians of `source` over `frames`, the frames of one
+/// frame block.
 ///
 /// # Errors
-/// Frames that cannot be read.
+/// Fails if a frame cannot be read.
 pub fn column_bytes(
     source: &dyn FrameSource,
     blocks: &[usize],
@@ -337,15 +347,17 @@ pub fn column_bytes(
     packing: &Packing,
 ) -> Result<Vec<usize>> {
     let count = source.info().count;
-    let encode = |&block: &usize| encode_block(source, of_block(count, block), frames.clone(), Columns::all(), packing);
+    let encode_tiles =
+        |&block: &usize| encode_block(source, of_block(count, block), frames.clone(), Columns::all(), packing);
     let mut bytes = vec![0; Columns::all().iter().count()];
-    for tiles in blocks.par_iter().map(encode).collect::<Result<Vec<_>>>()? {
+    for tiles in blocks.par_iter().map(encode_tiles).collect::<Result<Vec<_>>>()? {
         bytes.iter_mut().zip(tiles).for_each(|(bytes, tile)| *bytes += tile.map_or(0, |tile| tile.to_bytes().len()));
     }
     Ok(bytes)
 }
 
-/// The tiles of one block of Gaussians over `frames`, one entry per column; none for those not in `columns`.
+/// Encodes the tiles of one block of Gaussians over `frames`: one entry per column, `None` for columns not in
+/// `columns`.
 fn encode_block(
     source: &dyn FrameSource,
     gaussians: Range<usize>,
@@ -362,7 +374,7 @@ fn encode_block(
     let mut state = Gaussians::zeros(len, info.sh_degree);
     let mut values: Vec<Vec<f32>> = Columns::all().iter().map(|_| Vec::new()).collect();
     for frame in frames.clone() {
-        // A column that never varies is one frame for all; the container stores it once.
+        // An attribute that never varies is encoded from one frame; the container stores it once.
         let want = if frame == frames.start { columns } else { info.varying };
         reader.read(frame, want, &mut state)?;
         for (values, column) in
@@ -371,7 +383,7 @@ fn encode_block(
             values.extend_from_slice(state.column(column).planes());
         }
     }
-    let encode = |(values, column): (&Vec<f32>, Columns)| {
+    let encode_column = |(values, column): (&Vec<f32>, Columns)| {
         if !columns.contains(column) {
             return Ok(None);
         }
@@ -379,5 +391,5 @@ fn encode_block(
         let stored = if info.varying.contains(column) { frames.len() } else { 1 };
         Ok(Some(encode_tile(values, stored as u32, width, len as u32, packing.column(column))?))
     };
-    values.iter().zip(Columns::all().iter()).map(encode).collect()
+    values.iter().zip(Columns::all().iter()).map(encode_column).collect()
 }

@@ -1,7 +1,7 @@
-//! Any sequence as a `.splatv`: curves fitted to what every Gaussian does.
+//! Writes any sequence as a `.splatv` file: cubic curves fitted to the trajectory of every Gaussian.
 //!
-//! Players run through [0, 1]: times beyond are scaled to it. Harmonics above degree 0 have no place in the format.
-//! Memory: all curves.
+//! Players cover times in [0, 1], so other times are scaled to that range. The format has no SH coefficients above
+//! degree 0. Memory: all curves.
 
 use std::path::Path;
 
@@ -15,32 +15,32 @@ use crate::passes::{gather_all, tracks};
 use crate::progress::Events;
 use crate::source::FrameSource;
 
-/// Writes all frames of `source`; says how close that is.
+/// Writes all frames of `source` and returns a message about the accuracy.
 ///
 /// # Errors
-/// Frames that cannot be read; a failed write.
+/// Fails if a frame cannot be read or the file cannot be written.
 pub fn write_curves(source: &dyn FrameSource, path: &Path, events: &Events) -> Result<String> {
     let info = source.info();
     let progress = events.task("emit", "states", (info.count * info.times.len()) as u64);
-    let times = within_one(&info.times);
+    let times = scale_to_unit(&info.times);
     let tolerance = Tolerance::default();
     let found = tracks(source, &times, &progress, |track| {
         let mut misfit = Misfit::default();
         (curved(track, &tolerance, &mut misfit), misfit)
     })?;
     let misfit = found.iter().map(|(_, misfit)| *misfit).fold(Misfit::default(), Misfit::and);
-    let rows: Vec<SplatvGaussian> = found.iter().flat_map(|(curves, _)| curves).map(row).collect();
+    let rows: Vec<SplatvGaussian> = found.iter().flat_map(|(curves, _)| curves).map(splatv_gaussian).collect();
     let first = gather_all(source, 0, Columns::POSITION)?;
     let mut accuracy = Accuracy::new(&first.position);
-    let of_rows = found.iter().enumerate().flat_map(|(id, (curves, _))| curves.iter().map(move |_| id));
-    of_rows.zip(&rows).for_each(|(id, row)| measure(row, id, &mut accuracy));
+    let row_ids = found.iter().enumerate().flat_map(|(id, (curves, _))| curves.iter().map(move |_| id));
+    row_ids.zip(&rows).for_each(|(id, row)| measure(row, id, &mut accuracy));
     accuracy.check("a .splatv")?;
     let rows: Vec<_> = rows.iter().map(words).collect();
     write(path, rows.len(), rows.iter().copied(), &seen_whole(&first.position))?;
-    let bands = if info.sh_degree > 0 { ", in colours that do not change with direction" } else { "" };
+    let sh_loss = if info.sh_degree > 0 { ", in colors that do not change with direction" } else { "" };
     Ok(format!(
-        "{} Gaussians became {} curves{bands}: positions are {:.3} of a Gaussian's middle size off on average, {:.3} at most, \
-         opacities {:.3} at most",
+        "{} Gaussians became {} curves{sh_loss}; error of positions, as a fraction of the Gaussian's middle scale: {:.3} \
+         rms, {:.3} at most; error of opacities: {:.3} at most",
         info.count,
         rows.len(),
         misfit.rms(),
@@ -49,8 +49,8 @@ pub fn write_curves(source: &dyn FrameSource, path: &Path, events: &Events) -> R
     ))
 }
 
-/// `times`, from 0 to 1 if any of them is not in between.
-fn within_one(times: &[f64]) -> Vec<f64> {
+/// Returns `times`, scaled to 0 to 1 if one of them is outside that range.
+fn scale_to_unit(times: &[f64]) -> Vec<f64> {
     match (times.first(), times.last()) {
         (Some(&first), Some(&last)) if first < 0.0 || last > 1.0 => {
             let span = if last > first { last - first } else { 1.0 };
@@ -60,7 +60,7 @@ fn within_one(times: &[f64]) -> Vec<f64> {
     }
 }
 
-fn row(curve: &CubicTrack) -> SplatvGaussian {
+fn splatv_gaussian(curve: &CubicTrack) -> SplatvGaussian {
     let narrow = |value: f64| value as f32;
     let [place, motion @ ..] = curve.position;
     SplatvGaussian {
@@ -72,7 +72,7 @@ fn row(curve: &CubicTrack) -> SplatvGaussian {
         rgb: std::array::from_fn(|c| color(curve.sh[c])),
         opacity: curve.opacity,
         center: narrow(curve.center),
-        // A half has no infinity that players know.
+        // Players do not support infinity in half precision.
         width: narrow(curve.width.min(f64::from(half::f16::MAX.to_f32()))),
     }
 }
@@ -85,27 +85,27 @@ mod tests {
     use crate::model::opacity;
 
     #[test]
-    fn times_beyond_one_are_scaled_and_others_stay() {
-        assert_eq!(within_one(&[0.25, 1.0]), [0.25, 1.0]);
-        assert_eq!(within_one(&[-1.0, 0.0, 3.0]), [0.0, 0.25, 1.0]);
-        assert_eq!(within_one(&[7.0]), [0.0]);
+    fn only_times_outside_0_to_1_are_scaled() {
+        assert_eq!(scale_to_unit(&[0.25, 1.0]), [0.25, 1.0]);
+        assert_eq!(scale_to_unit(&[-1.0, 0.0, 3.0]), [0.0, 0.25, 1.0]);
+        assert_eq!(scale_to_unit(&[7.0]), [0.0]);
     }
 
     #[test]
-    fn a_player_finds_every_gaussian_of_every_frame_about_where_it_is() {
+    fn the_viewer_formulas_reproduce_every_gaussian() {
         let scene = Scene::new(300, 30);
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("scene.splatv");
-        let said = write_curves(&scene, &path, &Events::IGNORED).unwrap();
-        assert!(said.starts_with("300 Gaussians became"), "{said}");
+        let message = write_curves(&scene, &path, &Events::IGNORED).unwrap();
+        assert!(message.starts_with("300 Gaussians became"), "{message}");
         let file = Splatv::open(&path).unwrap();
         let rows: Vec<SplatvGaussian> = (0..file.count()).map(|k| SplatvGaussian::of_words(&file.words(k))).collect();
-        let (mut apart, mut depth) = (0.0, 0.0);
+        let (mut missing, mut too_faint) = (0.0, 0.0);
         let mut seen = 0;
         for frame in 0..30 {
             let time = scene.info().times[frame];
             let state = gather_all(&scene, frame, Columns::all()).unwrap();
-            // What the viewer draws, by its own formulas.
+            // States that the viewer draws, by its own formulas.
             let shown: Vec<([f64; 3], f64)> = rows
                 .iter()
                 .map(|row| {
@@ -125,19 +125,24 @@ mod tests {
                 let at = state.position.row::<3>(id).map(f64::from);
                 let size = f64::from(state.log_scale.row::<3>(id).iter().copied().fold(f32::MIN, f32::max)).exp();
                 let distance = |place: [f64; 3]| (0..3).map(|c| (place[c] - at[c]).powi(2)).sum::<f64>().sqrt() / size;
-                let here: Vec<f64> = shown
+                let nearby: Vec<f64> = shown
                     .iter()
                     .filter(|(place, _)| distance(*place) < 0.5)
                     .map(|(_, alpha)| (1.0 - alpha).ln())
                     .collect();
                 seen += 1;
-                apart += f64::from(here.is_empty());
-                // Others may lie there too, so that only too little can be told.
-                depth += f64::from(1.0 - here.iter().sum::<f64>().exp() < visible - 0.1);
+                missing += f64::from(nearby.is_empty());
+                // Other Gaussians may lie there too, so only a missing contribution can be detected.
+                too_faint += f64::from(1.0 - nearby.iter().sum::<f64>().exp() < visible - 0.1);
             }
         }
         let seen = f64::from(seen);
-        assert!(seen > 3000.0 && apart / seen < 0.01 && depth / seen < 0.05, "{} {} of {seen}", apart, depth);
+        assert!(
+            seen > 3000.0 && missing / seen < 0.01 && too_faint / seen < 0.05,
+            "{} {} of {seen}",
+            missing,
+            too_faint
+        );
         let again = folder.path().join("again.splatv");
         write_curves(&scene, &again, &Events::IGNORED).unwrap();
         assert_eq!(std::fs::read(&path).unwrap(), std::fs::read(&again).unwrap());

@@ -1,6 +1,6 @@
-//! Moving pictures as files: an animated PNG or GIF, or what `ffmpeg` makes of the frames.
+//! Films: an animated PNG or GIF, or a video that `ffmpeg` encodes.
 //!
-//! In: images, one after the other, all of one size. Out: a file. Memory: one frame; the encoder's own is its business.
+//! Input: images of one size, one after the other. Output: a file. Memory: one frame, beside the memory of the encoder.
 
 use std::env;
 use std::fs::File;
@@ -10,28 +10,29 @@ use std::process::{Child, ChildStdin, Command, Stdio};
 use std::thread::JoinHandle;
 
 use crate::error::{Error, Result, ShowPath};
-use crate::files::image::write::{of_png, rgb};
+use crate::files::image::write::{png_error_to_io, rgb};
 use crate::render::Image;
 
-/// Program that encodes what this one does not.
+/// Program that encodes the video formats.
 const ENCODER: &str = "ffmpeg";
-/// How well colors of a GIF are chosen: 1 is best, 30 fastest; 10 is what its author took.
+/// Speed of the color selection of a GIF: 1 gives the best colors, 30 is fastest; 10 is the compromise that the library
+/// recommends.
 const GIF_SPEED: i32 = 10;
-/// Bytes kept of what the encoder says.
-const SAID: u64 = 1 << 16;
+/// Maximum number of bytes kept of the encoder's messages.
+const MAX_MESSAGE_BYTES: u64 = 1 << 16;
 
-/// How a film is stored.
+/// File format of a film.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum FilmFormat {
     /// Animated PNG: every bit of every frame.
     Apng,
-    /// Animated GIF: 256 colors a frame, delays of whole hundredths of a second.
+    /// Animated GIF: 256 colors per frame, delays in whole hundredths of a second.
     Gif,
-    /// Encoded by the program at this path.
+    /// Video encoded by the program at this path.
     Encoded(PathBuf, Codec),
 }
 
-/// What the encoder makes.
+/// Video codec and container format.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Codec {
     /// H.264 in MP4.
@@ -41,10 +42,10 @@ pub enum Codec {
 }
 
 impl FilmFormat {
-    /// The format that a file's name asks for.
+    /// Returns the format for the file name `path`.
     ///
     /// # Errors
-    /// A name that asks for none; one that asks for an encoder that is not there.
+    /// Fails if the name has none of the known endings, or if it needs an encoder that is not installed.
     pub fn from_path(path: &Path) -> Result<FilmFormat> {
         let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
         let codec = match extension.as_str() {
@@ -64,17 +65,17 @@ impl FilmFormat {
         let found = env::split_paths(&folders).map(|folder| folder.join(&name)).find(|file| file.is_file());
         found.map(|program| FilmFormat::Encoded(program, codec)).ok_or_else(|| {
             Error::usage(format!(
-                "{}: {ENCODER}, which makes .{extension}, is in no folder of PATH\n  install it (Debian: apt-get install \
-                 {ENCODER}), or give a name that ends in .png (every bit, large) or .gif (256 colours a frame)",
+                "{}: {ENCODER}, which makes .{extension}, is in no folder of PATH\n  install it (Debian: apt-get \
+                 install {ENCODER}), or give a name that ends in .png (every bit, large) or .gif (256 colors a frame)",
                 path.shown()
             ))
         })
     }
 }
 
-/// A film that is being written.
+/// Writer of a film.
 pub struct FilmOutput {
-    /// As the user named it.
+    /// Path for messages, as the user named it.
     shown: PathBuf,
     size: (u32, u32),
     fps: u32,
@@ -90,10 +91,11 @@ enum FilmWriter {
 }
 
 impl FilmOutput {
-    /// Begins a film of `frames` frames of `size` (width, height), `fps` a second, in the file `path`; errors name `shown`.
+    /// Creates a film of `frames` frames of `size` (width, height) pixels, `fps` per second, in the file `path`. Errors
+    /// name the path `shown`.
     ///
     /// # Errors
-    /// A size that the format does not have; the system refuses; an encoder that cannot be run.
+    /// Fails if the format cannot have that size, if the file cannot be created, or if the encoder cannot be run.
     pub fn create(
         (path, shown): (&Path, &Path),
         format: &FilmFormat,
@@ -112,14 +114,14 @@ impl FilmOutput {
                     encoder.set_animated(frames, 0)?;
                     encoder.set_frame_delay(1, fps.try_into().unwrap_or(u16::MAX))
                 };
-                begin().map_err(|error| failed(of_png(error)))?;
-                FilmWriter::Apng(Box::new(encoder.write_header().map_err(|error| failed(of_png(error)))?))
+                begin().map_err(|error| failed(png_error_to_io(error)))?;
+                FilmWriter::Apng(Box::new(encoder.write_header().map_err(|error| failed(png_error_to_io(error)))?))
             }
             FilmFormat::Gif => {
                 let [width, height] = gif_size(size).map_err(failed)?;
                 let mut encoder =
-                    gif::Encoder::new(file()?, width, height, &[]).map_err(|error| failed(of_gif(error)))?;
-                encoder.set_repeat(gif::Repeat::Infinite).map_err(|error| failed(of_gif(error)))?;
+                    gif::Encoder::new(file()?, width, height, &[]).map_err(|error| failed(gif_error_to_io(error)))?;
+                encoder.set_repeat(gif::Repeat::Infinite).map_err(|error| failed(gif_error_to_io(error)))?;
                 FilmWriter::Gif(Box::new(encoder))
             }
             FilmFormat::Encoded(program, codec) => {
@@ -132,14 +134,15 @@ impl FilmOutput {
     /// Adds a frame.
     ///
     /// # Errors
-    /// A frame of another size; the system refuses; an encoder that gave up, with what it said.
+    /// Fails if the frame has another size or cannot be written, or if the encoder ended early; the message contains
+    /// the encoder's output.
     pub fn add(&mut self, image: &Image) -> Result<()> {
         let added = if (image.width, image.height) == self.size {
             self.write(image)
         } else {
             let (width, height) = self.size;
             Err(io::Error::other(format!(
-                "frames of {width}x{height} pixels, then one of {}x{}",
+                "expected frames of {width}x{height} pixels, found one of {}x{}",
                 image.width, image.height
             )))
         };
@@ -151,31 +154,33 @@ impl FilmOutput {
     fn write(&mut self, image: &Image) -> io::Result<()> {
         let bytes = rgb(image);
         match &mut self.writer {
-            FilmWriter::Apng(writer) => writer.write_image_data(&bytes).map_err(of_png),
+            FilmWriter::Apng(writer) => writer.write_image_data(&bytes).map_err(png_error_to_io),
             FilmWriter::Gif(encoder) => {
                 let [width, height] = gif_size(self.size)?;
                 let mut frame = gif::Frame::from_rgb_speed(width, height, &bytes, GIF_SPEED);
-                // Of the whole film as long as it should be, to half a hundredth of a second.
-                let until = |frame: u32| (2 * 100 * u64::from(frame) + u64::from(self.fps)) / (2 * u64::from(self.fps));
-                frame.delay = (until(self.added + 1) - until(self.added)) as u16;
-                encoder.write_frame(&frame).map_err(of_gif)
+                // Rounded so that the time up to each frame is correct to half a hundredth of a second.
+                let hundredths_until =
+                    |frame: u32| (2 * 100 * u64::from(frame) + u64::from(self.fps)) / (2 * u64::from(self.fps));
+                frame.delay = (hundredths_until(self.added + 1) - hundredths_until(self.added)) as u16;
+                encoder.write_frame(&frame).map_err(gif_error_to_io)
             }
             FilmWriter::Encoder(encoder) => encoder.write(&bytes),
         }
     }
 
-    /// Ends the film.
+    /// Completes the film.
     ///
     /// # Errors
-    /// Fewer frames than were promised; the system refuses; an encoder that failed, with what it said.
+    /// Fails if fewer frames were added than announced, if the file cannot be written, or if the encoder failed; the
+    /// message contains the encoder's output.
     pub fn finish(self) -> Result<()> {
         if self.added != self.frames {
-            let few = io::Error::other(format!("{} frames of {}", self.added, self.frames));
-            return Err(Error::io("write", &self.shown)(few));
+            let missing = io::Error::other(format!("expected {} frames, found {}", self.frames, self.added));
+            return Err(Error::io("write", &self.shown)(missing));
         }
         let finished = match self.writer {
-            FilmWriter::Apng(writer) => writer.finish().map_err(of_png),
-            FilmWriter::Gif(encoder) => encoder.into_inner().map_err(of_gif).and_then(|mut file| file.flush()),
+            FilmWriter::Apng(writer) => writer.finish().map_err(png_error_to_io),
+            FilmWriter::Gif(encoder) => encoder.into_inner().map_err(gif_error_to_io).and_then(|mut file| file.flush()),
             FilmWriter::Encoder(encoder) => encoder.finish(),
         };
         finished.map_err(Error::io("write", &self.shown))
@@ -189,20 +194,20 @@ fn gif_size((width, height): (u32, u32)) -> io::Result<[u16; 2]> {
     }
 }
 
-fn of_gif(error: gif::EncodingError) -> io::Error {
+fn gif_error_to_io(error: gif::EncodingError) -> io::Error {
     match error {
         gif::EncodingError::Io(error) => error,
         other => io::Error::other(other),
     }
 }
 
-/// The encoder at work.
+/// A running encoder process.
 struct FrameEncoder {
     child: Child,
-    /// None: there is nothing more to come.
+    /// Standard input of the encoder; `None` after it was closed.
     to: Option<ChildStdin>,
-    /// Gathers what it says.
-    said: Option<JoinHandle<String>>,
+    /// Thread that collects the encoder's messages.
+    messages: Option<JoinHandle<String>>,
 }
 
 impl FrameEncoder {
@@ -216,7 +221,7 @@ impl FrameEncoder {
         let mut command = Command::new(program);
         command.args(["-hide_banner", "-loglevel", "error", "-nostdin", "-y", "-f", "rawvideo", "-pix_fmt", "rgb24"]);
         command.args(["-s", &format!("{width}x{height}"), "-r", &fps.to_string(), "-i", "pipe:0", "-an"]);
-        // Players want colors at half the resolution, and for that even sizes.
+        // Players need color at half the resolution, which requires even sizes.
         command.args(["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p"]);
         command.args(match codec {
             Codec::Mp4 => &["-c:v", "libx264", "-crf", "18", "-movflags", "+faststart", "-f", "mp4"][..],
@@ -227,22 +232,22 @@ impl FrameEncoder {
             .spawn()
             .map_err(|error| io::Error::new(error.kind(), format!("cannot run {}: {error}", program.shown())))?;
         let to = child.stdin.take();
-        let said = child.stderr.take().map(|mut from| {
+        let messages = child.stderr.take().map(|mut from| {
             std::thread::spawn(move || {
-                let mut said = Vec::new();
-                let _ = from.by_ref().take(SAID).read_to_end(&mut said);
-                // Whoever cannot say more would wait for ever.
+                let mut messages = Vec::new();
+                let _ = from.by_ref().take(MAX_MESSAGE_BYTES).read_to_end(&mut messages);
+                // Reads on, because an encoder whose output nobody reads would block.
                 let _ = io::copy(&mut from, &mut io::sink());
-                String::from_utf8_lossy(&said).into_owned()
+                String::from_utf8_lossy(&messages).into_owned()
             })
         });
-        Ok(FrameEncoder { child, to, said })
+        Ok(FrameEncoder { child, to, messages })
     }
 
     fn write(&mut self, bytes: &[u8]) -> io::Result<()> {
         let Some(to) = &mut self.to else { return Err(io::Error::other(format!("{ENCODER} has ended"))) };
         match to.write_all(bytes) {
-            // It has ended; how, and what it said, says more.
+            // The encoder has ended; its exit status and messages describe the cause.
             Err(_) => Err(self.end().err().unwrap_or_else(|| io::Error::other(format!("{ENCODER} ended too early")))),
             Ok(()) => Ok(()),
         }
@@ -255,17 +260,17 @@ impl FrameEncoder {
     fn end(&mut self) -> io::Result<()> {
         self.to = None;
         let status = self.child.wait()?;
-        let said = self.said.take().and_then(|said| said.join().ok()).unwrap_or_default();
+        let messages = self.messages.take().and_then(|messages| messages.join().ok()).unwrap_or_default();
         match status.success() {
             true => Ok(()),
-            false => Err(io::Error::other(format!("{ENCODER} ended with {status}: {}", said.trim()))),
+            false => Err(io::Error::other(format!("{ENCODER} ended with {status}: {}", messages.trim()))),
         }
     }
 }
 
 impl Drop for FrameEncoder {
     fn drop(&mut self) {
-        // After `end` there is nobody to be stopped.
+        // After `end` the process has already exited.
         let _ = self.child.kill();
         let _ = self.child.wait();
     }
@@ -276,7 +281,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_gif_lasts_as_long_as_its_frames_a_second_say() {
+    fn gif_delays_add_up_to_the_frame_rate() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("x.gif");
         let mut film = FilmOutput::create((&path, &path), &FilmFormat::Gif, (4, 3), 60, 24).unwrap();
@@ -294,7 +299,7 @@ mod tests {
     }
 
     #[test]
-    fn names_that_ask_for_no_film_and_frames_of_another_size_are_refused() {
+    fn unknown_names_and_wrong_frame_sizes_are_refused() {
         for name in ["x", "x.npy", "film.avi"] {
             let message = FilmFormat::from_path(Path::new(name)).unwrap_err().to_string();
             assert!(message.contains(name) && message.contains(".gif, .mp4"), "{message}");

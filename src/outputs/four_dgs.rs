@@ -1,8 +1,9 @@
-//! A sequence as a `.4dgs`: pieces of straight motion in windows of time, written and checked by the crate `fourdgs`.
+//! Writes a sequence as a `.4dgs` file: pieces of straight motion in windows of time, encoded and checked by the crate
+//! `fourdgs`.
 //!
-//! Frames follow one another at 30 a second, whatever the source's clock; a piece lasts until the frame after its last one.
-//! Base colors are cut to [0, 1], harmonics above degree 0 become bytes over [−4, 4], as the format has them. Memory: all pieces, about 600 bytes each
-//! while they are encoded.
+//! Frames are 1/30 s apart, whatever the source's times; a piece lasts until the frame after its last one. As the
+//! format requires, base colors are clamped to [0, 1] and SH coefficients above degree 0 are stored as bytes over [−4,
+//! 4]. Memory: all pieces, about 600 bytes each while they are encoded.
 
 use std::path::Path;
 
@@ -18,13 +19,13 @@ use crate::passes::tracks;
 use crate::progress::Events;
 use crate::source::FrameSource;
 
-/// Frames a second of a sequence that says nothing of it.
+/// Frame rate in the file, in frames per second, because sequences state none.
 const FRAME_RATE: f64 = 30.0;
 
-/// Writes all frames of `source`; says how close that is.
+/// Writes all frames of `source` and returns a message about the accuracy.
 ///
 /// # Errors
-/// Frames that cannot be read; values that the format cannot hold; a failed write.
+/// Fails if a frame cannot be read, if the format cannot hold a value, or if the file cannot be written.
 pub fn write_four_dgs(source: &dyn FrameSource, path: &Path, events: &Events) -> Result<String> {
     let info = source.info();
     let progress = events.task("emit", "states", (info.count * info.times.len()) as u64);
@@ -42,20 +43,21 @@ pub fn write_four_dgs(source: &dyn FrameSource, path: &Path, events: &Events) ->
         ..GaussianSet::default()
     };
     for piece in found.iter().flat_map(|(pieces, _)| pieces) {
-        add(&mut set, piece, &starts);
+        add_piece(&mut set, piece, &starts);
     }
     let pieces = set.count();
     let options = WriteOptions { library: TOOL.to_owned(), ..WriteOptions::default() };
     let wanted = set.positions.clone();
-    on_grid(&mut set, &options);
+    snap_to_grid(&mut set, &options);
     let ids = found.iter().enumerate().flat_map(|(id, (pieces, _))| pieces.iter().map(move |_| id));
     check_positions(&set, &wanted, ids)?;
-    let refused = |error: fourdgs::Error| Error::usage(format!("{}: no .4dgs can hold this: {error}", path.shown()));
+    let refused =
+        |error: fourdgs::Error| Error::usage(format!("{}: a .4dgs file cannot hold this model: {error}", path.shown()));
     let bytes = write_to_vec(&set, starts[info.times.len()], &options, &SceneExtras::default()).map_err(refused)?;
     std::fs::write(path, bytes).map_err(Error::io("write", path))?;
     Ok(format!(
-        "{} Gaussians became {pieces} pieces of straight motion at {FRAME_RATE} frames a second: positions are {:.3} of a \
-         Gaussian's middle size off on average, {:.3} at most, opacities {:.3} at most",
+        "{} Gaussians became {pieces} pieces of straight motion at {FRAME_RATE} frames a second; error of positions, as \
+         a fraction of the Gaussian's middle scale: {:.3} rms, {:.3} at most; error of opacities: {:.3} at most",
         info.count,
         misfit.rms(),
         misfit.position,
@@ -63,9 +65,10 @@ pub fn write_four_dgs(source: &dyn FrameSource, path: &Path, events: &Events) ->
     ))
 }
 
-/// Moves positions and velocities to where the grid of the file has them. The encoder holds decoded values to its bounds
-/// without allowing for their rounding to f32, which in coordinates of some units takes what is half a step off beyond.
-fn on_grid(set: &mut GaussianSet, options: &WriteOptions) {
+/// Rounds positions and velocities to the grid of the file. The encoder checks decoded values against its bounds
+/// without allowing for their rounding to f32. For coordinates of a few units that rounding moves values that are half
+/// a step off beyond the bound.
+fn snap_to_grid(set: &mut GaussianSet, options: &WriteOptions) {
     let mut scales: Vec<f64> = set.scales.iter().map(|&scale| f64::from(scale)).collect();
     if scales.is_empty() {
         return;
@@ -77,8 +80,8 @@ fn on_grid(set: &mut GaussianSet, options: &WriteOptions) {
         *value = (origin + ((f64::from(*value) - origin) / step).round() * step) as f32;
     };
     for axis in 0..3 {
-        let of_axis = || set.positions.iter().skip(axis).step_by(3);
-        let origin = f64::from(of_axis().copied().fold(f32::INFINITY, f32::min));
+        let axis_values = || set.positions.iter().skip(axis).step_by(3);
+        let origin = f64::from(axis_values().copied().fold(f32::INFINITY, f32::min));
         set.positions.iter_mut().skip(axis).step_by(3).for_each(|value| snap(value, origin, steps.pos));
     }
     for (i, motion) in set.motions.as_chunks_mut::<3>().0.iter_mut().enumerate() {
@@ -88,36 +91,36 @@ fn on_grid(set: &mut GaussianSet, options: &WriteOptions) {
     }
 }
 
-/// Confirms that the grid leaves the Gaussians `ids`, piece by piece, about where they are `wanted`.
+/// Checks that the grid leaves the Gaussians `ids`, piece by piece, close to the positions `wanted`.
 fn check_positions(set: &GaussianSet, wanted: &[f32], ids: impl Iterator<Item = usize>) -> Result<()> {
     let planes = (0..3).flat_map(|axis| wanted.iter().skip(axis).step_by(3).copied()).collect();
     let mut accuracy = Accuracy::new(&Column::from_planes(3, planes));
     for (k, id) in ids.enumerate() {
-        let three = |of: &[f32]| [0, 1, 2].map(|axis| f64::from(of[3 * k + axis]));
+        let triple = |values: &[f32]| [0, 1, 2].map(|axis| f64::from(values[3 * k + axis]));
         let opacity = f64::from(set.colors[4 * k + 3]);
         let drawn =
-            |place: &[f32]| Drawn { position: three(place), scale: three(&set.scales), opacity, color: [0.0; 3] };
+            |place: &[f32]| Drawn { position: triple(place), scale: triple(&set.scales), opacity, color: [0.0; 3] };
         accuracy.add(id, &drawn(wanted), &drawn(&set.positions));
     }
     accuracy.check("a .4dgs")
 }
 
-/// Adds `piece`; `starts`: when each frame begins, and the last one ends.
-fn add(set: &mut GaussianSet, piece: &LinearPiece, starts: &[f64]) {
-    let narrow = |value: f64| value as f32;
-    set.positions.extend(piece.position.map(narrow));
-    set.motions.extend(piece.velocity.map(narrow));
-    set.scales.extend(piece.log_scale.map(|scale| narrow(scale.exp())));
-    let [w, x, y, z] = piece.rotation.map(narrow);
+/// Adds `piece`; `starts` holds the start time of each frame and the end of the last one, in seconds.
+fn add_piece(set: &mut GaussianSet, piece: &LinearPiece, starts: &[f64]) {
+    let to_f32 = |value: f64| value as f32;
+    set.positions.extend(piece.position.map(to_f32));
+    set.motions.extend(piece.velocity.map(to_f32));
+    set.scales.extend(piece.log_scale.map(|scale| to_f32(scale.exp())));
+    let [w, x, y, z] = piece.rotation.map(to_f32);
     set.rotations.extend([x, y, z, w]);
-    set.colors.extend((0..3).map(|c| narrow(color(piece.sh[c]).clamp(0.0, 1.0))));
-    set.colors.push(narrow(piece.opacity));
-    set.mu_t.push(narrow(piece.at));
+    set.colors.extend((0..3).map(|c| to_f32(color(piece.sh[c]).clamp(0.0, 1.0))));
+    set.colors.push(to_f32(piece.opacity));
+    set.mu_t.push(to_f32(piece.at));
     set.sigma_t.push(f32::INFINITY);
-    set.win_lo.push(narrow(starts[piece.frames.start]));
-    set.win_hi.push(narrow(starts[piece.frames.end]));
+    set.win_lo.push(to_f32(starts[piece.frames.start]));
+    set.win_hi.push(to_f32(starts[piece.frames.end]));
     if let Some(sh) = &mut set.sh {
-        // All coefficients of red, then of green, then of blue.
+        // Order: all coefficients of red, then of green, then of blue.
         let byte = |value: f32| {
             let place = (f64::from(value) - SH_QUANT_LO) / (SH_QUANT_HI - SH_QUANT_LO) * 255.0;
             place.round().clamp(0.0, 255.0) as u8
@@ -134,12 +137,12 @@ mod tests {
     use crate::passes::gather_all;
 
     #[test]
-    fn a_reader_of_the_format_finds_every_visible_gaussian_of_every_frame_where_it_is() {
+    fn a_reader_of_the_format_finds_every_visible_gaussian() {
         let scene = Scene::new(400, 24);
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("scene.4dgs");
-        let said = write_four_dgs(&scene, &path, &Events::IGNORED).unwrap();
-        assert!(said.contains("400 Gaussians became"), "{said}");
+        let message = write_four_dgs(&scene, &path, &Events::IGNORED).unwrap();
+        assert!(message.contains("400 Gaussians became"), "{message}");
         let read = fourdgs::read_path(&path).unwrap();
         let mut scales: Vec<f64> = read.gaussians.scales.iter().map(|&scale| f64::from(scale)).collect();
         scales.sort_by(f64::total_cmp);
@@ -147,7 +150,8 @@ mod tests {
         let (mut missing, mut apart, mut seen) = (0, 0.0f64, 0);
         for frame in 0..24 {
             let expected = gather_all(&scene, frame, Columns::all()).unwrap();
-            // In the middle of what a frame shows; pieces are straight, so that it lies half a step on.
+            // Evaluates just after the start of the frame; pieces are straight, so positions are off by a fraction of a
+            // step.
             let state = read.gaussians.state_at(frame as f64 / FRAME_RATE + 1e-4, read.header.cutoff);
             let seen_now = (0..400).filter(|&id| opacity(expected.opacity_logit.row::<1>(id)[0]) >= crate::fit::SEEN);
             assert_eq!(state.indices.len(), seen_now.count(), "one piece of each at a time");
@@ -157,17 +161,19 @@ mod tests {
                     continue;
                 }
                 let at = expected.position.row::<3>(id);
-                // The file has no order: the nearest one that is as opaque.
+                // The file has no order, so look for the nearest Gaussian with the same opacity.
                 let distance =
                     |k: usize| (0..3).map(|c| f64::from(state.centers[3 * k + c] - at[c]).powi(2)).sum::<f64>();
-                let alike = (0..state.indices.len()).filter(|&k| (f64::from(state.opacity[k]) - visible).abs() < 0.03);
-                let Some(distance) = alike.map(distance).reduce(f64::min).map(f64::sqrt) else {
+                let similar =
+                    (0..state.indices.len()).filter(|&k| (f64::from(state.opacity[k]) - visible).abs() < 0.03);
+                let Some(distance) = similar.map(distance).reduce(f64::min).map(f64::sqrt) else {
                     missing += 1;
                     continue;
                 };
                 seen += 1;
                 let size = f64::from(expected.log_scale.row::<3>(id).map(f32::exp).iter().copied().fold(0.0, f32::max));
-                // A tenth of a middle size is what the fit may be off, a twentieth of the median scale the file, twice.
+                // The fit may be off by a tenth of the Gaussian's scale, and the file by twice a twentieth of the
+                // median scale.
                 apart = apart.max(distance / (0.1 * size + 0.2 * median));
             }
         }

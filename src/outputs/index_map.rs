@@ -1,7 +1,7 @@
-//! Where each Gaussian of the input went.
+//! Index map: the new index of each Gaussian of the input.
 //!
-//! In: for every old Gaussian its new index, or none. Out: a `.npy` of int64 `[N]`, −1 for pruned, so
-//! that other per-Gaussian tensors can follow. Memory: none of its own.
+//! Input: for every Gaussian of the input its new index, or `None`. Output: a `.npy` file of int64 `[N]`, −1 for pruned
+//! Gaussians, so that other per-Gaussian tensors can be reordered likewise. Memory: none of its own.
 
 use std::fs::File;
 use std::io::{self, BufWriter, Write};
@@ -11,10 +11,10 @@ use npyz::{WriteOptions, WriterBuilder};
 
 use crate::error::{Error, Result};
 
-/// Writes `new_index` (`[N]`) to `path`; members of a cluster carry their proxy's index.
+/// Writes `new_index` (`[N]`) to `path`; members of a cluster have their proxy's index.
 ///
 /// # Errors
-/// A failed write.
+/// Fails if the file cannot be written.
 pub fn write_index_map(new_index: &[Option<u32>], path: &Path) -> Result<()> {
     let mut out = BufWriter::new(File::create(path).map_err(Error::io("create", path))?);
     write_npy(&mut out, new_index).and_then(|()| out.flush()).map_err(Error::io("write", path))

@@ -1,4 +1,4 @@
-//! Kinds of result, and the kind that a name asks for.
+//! Kinds of output, and the kind that a file name asks for.
 
 use std::path::Path;
 
@@ -6,58 +6,58 @@ use serde::{Deserialize, Serialize};
 
 use crate::error::{Error, Result, ShowPath};
 
-/// Kinds of result.
+/// Kind of output.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum OutputKind {
-    /// The files of a trained model, as its own training writes them.
+    /// Files of a trained model, in the format of its training code.
     Model,
-    /// A container.
+    /// A `.gseq` container of all frames.
     Gseq,
     /// A folder with one PLY per frame.
     PlySequence,
-    /// One PLY: the canonical cloud of a model, or a sequence of one frame.
+    /// One PLY file: the canonical Gaussians of a model, or a sequence of one frame.
     Ply,
-    /// An archive, to store and to send: of frames a container within bounds.
+    /// A `.gsz` archive for storage and transfer; for frames, a container with error bounds.
     Archive,
-    /// A `.splatv`: Gaussians on cubic paths, for viewers of them.
+    /// A `.splatv` file: Gaussians with cubic motion in windows of time, for its viewers.
     Splatv,
-    /// A `.4dgs`: pieces of straight motion.
+    /// A `.4dgs` file: pieces of straight motion.
     #[serde(rename = "4dgs")]
     FourDgs,
-    /// A `.spz`: one frame, in few bytes.
+    /// A `.spz` file: one frame, in few bytes.
     Spz,
 }
 
 impl OutputKind {
-    /// The kind that is asked for outright, else by the name `path`, else `own`.
-    pub fn from_path(path: &Path, asked: Option<OutputKind>, own: OutputKind) -> OutputKind {
-        asked.or(Self::by_name(path)).unwrap_or(own)
+    /// Returns the kind `asked` if given, else the kind of the name `path`, else `input_kind`, the kind of the input.
+    pub fn from_path(path: &Path, asked: Option<OutputKind>, input_kind: OutputKind) -> OutputKind {
+        asked.or(Self::from_name(path)).unwrap_or(input_kind)
     }
 
-    /// Confirms that a name that nobody says the kind of is one that some output has.
+    /// Checks that the name `path`, given without a kind, is a name of a known kind of output.
     ///
     /// # Errors
-    /// The ending of another kind of file, as [`Error::Usage`] with what can be written.
+    /// Returns [`Error::Usage`] with the possible outputs if the name has the ending of another kind of file.
     pub fn check_name(path: &Path) -> Result<()> {
-        let known = Self::by_name(path).is_some();
+        let known = Self::from_name(path).is_some();
         let Some(ending) = foreign_ending(path).filter(|_| !known) else { return Ok(()) };
         Err(Error::usage(format!(
-            "{}: nothing that is written here ends in .{ending}; expected one of\n  \
+            "{}: splatsieve does not write .{ending} files; expected one of\n  \
              NAME.gsz       archive of a model, of one PLY or of frames, the smallest\n  \
              NAME.gseq      container of all frames\n  \
              NAME.ply       one PLY\n  \
              NAME.splatv    curved motion in windows of time, for splaTV and WebGS\n  \
              NAME.4dgs      pieces of straight motion, for readers of 4dgs\n  \
              NAME.spz       one frame, for most web viewers\n  \
-             a folder       of the input's kind: model folder, or PLY files; its name has no such ending\n  \
-             or say outright with --as model|gseq|ply-sequence|ply|archive|splatv|4dgs|spz what {} is to be",
+             a folder       of the input's kind: model folder, or PLY files; give a name without an ending\n  \
+             or name the kind of {} with --as model|gseq|ply-sequence|ply|archive|splatv|4dgs|spz",
             path.shown(),
             path.shown()
         )))
     }
 
-    fn by_name(path: &Path) -> Option<OutputKind> {
+    fn from_name(path: &Path) -> Option<OutputKind> {
         match path.extension()?.to_str()?.to_ascii_lowercase().as_str() {
             "gseq" => Some(OutputKind::Gseq),
             "ply" => Some(OutputKind::Ply),
@@ -69,20 +69,20 @@ impl OutputKind {
         }
     }
 
-    /// Whether the result is a folder.
+    /// Returns whether the output is a folder.
     pub fn is_folder(self) -> bool {
         matches!(self, OutputKind::Model | OutputKind::PlySequence)
     }
 
-    /// Whether it holds every frame, as opposed to what frames are made of.
+    /// Returns whether the output holds every frame, as opposed to a model from which frames are computed.
     pub fn holds_frames(self) -> bool {
         !matches!(self, OutputKind::Model | OutputKind::Ply | OutputKind::Archive)
     }
 
-    /// Confirms that a result of this kind, named `path`, can hold so many frames.
+    /// Checks that an output of this kind, named `path`, can hold `frames` frames.
     ///
     /// # Errors
-    /// More frames, or fewer.
+    /// Fails for a `.spz` file if the number of frames is not 1.
     pub fn check_frames(self, frames: usize, path: &Path) -> Result<()> {
         match self {
             OutputKind::Spz if frames != 1 => Err(Error::usage(format!(
@@ -94,10 +94,10 @@ impl OutputKind {
     }
 }
 
-/// Confirms that `path` may be called the name of a folder that `what` writes.
+/// Checks that `path` is a possible name of a folder that the command `what` writes.
 ///
 /// # Errors
-/// The ending of a file, as [`Error::Usage`].
+/// Returns [`Error::Usage`] if the name has the ending of a file.
 pub fn check_folder_name(path: &Path, what: &str) -> Result<()> {
     match foreign_ending(path) {
         Some(ending) => Err(Error::usage(format!(
@@ -108,10 +108,10 @@ pub fn check_folder_name(path: &Path, what: &str) -> Result<()> {
     }
 }
 
-/// Confirms that `path` may be called the name of a container.
+/// Checks that `path` is a possible name of a container.
 ///
 /// # Errors
-/// The ending of another kind of file, as [`Error::Usage`].
+/// Returns [`Error::Usage`] if the name has the ending of another kind of file.
 pub fn check_container_name(path: &Path, what: &str) -> Result<()> {
     match foreign_ending(path).filter(|ending| !ending.eq_ignore_ascii_case("gseq")) {
         Some(ending) => Err(Error::usage(format!(
@@ -122,13 +122,13 @@ pub fn check_container_name(path: &Path, what: &str) -> Result<()> {
     }
 }
 
-/// The ending of a name that looks like that of a kind of file: letters, or one of a few with digits. `small.v2` and
-/// `run.2024` are names of folders, and so is whatever is one already.
+/// Returns the ending of a name that looks like the name of a file: letters only, or one of a few endings with digits.
+/// `small.v2` and `run.2024` are names of folders, and an existing folder may have any name.
 fn foreign_ending(path: &Path) -> Option<&str> {
     const WITH_DIGITS: [&str; 7] = ["mp4", "4dgs", "splat4d", "h5", "hdf5", "7z", "bz2"];
     let ending = path.extension()?.to_str()?;
-    let letters = ending.chars().all(|c| c.is_ascii_alphabetic());
-    let known = letters || WITH_DIGITS.iter().any(|known| ending.eq_ignore_ascii_case(known));
+    let only_letters = ending.chars().all(|c| c.is_ascii_alphabetic());
+    let known = only_letters || WITH_DIGITS.iter().any(|known| ending.eq_ignore_ascii_case(known));
     Some(ending).filter(|ending| known && !ending.is_empty() && !path.is_dir())
 }
 
@@ -137,7 +137,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_that_no_output_has_are_refused_with_what_can_be_written() {
+    fn unknown_endings_are_refused_with_the_possible_ones() {
         let refused = |name: &str| OutputKind::check_name(Path::new(name)).err().map(|error| error.to_string());
         for name in ["x.txt", "a/b.json", "x.ZIP", "x.mp4", "small.gsq", "x.sog"] {
             let message = refused(name).expect(name);

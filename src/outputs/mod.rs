@@ -1,7 +1,7 @@
 //! Writers that drive passes over a sequence: containers, fitted curves, frame streams, films and tables.
 //!
-//! Writers create the file they are given; [`crate::files::atomic`] hands out the temporary names to give them and
-//! moves what was written to where the user asked for it.
+//! Each writer creates the file at the path it is given. Callers pass a temporary name from [`crate::files::atomic`],
+//! which moves the finished file to the path that the user asked for.
 
 pub mod bounds;
 pub mod container;

@@ -1,8 +1,8 @@
-//! The rows of statistics, scores and decisions as tables for people and notebooks.
+//! Tables of statistics, scores and decisions, for people and notebooks.
 //!
-//! In: [`RowTable`]. Out: `.npz` (one array per column) or `.csv` (one line per Gaussian) with the same
-//! columns and the same values to the bit. Memory: none that grows with N. Bytes depend on the rows alone:
-//! entries of the archive are stored uncompressed, dated 1980-01-01.
+//! Input: [`RowTable`]. Output: `.npz` (one array per column) or `.csv` (one line per Gaussian) with the same columns
+//! and the same values to the bit. Memory: none that grows with N. The bytes depend on the rows alone: entries of the
+//! archive are stored uncompressed, dated 1980-01-01.
 
 use std::fs::File;
 use std::io::{self, BufWriter, Write};
@@ -17,22 +17,22 @@ use crate::error::{Error, Result};
 use crate::files::zip_output::ZipOutput;
 use crate::model::{self, Rows, Statistic};
 
-/// Everything known of N Gaussians after selection; every slice has N entries.
+/// Statistics, scores and decisions of N Gaussians after selection; every slice has N entries.
 #[derive(Debug, Clone, Copy)]
 pub struct RowTable<'a> {
-    /// Statistics, each a column ([`Statistic::column`]); last of all columns W, where there is one.
+    /// Statistics, one column each ([`Statistic::column`]); W, if measured, is the last column of the table.
     pub rows: &'a Rows,
-    /// S_static.
+    /// Static score S_static.
     pub static_score: &'a [f64],
-    /// S_dynamic.
+    /// Dynamic score S_dynamic.
     pub dynamic_score: &'a [f64],
-    /// S.
+    /// Score S.
     pub score: &'a [f64],
     /// Whether the Gaussian survives stage 2.
     pub keep: &'a [bool],
 }
 
-/// One column of the table.
+/// Values of one column of the table.
 #[derive(Clone, Copy)]
 enum TableColumn<'a> {
     F64(&'a [f64]),
@@ -59,34 +59,35 @@ impl TableColumn<'_> {
 }
 
 impl RowTable<'_> {
-    /// Writes an archive that `numpy.load` opens: arrays `[N]` of float64, `life` uint32, `keep` bool.
+    /// Writes an archive that `numpy.load` opens: arrays `[N]` of float64, `life` as uint32, `keep` as bool.
     ///
     /// # Errors
-    /// Slices of different lengths; a failed write.
+    /// Fails if slices have different lengths or the file cannot be written.
     pub fn write_npz(&self, path: &Path) -> Result<()> {
         self.check_lengths()?;
         let file = BufWriter::new(File::create(path).map_err(Error::io("create", path))?);
-        self.npz_into(file).map_err(Error::io("write", path))
+        self.write_npz_to(file).map_err(Error::io("write", path))
     }
 
-    /// Writes a table with a header line: `id`, then the columns; floats as the shortest text that reads
-    /// back as the same f64 (`NaN`, `inf` where there are any), `keep` as `true` or `false`.
+    /// Writes a table with a header line: `id`, then the columns. Floats are the shortest text that reads back as the
+    /// same f64 (`NaN`, `inf` where they occur), `keep` is `true` or `false`.
     ///
     /// # Errors
-    /// Slices of different lengths; a failed write.
+    /// Fails if slices have different lengths or the file cannot be written.
     pub fn write_csv(&self, path: &Path) -> Result<()> {
         self.check_lengths()?;
         let file = File::create(path).map_err(Error::io("create", path))?;
-        self.csv_into(file).map_err(Error::io("write", path))
+        self.write_csv_to(file).map_err(Error::io("write", path))
     }
 
-    /// The columns in order, as both formats name them.
+    /// Returns the columns in order, with their names in both formats.
     fn columns(&self) -> Vec<(&'static str, TableColumn<'_>)> {
-        let column = |of: Statistic| match of.values() {
-            model::Values::F64(values, _) => (of.column(), TableColumn::F64(values(self.rows))),
-            model::Values::U32(values, _) => (of.column(), TableColumn::U32(values(self.rows))),
+        let column = |statistic: Statistic| match statistic.values() {
+            model::Values::F64(values, _) => (statistic.column(), TableColumn::F64(values(self.rows))),
+            model::Values::U32(values, _) => (statistic.column(), TableColumn::U32(values(self.rows))),
         };
-        let mut columns: Vec<_> = Statistic::ALL.into_iter().filter(|&of| of != Statistic::W).map(column).collect();
+        let mut columns: Vec<_> =
+            Statistic::ALL.into_iter().filter(|&statistic| statistic != Statistic::W).map(column).collect();
         columns.extend([
             ("static_score", TableColumn::F64(self.static_score)),
             ("dynamic_score", TableColumn::F64(self.dynamic_score)),
@@ -107,9 +108,9 @@ impl RowTable<'_> {
         }
     }
 
-    fn npz_into(&self, out: impl Write + io::Seek) -> io::Result<()> {
+    fn write_npz_to(&self, out: impl Write + io::Seek) -> io::Result<()> {
         let mut archive = NpzWriter::new(ZipOutput::new(out));
-        // 8 bytes a value and a header: beyond 4 GiB an entry needs the 64-bit form.
+        // Each value takes 8 bytes, plus a header: an entry beyond 4 GiB needs the 64-bit zip format.
         let large = self.rows.len() as u64 * 8 + 4096 > u64::from(u32::MAX);
         let options = FileOptions::default()
             .compression_method(CompressionMethod::Stored)
@@ -125,7 +126,7 @@ impl RowTable<'_> {
         archive.zip_writer().finish()?.close()
     }
 
-    fn csv_into(&self, out: impl Write) -> io::Result<()> {
+    fn write_csv_to(&self, out: impl Write) -> io::Result<()> {
         let columns = self.columns();
         let mut out = csv::Writer::from_writer(out);
         out.write_record(std::iter::once("id").chain(columns.iter().map(|(name, _)| *name)))?;
@@ -179,7 +180,7 @@ mod tests {
     }
 
     #[test]
-    fn npz_reads_back_bit_for_bit_and_twice_the_same() {
+    fn npz_reads_back_bit_for_bit_and_is_reproducible() {
         let folder = tempfile::tempdir().unwrap();
         let [a, b] = ["a", "b"].map(|name| folder.path().join(name));
         with_table(|table| {
@@ -234,9 +235,9 @@ mod tests {
     }
 
     #[test]
-    fn csv_is_these_bytes() {
+    fn csv_bytes_are_fixed() {
         let mut text = Vec::new();
-        with_table(|table| table.csv_into(&mut text).unwrap());
+        with_table(|table| table.write_csv_to(&mut text).unwrap());
         let expected = "id,D,kappa,V,life,C,E,vis,static_score,dynamic_score,score,keep,W\n\
             0,0.1,0.2,0.03333333333333333,0,0.4,1.0,0.03,-0.0,-0.0,-0.0,true,0.020000000000000004\n\
             1,NaN,2.2,0.3666666666666667,7,4.4,1000000000000.0,0.33,\
@@ -246,7 +247,7 @@ mod tests {
     }
 
     #[test]
-    fn a_column_of_another_length_is_named() {
+    fn a_column_of_wrong_length_is_named() {
         let rows = Rows { w: Vec::new(), ..rows() };
         let table = RowTable {
             rows: &rows,

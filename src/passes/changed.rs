@@ -1,48 +1,48 @@
-//! A sequence with its Gaussians changed, or without the last of their harmonics, frame by frame as it is read.
+//! Source that adds parameter deltas to another source, or omits its higher SH degrees, frame by frame as it is read.
 
 use crate::compressed_model::{ParamDelta, TrajectoryDelta};
 use crate::error::Result;
 use crate::model::{Column, Columns, Gaussians, SequenceInfo};
 use crate::source::{BlockReader, FrameSource, Ids, ReadPlan, Reads};
 
-/// A source whose parameters are changed, the same at every frame and along a course.
+/// Source whose parameters are changed by a delta that is constant in time and by a trajectory delta.
 pub struct Changed<'a> {
     source: Box<dyn FrameSource + 'a>,
-    change: &'a ParamDelta,
-    course: &'a TrajectoryDelta,
+    delta: &'a ParamDelta,
+    trajectory: &'a TrajectoryDelta,
     info: SequenceInfo,
 }
 
 impl<'a> Changed<'a> {
-    /// `source` with `change` and `course` added to its Gaussians, and of their harmonics those up to `sh_degree`; nothing
-    /// to add and none above: the source as it is.
+    /// Returns `source` with `delta` and `trajectory` added to its Gaussians, and SH up to `sh_degree` only. If both
+    /// deltas are empty and no SH degree is above `sh_degree`, the frames equal those of `source`.
     pub fn new(
         source: Box<dyn FrameSource + 'a>,
-        change: &'a ParamDelta,
-        course: &'a TrajectoryDelta,
+        delta: &'a ParamDelta,
+        trajectory: &'a TrajectoryDelta,
         sh_degree: usize,
     ) -> Changed<'a> {
         let mut info = source.info().clone();
         info.sh_degree = info.sh_degree.min(sh_degree);
-        info.varying |= course.columns();
-        Changed { source, change, course, info }
+        info.varying |= trajectory.columns();
+        Changed { source, delta, trajectory, info }
     }
 
-    fn is_plain(&self) -> bool {
-        self.change.is_empty() && self.course.is_empty() && self.drops().is_none()
+    fn is_unchanged(&self) -> bool {
+        self.delta.is_empty() && self.trajectory.is_empty() && self.dropped_sh_buffer().is_none()
     }
 
     fn reader<'b>(
         &self,
         reader: Box<dyn BlockReader + 'b>,
-        change: ParamDelta,
-        course: TrajectoryDelta,
+        delta: ParamDelta,
+        trajectory: TrajectoryDelta,
     ) -> ChangedReader<'b> {
-        ChangedReader { reader, change, course, frames: self.info.times.len(), all_sh: self.drops() }
+        ChangedReader { reader, delta, trajectory, frames: self.info.times.len(), all_sh: self.dropped_sh_buffer() }
     }
 
-    /// Room for all harmonics, where some of them go.
-    fn drops(&self) -> Option<Column> {
+    /// Returns a buffer for all SH coefficients of `source` if some of them are dropped.
+    fn dropped_sh_buffer(&self) -> Option<Column> {
         let degree = self.source.info().sh_degree;
         (degree > self.info.sh_degree).then(|| Gaussians::zeros(0, degree).sh)
     }
@@ -54,20 +54,24 @@ impl FrameSource for Changed<'_> {
     }
 
     fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>> {
-        if self.is_plain() {
+        if self.is_unchanged() {
             return self.source.open(ids);
         }
-        let places: Vec<u32> = ids.iter().map(|id| id as u32).collect();
-        Ok(Box::new(self.reader(self.source.open(ids)?, self.change.pick(&places), self.course.pick(&places))))
+        let ids_of_rows: Vec<u32> = ids.iter().map(|id| id as u32).collect();
+        Ok(Box::new(self.reader(
+            self.source.open(ids)?,
+            self.delta.pick(&ids_of_rows),
+            self.trajectory.pick(&ids_of_rows),
+        )))
     }
 
     fn open_all(&self, wanted: &ReadPlan) -> Option<Result<Box<dyn BlockReader + '_>>> {
         let opened = self.source.open_all(wanted)?;
-        if self.is_plain() {
+        if self.is_unchanged() {
             return Some(opened);
         }
         let changed = |reader| -> Box<dyn BlockReader + '_> {
-            Box::new(self.reader(reader, self.change.clone(), self.course.clone()))
+            Box::new(self.reader(reader, self.delta.clone(), self.trajectory.clone()))
         };
         Some(opened.map(changed))
     }
@@ -79,11 +83,11 @@ impl FrameSource for Changed<'_> {
 
 struct ChangedReader<'a> {
     reader: Box<dyn BlockReader + 'a>,
-    change: ParamDelta,
-    course: TrajectoryDelta,
-    /// How many there are.
+    delta: ParamDelta,
+    trajectory: TrajectoryDelta,
+    /// Number of frames of the sequence.
     frames: usize,
-    /// Where harmonics are read into, of which some go.
+    /// Buffer into which all SH coefficients are read if some of them are dropped.
     all_sh: Option<Column>,
 }
 
@@ -97,14 +101,14 @@ impl BlockReader for ChangedReader<'_> {
                 std::mem::swap(&mut out.sh, all);
                 read?;
                 out.sh.resize(all.len());
-                let left = out.sh.planes().len();
-                out.sh.planes_mut().copy_from_slice(&all.planes()[..left]);
+                let kept = out.sh.planes().len();
+                out.sh.planes_mut().copy_from_slice(&all.planes()[..kept]);
             }
         }
-        match self.course.is_empty() {
-            true => self.change.add_to(out, want),
-            // The course has no higher bands.
-            false => self.course.at(frame, self.frames).and(self.change.clone()).add_to(out, want),
+        match self.trajectory.is_empty() {
+            true => self.delta.add_to(out, want),
+            // The trajectory delta has no higher SH degrees.
+            false => self.trajectory.at(frame, self.frames).and(self.delta.clone()).add_to(out, want),
         }
         Ok(())
     }
@@ -121,7 +125,7 @@ mod tests {
     use crate::model::ALL_HARMONICS;
 
     #[test]
-    fn any_block_of_ids_gets_the_changes_of_its_own_gaussians_in_any_column() {
+    fn each_gaussian_gets_its_own_delta_in_every_column() {
         let plain = Scene::new(40, 3);
         let mut by = Gaussians::zeros(40, 0);
         by.log_scale = Default::default();
@@ -130,9 +134,9 @@ mod tests {
             by.opacity_logit.set_row(i, [-(i as f32)]);
             by.sh.set_row(i, [0.125 * i as f32; 3]);
         }
-        let change = ParamDelta(by);
-        let straight = TrajectoryDelta::default();
-        let changed = Changed::new(Box::new(Scene::new(40, 3)), &change, &straight, ALL_HARMONICS);
+        let delta = ParamDelta(by);
+        let no_trajectory = TrajectoryDelta::default();
+        let changed = Changed::new(Box::new(Scene::new(40, 3)), &delta, &no_trajectory, ALL_HARMONICS);
         for ids in [Ids::List(&[39, 5, 0]), Ids::Range(7..12)] {
             let read = |source: &dyn FrameSource| {
                 let mut state = Gaussians::zeros(ids.len(), plain.info().sh_degree);
@@ -141,16 +145,16 @@ mod tests {
             };
             let (mut expected, got) = (read(&plain), read(&changed));
             for (row, id) in ids.iter().enumerate() {
-                for column in change.columns().iter() {
-                    let by = change.0.column(column);
+                for column in delta.columns().iter() {
+                    let by = delta.0.column(column);
                     (0..by.width()).for_each(|c| expected.column_mut(column).plane_mut(c)[row] += by.plane(c)[id]);
                 }
             }
             assert!(got == expected, "{ids:?}");
         }
         for ids in [Ids::List(&[39, 5, 0]), Ids::Range(0..40)] {
-            // Without the first band too, whose changes go with it.
-            let fewer = Changed::new(Box::new(Scene::new(40, 3)), &change, &straight, 0);
+            // Without SH degree 1, whose change is dropped with it.
+            let fewer = Changed::new(Box::new(Scene::new(40, 3)), &delta, &no_trajectory, 0);
             assert_eq!((fewer.info().sh_degree, plain.info().sh_degree), (0, 1));
             let mut expected = Gaussians::zeros(ids.len(), 1);
             changed.open(ids.clone()).unwrap().read(1, Columns::all(), &mut expected).unwrap();
@@ -161,7 +165,7 @@ mod tests {
         }
         let none = ParamDelta::default();
         let mut untouched = Gaussians::zeros(40, plain.info().sh_degree);
-        let unchanged = Changed::new(Box::new(Scene::new(40, 3)), &none, &straight, ALL_HARMONICS);
+        let unchanged = Changed::new(Box::new(Scene::new(40, 3)), &none, &no_trajectory, ALL_HARMONICS);
         unchanged.open(Ids::Range(0..40)).unwrap().read(1, Columns::all(), &mut untouched).unwrap();
         let mut expected = untouched.clone();
         plain.open(Ids::Range(0..40)).unwrap().read(1, Columns::all(), &mut expected).unwrap();
@@ -169,23 +173,23 @@ mod tests {
     }
 
     #[test]
-    fn what_changes_along_a_course_varies_and_is_read_at_every_frame() {
+    fn columns_of_a_trajectory_delta_vary_in_time() {
         let plain = Scene::new(30, 5);
-        let knot = |scale: f32| {
+        let keyframe = |scale: f32| {
             let mut by = Gaussians::zeros(0, 0);
             by.log_scale = Column::from_planes(3, (0..90).map(|k| scale * k as f32).collect());
             ParamDelta(by)
         };
-        let (change, course) = (knot(0.5), TrajectoryDelta(vec![knot(0.0), knot(1.0), knot(-1.0)]));
+        let (delta, trajectory) = (keyframe(0.5), TrajectoryDelta(vec![keyframe(0.0), keyframe(1.0), keyframe(-1.0)]));
         assert!(!plain.info().varying.contains(Columns::LOG_SCALE));
-        let changed = Changed::new(Box::new(Scene::new(30, 5)), &change, &course, ALL_HARMONICS);
+        let changed = Changed::new(Box::new(Scene::new(30, 5)), &delta, &trajectory, ALL_HARMONICS);
         assert_eq!(changed.info().varying, plain.info().varying | Columns::LOG_SCALE);
         let ids = [4, 29, 0];
         let mut reader = changed.open(Ids::List(&ids)).unwrap();
         for (frame, scale) in [(0, 0.5), (1, 1.0), (2, 1.5), (3, 0.5), (4, -0.5)] {
             let mut expected = Gaussians::zeros(3, plain.info().sh_degree);
             plain.open(Ids::List(&ids)).unwrap().read(frame, Columns::all(), &mut expected).unwrap();
-            knot(scale).pick(&ids).add_to(&mut expected, Columns::all());
+            keyframe(scale).pick(&ids).add_to(&mut expected, Columns::all());
             let mut got = Gaussians::zeros(3, plain.info().sh_degree);
             reader.read(frame, Columns::all(), &mut got).unwrap();
             assert!(got == expected, "frame {frame}");

@@ -1,4 +1,4 @@
-//! Many Gaussians of a source, frame after frame, read in blocks on all threads.
+//! Readers of many Gaussians of a source at one frame after the other, in blocks on all threads.
 
 use rayon::prelude::*;
 
@@ -8,9 +8,9 @@ use crate::error::Result;
 use crate::model::{Columns, Gaussians, SequenceInfo};
 use crate::source::{BlockReader, FrameSource, Ids, ReadPlan};
 
-/// Readers over Gaussians of a source, open for all the frames that are wanted of it.
+/// Readers over blocks of Gaussians, kept open for all frames to be read.
 ///
-/// Memory: per Gaussian its reader; per thread one block's state at one frame.
+/// Memory: the reader of every Gaussian; per thread one block's state at one frame.
 pub struct FrameReaders<'a> {
     info: &'a SequenceInfo,
     columns: Columns,
@@ -20,6 +20,9 @@ pub struct FrameReaders<'a> {
 
 impl<'a> FrameReaders<'a> {
     /// Opens readers for the columns `columns` of the Gaussians `ids` at the frames `wanted`.
+    ///
+    /// # Errors
+    /// A source that cannot be opened.
     pub fn open(
         source: &'a dyn FrameSource,
         ids: Ids<'_>,
@@ -43,19 +46,19 @@ impl<'a> FrameReaders<'a> {
         Ok(FrameReaders { info: source.info(), columns, count, readers })
     }
 
-    /// A state to read into.
+    /// Returns a state to read into.
     pub fn state(&self) -> Gaussians {
         Gaussians::zeros(self.count, self.sh_degree())
     }
 
-    /// No room for colors that nobody reads.
+    /// Returns the SH degree of the state: 0 if SH is not read, which avoids its memory.
     fn sh_degree(&self) -> usize {
         if self.columns.contains(Columns::SH) { self.info.sh_degree } else { 0 }
     }
 }
 
 impl BlockReader for FrameReaders<'_> {
-    /// Of the columns `want` those that were opened.
+    /// Reads the columns of `want` for which the readers were opened.
     fn read(&mut self, frame: usize, want: Columns, state: &mut Gaussians) -> Result<()> {
         let want = want & self.columns;
         if want.is_empty() {
@@ -77,9 +80,10 @@ impl BlockReader for FrameReaders<'_> {
     }
 }
 
-/// A reader of the columns `columns` of all Gaussians of a source at the frames `wanted`, to be kept open over them.
+/// Opens a reader of the columns `columns` of all Gaussians of a source at the frames `wanted`, to be kept open for all
+/// of them.
 ///
-/// Memory: that of [`FrameReaders`], or of the source's own ([`FrameSource::open_all`]).
+/// Memory: that of [`FrameReaders`], or of the source's own reader ([`FrameSource::open_all`]).
 pub(super) fn open_all<'a>(
     source: &'a dyn FrameSource,
     columns: Columns,

@@ -1,5 +1,5 @@
-//! The state of many Gaussians at one frame, read in blocks on all threads. Whoever reads more than a frame keeps
-//! readers open instead ([`super::FrameReaders`], [`super::States`]), so that no tile is decoded for each.
+//! State of many Gaussians at one frame, read in blocks on all threads. To read several frames, use readers that stay
+//! open ([`super::FrameReaders`], [`super::States`]); they decode each tile once.
 
 use rayon::prelude::*;
 
@@ -10,9 +10,12 @@ use crate::error::{Error, Result};
 use crate::model::{Column, Columns, Gaussians};
 use crate::source::{BlockReader, FrameSource, Ids, ReadPlan};
 
-/// Columns `want` of the Gaussians `ids` at `frame`; all other columns are empty.
+/// Reads the columns `want` of the Gaussians `ids` at `frame`; all other columns are empty.
 ///
-/// Memory: what it gives, and per thread a reader over one block and that block's state.
+/// Memory: the result, and per thread a reader over one block and that block's state.
+///
+/// # Errors
+/// A frame that cannot be read.
 pub fn gather(source: &dyn FrameSource, ids: &[u32], frame: usize, want: Columns) -> Result<Gaussians> {
     let sh_degree = source.info().sh_degree;
     let mut all = Gaussians::zeros(0, sh_degree);
@@ -31,22 +34,25 @@ pub fn gather(source: &dyn FrameSource, ids: &[u32], frame: usize, want: Columns
     Ok(all)
 }
 
-/// Columns `want` of all Gaussians at `frame`; all other columns are empty.
+/// Reads the columns `want` of all Gaussians at `frame`; all other columns are empty.
+///
+/// # Errors
+/// A frame that cannot be read.
 pub fn gather_all(source: &dyn FrameSource, frame: usize, want: Columns) -> Result<Gaussians> {
     let mut all = Gaussians::zeros(0, source.info().sh_degree);
     open_all(source, want, &ReadPlan::new([frame]))?.read(frame, want, &mut all)?;
     Ok(all)
 }
 
-/// Reads all Gaussians of a source that decodes nothing together, each block by a reader that lasts for one frame: nothing is
-/// gained by what readers of all Gaussians would keep.
+/// Reader of all Gaussians of a source that does not decode frames together. It opens a reader per block and frame,
+/// because readers kept open would take memory and save nothing.
 pub struct InBlocks<'a> {
     source: &'a dyn FrameSource,
     ids: Vec<u32>,
 }
 
 impl<'a> InBlocks<'a> {
-    /// Of all of `source`. Memory: 4 bytes a Gaussian.
+    /// Creates a reader of all Gaussians of `source`. Memory: 4 bytes per Gaussian.
     pub fn new(source: &'a dyn FrameSource) -> InBlocks<'a> {
         InBlocks { source, ids: (0..source.info().count as u32).collect() }
     }
@@ -54,10 +60,10 @@ impl<'a> InBlocks<'a> {
 
 impl BlockReader for InBlocks<'_> {
     fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
-        // What is replaced goes first.
+        // Free the old columns before the new ones are read.
         out.columns_mut(want).for_each(|column| *column = Column::default());
         let mut found = gather(self.source, &self.ids, frame, want)?;
-        out.columns_mut(want).zip(found.columns_mut(want)).for_each(|(to, from)| std::mem::swap(to, from));
+        out.columns_mut(want).zip(found.columns_mut(want)).for_each(|(old, new)| std::mem::swap(old, new));
         Ok(())
     }
 }

@@ -1,5 +1,5 @@
-//! Consecutive frames of a sequence that are in memory together: how what arrives frame by frame meets
-//! passes that go Gaussian by Gaussian.
+//! Consecutive frames that are held in memory together, so that passes which read block by block can process input that
+//! arrives frame by frame.
 
 use std::ops::Range;
 
@@ -7,7 +7,7 @@ use crate::error::Result;
 use crate::model::{Column, Columns, Gaussians, SequenceInfo};
 use crate::source::{BlockReader, FrameSource, Ids};
 
-/// Frames with all columns, as a source; its frame 0 is the first that is held.
+/// Source of frames held in memory with all columns. Its frame 0 is the first frame held.
 pub struct HeldFrames {
     info: SequenceInfo,
     constant: Gaussians,
@@ -15,36 +15,36 @@ pub struct HeldFrames {
 }
 
 impl HeldFrames {
-    /// No frames yet of `count` Gaussians. `constant` holds the columns outside `varying`.
+    /// Creates a source of `count` Gaussians without frames. `constant` holds the columns outside `varying`.
     pub fn new(count: usize, sh_degree: usize, varying: Columns, constant: Gaussians) -> Self {
         let info = SequenceInfo { count, times: Vec::new(), sh_degree, varying };
         HeldFrames { info, constant, frames: Vec::new() }
     }
 
-    /// Adds a frame: of `state` the varying columns, for all Gaussians.
+    /// Adds a frame. Only the varying columns of `state` are used; they hold all Gaussians.
     pub fn push(&mut self, time: f64, state: Gaussians) {
         self.info.times.push(time);
         self.frames.push(state);
     }
 
-    /// Takes all frames out.
+    /// Removes and returns all frames.
     pub fn drain(&mut self) -> impl Iterator<Item = Gaussians> {
         self.info.times.clear();
         self.frames.drain(..)
     }
 
-    /// Positions of all Gaussians at a frame that is held.
+    /// Returns the positions of all Gaussians at a held frame.
     pub fn position(&self, frame: usize) -> &Column {
         let varies = self.info.varying.contains(Columns::POSITION);
         if varies { &self.frames[frame].position } else { &self.constant.position }
     }
 
-    /// Number of frames held.
+    /// Returns the number of frames held.
     pub fn len(&self) -> usize {
         self.frames.len()
     }
 
-    /// Whether no frame is held.
+    /// Returns whether no frame is held.
     pub fn is_empty(&self) -> bool {
         self.frames.is_empty()
     }
@@ -70,7 +70,7 @@ impl FrameSource for HeldFrames {
 struct HeldReader<'a> {
     held: &'a HeldFrames,
     len: usize,
-    /// Consecutive ids, in the order asked for.
+    /// Ranges of consecutive ids, in the order of the requested ids.
     runs: Vec<Range<usize>>,
 }
 

@@ -1,13 +1,14 @@
-//! A state cut into the parts that blocks of its Gaussians are written to, each from its own thread.
+//! Division of a state into slices that blocks of Gaussians are written to, each from its own thread.
 
 use super::BLOCK;
 use crate::model::{Columns, Gaussians};
 
-/// Where the values of one block go: a slice for every component of every column, in their order.
+/// Destination of one block: a slice for every component of every column, in order.
 pub struct BlockSlices<'a>(Vec<&'a mut [f32]>);
 
 impl<'a> BlockSlices<'a> {
-    /// The parts of the columns `want` of `state`, which are resized to `count` Gaussians: one for each [`BLOCK`].
+    /// Resizes the columns `want` of `state` to `count` Gaussians and divides them, one part for each [`BLOCK`] of
+    /// Gaussians.
     pub fn split(state: &'a mut Gaussians, want: Columns, count: usize) -> Vec<BlockSlices<'a>> {
         let mut parts: Vec<BlockSlices<'a>> = (0..count.div_ceil(BLOCK)).map(|_| BlockSlices(Vec::new())).collect();
         for column in state.columns_mut(want) {
@@ -19,7 +20,7 @@ impl<'a> BlockSlices<'a> {
         parts
     }
 
-    /// Copies the columns `want` of `block`.
+    /// Copies the columns `want` of `block` to the slices.
     pub fn write(self, block: &Gaussians, want: Columns) {
         let columns = want.iter().map(|column| block.column(column));
         let planes = columns.flat_map(|column| (0..column.width()).map(|c| column.plane(c)));

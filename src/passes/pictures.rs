@@ -1,7 +1,7 @@
-//! Making pictures of sources: the one way from a list of pictures to the states that each of them shows.
+//! Passes over views: reads the states that a list of views shows, and hands them on in batches.
 //!
-//! Frame-major, for occlusion needs all Gaussians of a frame at once: frames are read by blocks on all threads, then
-//! the pictures of a batch of frames are handed on together, to be shared out among the threads.
+//! The order is by frame, because occlusion needs all Gaussians of a frame at once. Frames are read in blocks on all
+//! threads; then the views of a batch of frames are handed on together, to be distributed among the threads.
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Mutex, PoisonError};
@@ -17,27 +17,27 @@ use crate::model::{Camera, Column, Columns, Gaussians, Picture};
 use crate::render::{Image, blend_features, render};
 use crate::source::{BlockReader, FeatureDecoder, FrameSource, Ids, ReadPlan};
 
-/// Pictures of a batch for each thread: enough that the last ones to finish cost little.
-pub const PICTURES_PER_THREAD: usize = 4;
+/// Number of views of a batch per thread: enough that the last ones to finish cost little time.
+pub const VIEWS_PER_THREAD: usize = 4;
 
-/// What pictures show.
+/// Gaussians that views show.
 pub struct Subject<'a> {
-    /// Where the states come from.
+    /// Source of the states.
     pub source: &'a dyn FrameSource,
-    /// Gaussians that readers are kept open for over all frames; none: all, read as the source likes best
-    /// ([`FrameSource::open_all`]).
+    /// Gaussians for which readers are kept open over all frames. `None`: all Gaussians, read in the way that is
+    /// cheapest for the source ([`FrameSource::open_all`]).
     pub ids: Option<Ids<'a>>,
-    /// Columns that are looked at; the others are empty.
+    /// Columns that are read; the others are empty.
     pub columns: Columns,
 }
 
 impl<'a> Subject<'a> {
-    /// All there is to see of `source`.
+    /// Returns the subject of all Gaussians of `source` with all columns.
     pub fn all(source: &'a dyn FrameSource) -> Subject<'a> {
         Subject { source, ids: None, columns: Columns::all() }
     }
 
-    /// What decodes its features, where all Gaussians are looked at and have some.
+    /// Returns the decoder of the source's features, if all Gaussians are shown and have features.
     fn decoder(&self) -> Option<&'a dyn FeatureDecoder> {
         self.source.decoder().filter(|_| self.ids.is_none())
     }
@@ -50,32 +50,33 @@ impl<'a> Subject<'a> {
     }
 }
 
-/// How much is handed on together.
+/// Maximum size of a batch of views.
 #[derive(Debug, Clone, Copy)]
 pub struct Batch {
-    /// Most frames, each with a state of every subject.
+    /// Maximum number of frames, each with a state of every subject.
     pub frames: usize,
-    /// Most pictures.
+    /// Maximum number of views.
     pub pictures: usize,
-    /// Most frames that a reader keeps of those decoded together.
+    /// Maximum number of frames that a reader keeps of those decoded together.
     pub held: usize,
 }
 
 impl Batch {
-    /// For looking at many pictures of little memory each: pictures of several frames keep all threads busy.
-    fn to_look(limits: &Limits) -> Batch {
-        let pictures = PICTURES_PER_THREAD * rayon::current_num_threads();
+    /// Returns the batch size for many views that take little memory each: views of several frames keep all threads
+    /// busy.
+    fn many_views(limits: &Limits) -> Batch {
+        let pictures = VIEWS_PER_THREAD * rayon::current_num_threads();
         Batch { frames: limits.frames_together, pictures, held: limits.frames_held }
     }
 
-    /// For pictures that are kept while their batch lasts: one frame, a picture for each thread.
+    /// Returns the batch size for views that are kept until their batch ends: one frame, one view per thread.
     pub fn of_frame(limits: &Limits) -> Batch {
         let pictures = rayon::current_num_threads().min(limits.pictures_together);
         Batch { frames: 1, pictures, held: limits.frames_held }
     }
 
-    /// How many of `pictures` make up a batch.
-    fn first(&self, pictures: &[Picture]) -> usize {
+    /// Returns how many of the first `pictures` form a batch.
+    fn batch_length(&self, pictures: &[Picture]) -> usize {
         let (mut frames, mut last) = (0, None);
         let fits = |picture: &&Picture| {
             frames += usize::from(last != Some(picture.frame));
@@ -86,32 +87,33 @@ impl Batch {
     }
 }
 
-/// A picture to make, with the states of `S` subjects at its frame.
+/// View to render, with the states of `S` subjects at its frame.
 #[derive(Clone, Copy)]
 pub struct ViewStates<'a, const S: usize> {
-    /// Which picture.
+    /// Frame, view number and camera index.
     pub picture: Picture,
-    /// What takes it.
+    /// Camera of the view.
     pub camera: &'a Camera,
-    /// What it shows.
+    /// States of the subjects at the view's frame.
     pub states: [&'a Gaussians; S],
-    /// Of subjects with features in the place of colors, what decodes them, and the features.
+    /// Decoder and features of each subject that has features in place of colors.
     decoded: [Option<(&'a dyn FeatureDecoder, &'a Column)>; S],
 }
 
 impl<const S: usize> ViewStates<'_, S> {
-    /// The picture of the subject numbered `subject` before `background`, on all threads of the pool, as its own renderer
-    /// makes it: of one with features these are blended and decoded, and there is no background.
+    /// Renders the subject with index `subject` over `background`, on all threads of the pool, as the subject's own
+    /// renderer does. The features of a subject that has some are blended and decoded, without a background.
     pub fn render(&self, subject: usize, background: [f32; 3]) -> Image {
         self.render_as(subject, self.states[subject], self.features(subject), background)
     }
 
-    /// The features of the subject numbered `subject`, where its pictures are made of some.
+    /// Returns the features of the subject with index `subject`, if its renders use features.
     pub fn features(&self, subject: usize) -> Option<&Column> {
         self.decoded[subject].map(|(_, features)| features)
     }
 
-    /// [`ViewStates::render`] of that subject in another `state`, of as many Gaussians as `features`.
+    /// Renders the subject as [`ViewStates::render`] does, but with another `state`, which has as many Gaussians as
+    /// `features`.
     pub fn render_as(
         &self,
         subject: usize,
@@ -137,29 +139,30 @@ impl<const S: usize> ViewStates<'_, S> {
     }
 }
 
-/// States of all subjects at a frame, to be read into again.
+/// States of all subjects at a frame; the buffers are reused for later frames.
 struct StateSlot<const S: usize> {
     frame: usize,
     states: [Gaussians; S],
-    /// Features of subjects that have some.
+    /// Features of each subject that has some.
     features: [Column; S],
 }
 
-/// Hands `pictures` (by frame; cameras by their index in `cameras`) to `visit`, in order, in batches; every state is
-/// read once, and what does not vary once for each frame of a batch.
+/// Calls `visit` with batches of `pictures`, in order. `pictures` must be in the order of their frames, with cameras as
+/// indices into `cameras`. Every state is read once; columns that do not vary are read once for each frame slot of a
+/// batch.
 ///
-/// Memory: of each subject its reader, the frames that it keeps, and a state for every frame of a batch.
+/// Memory: for each subject its reader, the frames that the reader keeps, and a state for every frame of a batch.
 ///
 /// # Errors
-/// Frames that cannot be read; those of `visit`.
+/// Frames that cannot be read; errors of `visit`.
 pub fn show<const S: usize>(
     subjects: [Subject<'_>; S],
     cameras: &[Camera],
     pictures: &[Picture],
-    most: Batch,
+    max_batch: Batch,
     mut visit: impl FnMut(&[ViewStates<'_, S>]) -> Result<()>,
 ) -> Result<()> {
-    let wanted = ReadPlan::new(pictures.iter().map(|picture| picture.frame)).holding(most.held);
+    let wanted = ReadPlan::new(pictures.iter().map(|picture| picture.frame)).holding(max_batch.held);
     let mut readers = Vec::with_capacity(S);
     for subject in &subjects {
         readers.push(subject.open(&wanted)?);
@@ -167,22 +170,22 @@ pub fn show<const S: usize>(
     let mut slots: Vec<StateSlot<S>> = Vec::new();
     let mut rest = pictures;
     while !rest.is_empty() {
-        let (batch, later) = rest.split_at(most.first(rest));
+        let (batch, later) = rest.split_at(max_batch.batch_length(rest));
         rest = later;
-        // A frame of more pictures than a batch has: its state is there.
-        if let Some(again) = slots.iter().position(|slot| slot.frame == batch[0].frame) {
-            slots.swap(0, again);
+        // If a frame has more views than a batch, its state is already in a slot.
+        if let Some(slot) = slots.iter().position(|slot| slot.frame == batch[0].frame) {
+            slots.swap(0, slot);
         }
-        for (place, of_frame) in batch.chunk_by(|a, b| a.frame == b.frame).enumerate() {
-            let frame = of_frame[0].frame;
-            let is_new = place == slots.len();
+        for (index, frame_views) in batch.chunk_by(|a, b| a.frame == b.frame).enumerate() {
+            let frame = frame_views[0].frame;
+            let is_new = index == slots.len();
             if is_new {
                 let states = std::array::from_fn(|k| Gaussians::zeros(0, subjects[k].source.info().sh_degree));
                 slots.push(StateSlot { frame, states, features: std::array::from_fn(|_| Column::default()) });
-            } else if slots[place].frame == frame {
+            } else if slots[index].frame == frame {
                 continue;
             }
-            let slot = &mut slots[place];
+            let slot = &mut slots[index];
             for ((subject, reader), state) in subjects.iter().zip(&mut readers).zip(&mut slot.states) {
                 let varying = subject.source.info().varying;
                 let want = if is_new { subject.columns } else { subject.columns & varying };
@@ -195,11 +198,11 @@ pub fn show<const S: usize>(
             }
             slot.frame = frame;
         }
-        let of_frames = batch.chunk_by(|a, b| a.frame == b.frame).zip(&slots);
-        let views: Vec<ViewStates<'_, S>> = of_frames
-            .flat_map(|(of_frame, StateSlot { states, features, .. })| {
+        let frames = batch.chunk_by(|a, b| a.frame == b.frame).zip(&slots);
+        let views: Vec<ViewStates<'_, S>> = frames
+            .flat_map(|(frame_views, StateSlot { states, features, .. })| {
                 let decoded = std::array::from_fn(|k| Some((subjects[k].decoder()?, &features[k])));
-                of_frame.iter().map(move |&picture| ViewStates {
+                frame_views.iter().map(move |&picture| ViewStates {
                     picture,
                     camera: &cameras[picture.camera as usize],
                     states: states.each_ref(),
@@ -212,34 +215,36 @@ pub fn show<const S: usize>(
     Ok(())
 }
 
-/// Workers that have seen some pictures and may see more.
+/// Workers that accumulate results over views, one per thread at most.
 ///
-/// Memory per Gaussian: its reader; the columns looked at for each frame of a batch (of 4 × threads pictures at most,
-/// no more frames than [`Limits::frames_together`]); what a worker holds, one per thread but no more than
-/// [`Limits::pictures_together`].
+/// Memory per Gaussian: its reader; the columns read, for each frame of a batch (at most 4 × threads views and
+/// [`Limits::frames_together`] frames); the data of a worker, for at most [`Limits::pictures_together`] workers.
 pub(crate) struct Workers<W> {
     limits: Limits,
-    /// Those without a picture.
+    /// Workers without a view at the moment.
     free: Mutex<Vec<W>>,
 }
 
 impl<W: Send> Workers<W> {
-    /// Nothing seen yet.
+    /// Creates an empty set of workers.
     pub(crate) fn new(limits: Limits) -> Self {
         Workers { limits, free: Mutex::default() }
     }
 
-    /// Shows all of `pictures`, each to any one of the workers.
+    /// Passes each of `pictures` to one of the workers.
+    ///
+    /// # Errors
+    /// Frames that cannot be read.
     pub(crate) fn show(
         &mut self,
         subject: Subject<'_>,
         cameras: &[Camera],
         pictures: &[Picture],
         new_worker: impl Fn() -> W + Sync,
-        see: impl Fn(&mut W, &Gaussians, &Camera) + Sync,
+        visit: impl Fn(&mut W, &Gaussians, &Camera) + Sync,
     ) -> Result<()> {
         let workers = rayon::current_num_threads().min(self.limits.pictures_together);
-        show([subject], cameras, pictures, Batch::to_look(&self.limits), |views| {
+        show([subject], cameras, pictures, Batch::many_views(&self.limits), |views| {
             let next = AtomicUsize::new(0);
             (0..workers.min(views.len())).into_par_iter().with_max_len(1).for_each(|_| {
                 let free = self.free.lock().unwrap_or_else(PoisonError::into_inner).pop();
@@ -247,7 +252,7 @@ impl<W: Send> Workers<W> {
                 while let Some(&ViewStates { camera, states: [state], .. }) =
                     views.get(next.fetch_add(1, Ordering::Relaxed))
                 {
-                    see(&mut worker, state, camera);
+                    visit(&mut worker, state, camera);
                 }
                 self.free.lock().unwrap_or_else(PoisonError::into_inner).push(worker);
             });
@@ -255,7 +260,8 @@ impl<W: Send> Workers<W> {
         })
     }
 
-    /// The workers, in no order: fold them by what does not depend on it.
+    /// Returns the workers in no particular order; their results must be combined in a way that does not depend on the
+    /// order.
     pub(crate) fn into_inner(self) -> Vec<W> {
         self.free.into_inner().unwrap_or_else(PoisonError::into_inner)
     }
@@ -267,24 +273,24 @@ mod tests {
     use crate::diagnostics::demo_scene::Scene;
     use crate::passes::gather_all;
 
-    /// `views` pictures of every frame of `frames`.
+    /// Returns `views` views of every frame of `frames`.
     fn pictures(frames: &[usize], views: u32) -> Vec<Picture> {
         let of_frame = |&frame: &usize| (0..views).map(move |view| Picture { frame, view, camera: view });
         frames.iter().flat_map(of_frame).collect()
     }
 
     #[test]
-    fn every_picture_comes_once_in_order_with_the_states_of_its_frame_in_batches_of_any_size() {
+    fn every_view_comes_once_with_its_state_for_any_batch_size() {
         let scene = Scene::new(1500, 9);
         let rig = scene.rig();
         let all = pictures(&[0, 2, 3, 7, 8], 3);
         let expected: Vec<Gaussians> = (0..9).map(|frame| gather_all(&scene, frame, Columns::all()).unwrap()).collect();
-        for (frames, most) in [(1, 1), (1, 2), (1, 9), (2, 4), (3, 7), (9, 99), (0, 0)] {
+        for (frames, max_batch) in [(1, 1), (1, 2), (1, 9), (2, 4), (3, 7), (9, 99), (0, 0)] {
             let mut seen = Vec::new();
-            let batch = Batch { frames, pictures: most, held: 4 };
+            let batch = Batch { frames, pictures: max_batch, held: 4 };
             let position = Subject { source: &scene, ids: None, columns: Columns::POSITION };
             show([Subject::all(&scene), position], &rig.cameras, &all, batch, |views| {
-                assert!(views.len() <= most.max(1), "{} pictures of at most {most}", views.len());
+                assert!(views.len() <= max_batch.max(1), "{} pictures of at most {max_batch}", views.len());
                 let of_frames = views.chunk_by(|a, b| a.picture.frame == b.picture.frame).count();
                 assert!(of_frames <= frames.max(1), "{of_frames} frames of at most {frames}");
                 for ViewStates { picture, camera, states: [state, places], .. } in views {
@@ -296,14 +302,14 @@ mod tests {
                 Ok(())
             })
             .unwrap();
-            assert_eq!(seen, all, "{frames} frames, {most} pictures");
+            assert_eq!(seen, all, "{frames} frames, {max_batch} pictures");
         }
     }
 
-    /// A scene whose Gaussians have features, and whose colors are the rays that pixels are seen along.
-    struct Rays(Scene);
+    /// Scene whose Gaussians have features and whose pixel colors are the rays through the pixels.
+    struct RayScene(Scene);
 
-    impl FrameSource for Rays {
+    impl FrameSource for RayScene {
         fn info(&self) -> &crate::model::SequenceInfo {
             self.0.info()
         }
@@ -317,7 +323,7 @@ mod tests {
         }
     }
 
-    impl FeatureDecoder for Rays {
+    impl FeatureDecoder for RayScene {
         fn features(&self, frame: usize, out: &mut Column) -> Result<()> {
             *out = Column::zeros(2, self.info().count);
             out.plane_mut(1).fill(frame as f32);
@@ -331,8 +337,8 @@ mod tests {
     }
 
     #[test]
-    fn features_are_decoded_along_the_ray_of_each_pixel_and_only_where_all_gaussians_are_looked_at() {
-        let scene = Rays(Scene::new(200, 3));
+    fn features_are_decoded_along_the_ray_of_each_pixel() {
+        let scene = RayScene(Scene::new(200, 3));
         let rig = scene.0.rig();
         let some: Vec<u32> = (0..200).collect();
         let batch = Batch { frames: 2, pictures: 4, held: 4 };
@@ -344,7 +350,7 @@ mod tests {
                 for (at, color) in image.data.as_chunks::<3>().0.iter().enumerate() {
                     let seen = DVec3::from(color.map(f64::from));
                     assert!(((seen - camera.center()).length() - 1.0).abs() < 1e-5);
-                    // Where the camera sees that point is the middle of the pixel.
+                    // The camera sees that point at the center of the pixel.
                     let point = camera.rotation * seen + camera.translation;
                     let found = [camera.fx * point.x / point.z + camera.cx, camera.fy * point.y / point.z + camera.cy];
                     let pixel = [at % camera.width as usize, at / camera.width as usize];
@@ -358,7 +364,7 @@ mod tests {
     }
 
     #[test]
-    fn a_state_is_read_once_however_many_batches_its_pictures_make_up() {
+    fn each_state_is_read_once_for_any_number_of_batches() {
         let scene = Scene::new(300, 6);
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("scene.gseq");

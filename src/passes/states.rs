@@ -1,19 +1,19 @@
-//! The states of all Gaussians of a source, frame after frame.
+//! States of all Gaussians of a source at one frame after the other.
 
 use super::frames::open_all;
 use crate::error::Result;
 use crate::model::{Columns, Gaussians};
 use crate::source::{BlockReader, FrameSource, ReadPlan};
 
-/// All columns of all Gaussians at one frame after the other; what does not vary is read once.
+/// Reader of all columns of all Gaussians at one frame after the other. Columns that do not vary are read once.
 ///
-/// Memory: one state, and what [`open_all`] takes.
+/// Memory: one state, and that of [`open_all`].
 pub struct States<'a> {
     reader: Box<dyn BlockReader + 'a>,
     varying: Columns,
     /// Columns to read next.
-    unknown: Columns,
-    now: Gaussians,
+    unread: Columns,
+    current: Gaussians,
 }
 
 impl<'a> States<'a> {
@@ -26,24 +26,21 @@ impl<'a> States<'a> {
         Ok(States {
             reader: open_all(source, Columns::all(), wanted)?,
             varying: info.varying,
-            unknown: Columns::all(),
-            now: Gaussians::zeros(0, info.sh_degree),
+            unread: Columns::all(),
+            current: Gaussians::zeros(0, info.sh_degree),
         })
     }
 
-    /// The state at `frame`.
-    ///
-    /// # Errors
-    /// A frame that cannot be read.
+    /// Returns the state at `frame`.
     pub fn at(&mut self, frame: usize) -> Result<&Gaussians> {
-        self.reader.read(frame, self.unknown, &mut self.now)?;
-        self.unknown = self.varying;
-        Ok(&self.now)
+        self.reader.read(frame, self.unread, &mut self.current)?;
+        self.unread = self.varying;
+        Ok(&self.current)
     }
 
-    /// The state at the frame asked for last; of none no Gaussians.
-    pub fn now(&self) -> &Gaussians {
-        &self.now
+    /// Returns the state of the last frame read; without Gaussians if none was read.
+    pub fn current(&self) -> &Gaussians {
+        &self.current
     }
 }
 
@@ -55,7 +52,7 @@ mod tests {
     use crate::passes::gather_all;
 
     #[test]
-    fn states_are_those_of_single_reads_and_constant_tiles_are_decoded_once() {
+    fn states_equal_single_reads_with_constant_tiles_read_once() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("scene.gseq");
         let scene = crate::diagnostics::demo_scene::Scene::new(1500, 40);
@@ -65,12 +62,13 @@ mod tests {
         assert!(!constant.is_empty(), "the scene has no constant column to tell by");
         let frames = [0, 3, 31, 32, 39];
         let mut states = States::open(&container, &ReadPlan::new(frames)).unwrap();
-        assert!(states.now().is_empty());
+        assert!(states.current().is_empty());
         for frame in frames {
             let expected = gather_all(&scene, frame, Columns::all()).unwrap();
-            assert!(*states.at(frame).unwrap() == expected && *states.now() == expected, "frame {frame}");
+            assert!(*states.at(frame).unwrap() == expected && *states.current() == expected, "frame {frame}");
         }
-        // Two blocks of Gaussians; a tile of each varying column for both blocks of frames.
+        // The file has two blocks of Gaussians, and each varying column has one tile per block of Gaussians and block
+        // of frames.
         let varying = container.info().varying.iter().count() as u64;
         assert_eq!(container.reads().tiles, 2 * (constant.iter().count() as u64 + 2 * varying));
     }

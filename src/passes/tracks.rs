@@ -1,4 +1,4 @@
-//! Every Gaussian along all frames, a block of them at a time on every thread.
+//! Passes over Gaussians with all frames of each: a block of Gaussians at a time on every thread.
 
 use std::ops::Range;
 
@@ -10,15 +10,13 @@ use crate::model::{Columns, Gaussians};
 use crate::progress::Progress;
 use crate::source::{FrameSource, Ids};
 
-/// Gaussians that a thread holds along all frames.
+/// Number of Gaussians of which a thread holds all frames.
 pub const TRACKED: usize = 64;
 
-/// What `make` makes of every Gaussian's track, in order; its frames are at `times`, of whatever clock.
+/// Calls `make` with the track of every Gaussian and returns the results in order. The frames of a track are at
+/// `times`, in any unit of time.
 ///
-/// Memory: what is made, and for every thread a reader and all states of [`TRACKED`] Gaussians.
-///
-/// # Errors
-/// Frames that cannot be read.
+/// Memory: the results, and for every thread a reader and all states of [`TRACKED`] Gaussians.
 pub fn tracks<R: Send>(
     source: &dyn FrameSource,
     times: &[f64],
@@ -26,12 +24,12 @@ pub fn tracks<R: Send>(
     make: impl Fn(&FittedTrack) -> R + Sync,
 ) -> Result<Vec<R>> {
     let info = source.info();
-    let of_block = |ids: Range<usize>| -> Result<Vec<R>> {
+    let tracks_of_block = |ids: Range<usize>| -> Result<Vec<R>> {
         let mut reader = source.open(Ids::Range(ids.clone()))?;
         let mut states: Vec<Gaussians> = Vec::with_capacity(info.times.len());
         let mut want = Columns::all();
         for frame in 0..info.times.len() {
-            // What does not vary is what it was.
+            // Columns that do not vary keep the values of the previous frame.
             let mut state = states.last().cloned().unwrap_or_else(|| Gaussians::zeros(0, info.sh_degree));
             reader.read(frame, want, &mut state)?;
             want = info.varying;
@@ -42,7 +40,7 @@ pub fn tracks<R: Send>(
     };
     let blocks: Vec<Vec<R>> = (0..info.count.div_ceil(TRACKED))
         .into_par_iter()
-        .map(|block| of_block(block * TRACKED..info.count.min((block + 1) * TRACKED)))
+        .map(|block| tracks_of_block(block * TRACKED..info.count.min((block + 1) * TRACKED)))
         .collect::<Result<_>>()?;
     Ok(blocks.into_iter().flatten().collect())
 }
@@ -55,7 +53,7 @@ mod tests {
     use crate::passes::gather_all;
 
     #[test]
-    fn tracks_are_what_frames_say_whatever_the_number_of_threads() {
+    fn tracks_equal_the_frames_for_any_thread_count() {
         let scene = Scene::new(3 * TRACKED + 5, 7);
         let progress = Progress::IGNORED;
         let all = |threads: usize| {

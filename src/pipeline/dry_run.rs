@@ -1,4 +1,4 @@
-//! A dry run: what a run would do, take and write, found by opening the input and by a calibration alone.
+//! Dry run: reports what a run would do, cost and write. It only opens the input and runs a short calibration.
 
 use std::fmt::Write as _;
 use std::path::Path;
@@ -21,55 +21,56 @@ use crate::pipeline::stages::write::beside_names;
 use crate::pipeline::throughput::forecast;
 use crate::scene::{InputOptions, open_scene};
 
-/// What a run would do.
+/// Report of a dry run.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Foreseen {
     /// Program and version.
     pub tool: String,
-    /// Always true: this is no summary of a run.
+    /// Always true; tells this report from the summary of a run.
     pub dry_run: bool,
-    /// The input's path as given.
+    /// Path of the input as given.
     pub path: String,
-    /// "4DGaussians model", "PLY sequence", ...
+    /// Kind of the input: "4DGaussians model", "PLY sequence", ...
     pub kind: String,
-    /// Gaussians of the input.
+    /// Number of Gaussians of the input.
     pub gaussians_in: usize,
-    /// Its frames.
+    /// Number of frames of the input.
     pub frames: usize,
-    /// Degree of its spherical harmonics.
+    /// SH degree of the input.
     pub sh_degree: usize,
     /// Bytes of the input.
     pub bytes: u64,
-    /// From where it would be looked at.
+    /// Cameras whose views would be rendered.
     pub cameras: CameraSummary,
-    /// Gaussians in the output, where they are known before; else pictures decide.
+    /// Number of Gaussians in the output, if it is known in advance; otherwise renders decide.
     pub gaussians: Option<usize>,
-    /// What decides how many.
+    /// Rule that determines the number of Gaussians.
     pub size_by: String,
-    /// How many Gaussians ranking and refinement would leave.
+    /// Numbers of Gaussians that ranking and refinement would leave, as text.
     pub counts: String,
-    /// Where the result would lie.
+    /// Path of the output.
     pub output: String,
-    /// Its kind.
+    /// Kind of the output.
     pub output_kind: OutputKind,
-    /// What would lie there: the result, and the files in or beside it.
+    /// Paths that would be written: the output, and the files in or beside it.
     pub would_write: Vec<String>,
-    /// What it would take.
+    /// Expected time and memory.
     pub forecast: Forecast,
-    /// What would not be done, and why.
+    /// Stages that would be omitted, with reasons.
     pub left_out: Vec<LeftOut>,
-    /// Things a person should know.
+    /// Notes for the user.
     pub notes: Vec<String>,
 }
 
-/// What a run would do, without doing it: the input is opened, and some pictures of it are made to measure by.
+/// Returns the report of a dry run of `request`. Opens the input and renders a few views to calibrate time estimates.
 ///
 /// # Errors
-/// Those that a run would end with before its first stage. A stream, of which nothing is known before it has passed.
+/// Fails where a run would fail before its first stage. Also fails for a stream, whose size is unknown before it has
+/// arrived completely.
 pub fn foresee(request: &Request) -> Result<Foreseen> {
     if request.input.is_stream() {
         return Err(Error::usage(
-            "--dry-run: what a stream would take shows only once it has passed\n  give a file or folder; --explain says \
+            "--dry-run: the cost of a stream is known only after it has ended\n  give a file or folder; --explain says \
              how many frames there is memory for",
         ));
     }
@@ -111,26 +112,30 @@ pub fn foresee(request: &Request) -> Result<Foreseen> {
     })
 }
 
-/// What decides how many Gaussians stay.
+/// Returns a text that tells how the number of Gaussians in the output is determined.
 fn size_by(request: &Request) -> String {
     match (&request.goal, &request.target) {
-        (Some(Goal::Quality(Quality::Psnr(least))), _) => format!("the fewest with pictures of {least} dB"),
-        (Some(Goal::Quality(_)), _) => "the fewest that lose no more against the photographs".to_owned(),
-        (Some(Goal::Bytes(most)), _) => format!("the best in {most} bytes"),
-        (None, Some(_)) => "as asked for".to_owned(),
-        (None, None) => "what the recipe keeps, which pictures decide".to_owned(),
+        (Some(Goal::Quality(Quality::Psnr(least))), _) => {
+            format!("the smallest number with {least} dB PSNR against the original, found by a search")
+        }
+        (Some(Goal::Quality(Quality::Loss { most, .. })), _) => {
+            format!("the smallest number that loses at most {most} dB PSNR against the photographs, found by a search")
+        }
+        (Some(Goal::Bytes(most)), _) => format!("as many as fit {most} bytes"),
+        (None, Some(_)) => "as requested".to_owned(),
+        (None, None) => "as many as pass the thresholds of the recipe, known only after scoring".to_owned(),
     }
 }
 
 impl Foreseen {
-    /// As JSON, for programs.
+    /// Returns the report as JSON, for programs.
     pub fn json(&self) -> String {
         let mut text = serde_json::to_string_pretty(self).expect("plain data");
         text.push('\n');
         text
     }
 
-    /// For a person.
+    /// Returns the report as text for display.
     pub fn text(&self) -> String {
         let mut out = String::new();
         // Writing to a String cannot fail.
@@ -144,7 +149,7 @@ impl Foreseen {
             self.sh_degree
         );
         let CameraSummary { origin, cameras, pairs } = &self.cameras;
-        let _ = writeln!(out, "cameras: {origin} ({cameras} cameras, {pairs} pictures)");
+        let _ = writeln!(out, "cameras: {origin} ({cameras} cameras, {pairs} views)");
         let _ = match self.gaussians {
             Some(count) => {
                 let percent = 100.0 * count as f64 / self.gaussians_in.max(1) as f64;
@@ -153,9 +158,9 @@ impl Foreseen {
             None => writeln!(out, "would keep {}", self.size_by),
         };
         let _ = writeln!(out, "{}", self.counts);
-        let of: f64 = self.forecast.stages.iter().map(|stage| stage.core_seconds).sum();
+        let core_seconds: f64 = self.forecast.stages.iter().map(|stage| stage.core_seconds).sum();
         for stage in &self.forecast.stages {
-            let part = 100.0 * stage.core_seconds / of.max(1e-9);
+            let part = 100.0 * stage.core_seconds / core_seconds.max(1e-9);
             let _ = writeln!(out, "  {:<8} {part:>3.0}% of the time", stage.name);
         }
         for left in &self.left_out {

@@ -1,15 +1,18 @@
-//! What the user knows better than the scores: Gaussians to keep or to drop.
+//! Parser for lists of ids of Gaussians that the user keeps or drops.
 
 use std::path::Path;
 
 use crate::error::{Error, Result, quoted};
 use crate::files::text::read_text;
 
-/// Maximum number of bytes of a file of ids: four million ids take as many.
+/// Maximum number of bytes of a file of ids; enough for four million ids.
 const MAX_LIST: u64 = 32 << 20;
 
-/// Ids and ranges from a file, where `#` begins a comment, or from a list such as `3,10-20`, with commas, blanks or lines
-/// between; increasing, without repetition. Every id is below `count`.
+/// Reads ids and ranges from a file, where `#` begins a comment, or from a list such as `3,10-20`. Commas, blanks or
+/// line ends separate them. Returns the ids in increasing order without repetition.
+///
+/// # Errors
+/// Fails if a word is no id or range, if a range is reversed, or if an id is not below `count`.
 pub(super) fn parse_ids(spec: &str, count: usize) -> Result<Vec<u32>> {
     let is_list = spec.chars().all(|c| c.is_ascii_digit() || matches!(c, ',' | '-') || c.is_ascii_whitespace());
     let (text, origin) = if is_list {
@@ -23,7 +26,7 @@ pub(super) fn parse_ids(spec: &str, count: usize) -> Result<Vec<u32>> {
             Error::usage(format!("{origin}, line {}: expected {expected}, found {}", number + 1, quoted(found)))
         };
         let line = line.split('#').next().unwrap_or("");
-        // Blanks around its hyphen belong to a range.
+        // A range may have blanks around its hyphen.
         let line = line.split('-').map(str::trim).collect::<Vec<_>>().join("-");
         for word in line.split([',', ' ', '\t']).filter(|word| !word.is_empty()) {
             let bounds = match word.split_once('-') {
@@ -66,15 +69,15 @@ mod tests {
     }
 
     #[test]
-    fn a_range_that_runs_backwards_is_named_as_one() {
+    fn reversed_range_is_reported_with_its_correction() {
         let message = parse_ids("3,10-5", 20).unwrap_err().to_string();
         assert!(message.contains("runs forwards, such as 5-10") && message.contains("\"10-5\""), "{message}");
-        // Also beyond the last: what is wrong first is said first.
+        // A range that is both reversed and too high is reported as reversed first.
         assert!(parse_ids("100-5", 20).unwrap_err().to_string().contains("5-100"));
     }
 
     #[test]
-    fn ids_that_do_not_exist_are_refused_with_their_line() {
+    fn ids_out_of_range_are_reported_with_their_line() {
         for spec in ["20", "5-3", "1-99", "4294967296"] {
             let message = parse_ids(spec, 20).unwrap_err().to_string();
             assert!(message.contains("line 1") && message.contains(spec), "{message}");

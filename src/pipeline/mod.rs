@@ -1,7 +1,7 @@
-//! The main job: scan, score, rank, prune, merge, refine, write.
+//! The pipeline of a compression: scan, score, rank, prune, merge, refine, write.
 //!
-//! A request is turned into a [`RunPlan`], once, before any work: the stages of [`stages::STAGES`] that it needs, in their
-//! order. [`run_stages`] runs them.
+//! A request is turned into a [`RunPlan`] once, before any work. The plan lists the stages of [`stages::STAGES`] that
+//! the request needs, in their order. [`run_stages`] runs them.
 
 pub mod dry_run;
 mod ids;
@@ -39,10 +39,10 @@ use stage::{Measured, Phase, RunState};
 use stages::measure::Measure;
 use summary::{InputSummary, Summary};
 
-/// Writes a smaller model and says what was done.
+/// Compresses the input of `request`, writes the result and returns its summary.
 ///
 /// # Errors
-/// Whatever is wrong with input, cameras, recipe or output. Nothing is left behind then.
+/// Fails if the input, the cameras, the recipe or the output is invalid. An error leaves no output behind.
 pub fn compress(request: &Request) -> Result<Completion<Summary>> {
     Completion::from_result(compress_whole(request))
 }
@@ -58,20 +58,21 @@ fn compress_whole(request: &Request) -> Result<Summary> {
     Ok(run_stages(&scene, &plan, arrived, request, journal)?.0)
 }
 
-/// [`compress`] of a scene that is open already; also gives every Gaussian's place in the output.
+/// Compresses a scene that is already open, like [`compress`]. Returns the summary and the index of every input
+/// Gaussian in the output.
 ///
 /// # Errors
-/// Those of [`compress`].
+/// See [`compress`].
 pub fn compress_scene(scene: &Scene, request: &Request) -> Result<(Summary, Vec<Option<u32>>)> {
     let plan = RunPlan::within_memory(request, InputMeta::from_scene(scene), &scene.workload())?;
     plan.check_target(&scene.path)?;
     run_stages(scene, &plan, None, request, Journal::default())
 }
 
-/// The stages of a run that can be divided among several, in order, with what their parts are made of.
+/// Returns the stages of a run that can be divided among several processes, in order, with their units of work.
 ///
 /// # Errors
-/// Those of opening the input; nothing else is read.
+/// Fails if the input cannot be opened. Reads nothing else.
 pub fn divided_stages(request: &Request) -> Result<Vec<String>> {
     let plan = |input, work: &Workload| RunPlan::within_memory(request, input, work);
     let memory = Budget { tell: Verbosity::Nothing, ..request.input.memory };
@@ -80,24 +81,24 @@ pub fn divided_stages(request: &Request) -> Result<Vec<String>> {
     Ok(plan.shardable_units(&scene))
 }
 
-/// Gives a scene that is open already the limits by which the request's budget holds.
+/// Sets the limits of a scene that is already open so that the request stays within its memory budget.
 ///
 /// # Errors
-/// A budget that cannot work, and those of [`RunPlan::new`].
+/// Fails if the budget is too small, and where [`RunPlan::new`] fails.
 pub fn keep_to_budget(scene: &mut Scene, request: &Request) -> Result<()> {
     let plan = RunPlan::within_memory(request, InputMeta::from_scene(scene), &scene.workload())?;
     scene.keep_to(request.input.memory, |work, limits| plan.estimates(work, limits))
 }
 
-/// Measures a scene, scores and selects, as `recipe` has it.
+/// Measures a scene, scores its Gaussians and selects survivors with the parameters of `recipe`.
 ///
 /// # Errors
-/// Whatever is wrong with the frames.
+/// Fails if frames cannot be read or their times cannot be scanned.
 pub fn score_scene(scene: &Scene, recipe: &Recipe, user: &UserOverrides) -> Result<Scored> {
     Measure::new(recipe, scene.has_cameras, user.clone()).measure(scene, None, &mut Journal::default())
 }
 
-/// Runs the stages of `plan`, one after the other. Returns the summary, and where each Gaussian of the input is in the
+/// Runs the stages of `plan`, one after the other. Returns the summary and the index of every input Gaussian in the
 /// output.
 fn run_stages(
     scene: &Scene,
@@ -128,7 +129,7 @@ fn run_stages(
         None => plan.stages.run(Phase::Reduce, &mut run)?,
     }
     let scored = run.scored()?;
-    // Of nothing nothing stays, which is right.
+    // An empty input may give an empty output; losing every Gaussian of a non-empty input is an error.
     if run.result.is_empty() && scored.count() > 0 {
         return Err(nothing_left(scene, &scored));
     }
@@ -139,7 +140,7 @@ fn run_stages(
     run.written.ok_or_else(|| Error::internal("no stage of the plan wrote a result"))
 }
 
-/// Returns the text of `recipe.toml` beside the result of an input with the digest `own`, and notes where the recipe was
+/// Returns the text of `recipe.toml` beside the result of an input with the digest `own`. Adds a note if the recipe was
 /// made for another input.
 fn recipe_text(own: &str, plan: &RunPlan, request: &Request, journal: &mut Journal) -> String {
     if let Some(other) = request.made_for.as_ref().filter(|digest| *digest != own) {
@@ -149,7 +150,7 @@ fn recipe_text(own: &str, plan: &RunPlan, request: &Request, journal: &mut Journ
     RecipeRecord::new(request, &plan.measure.score.user, own.to_owned()).text(request, &folder)
 }
 
-/// That no Gaussian is left: nothing renders such a result.
+/// Returns the error for a result without any Gaussian: nothing could render it.
 fn nothing_left(scene: &Scene, scored: &Scored) -> Error {
     let all = scored.count();
     let dropped = scored.selection.counts.forced_drop;
@@ -158,7 +159,7 @@ fn nothing_left(scene: &Scene, scored: &Scored) -> Error {
         _ => format!("none of {all}, {dropped} of which --drop-ids or --non-finite drops"),
     };
     Error::input(&scene.path, "", "at least one Gaussian that stays", found)
-        .hint("nothing was written: drop fewer, or ask for a size with --target-ratio")
+        .hint("nothing was written: drop fewer, or ask for a size with --ratio")
 }
 
 #[cfg(test)]
@@ -170,7 +171,7 @@ pub(crate) mod tests {
     use crate::models::MemoryProfile;
     use crate::outputs::container::{FRAME_BLOCK, write_container};
 
-    /// A small dynamic scene with its cameras.
+    /// Writes a small dynamic demo scene with cameras and opens it.
     pub(crate) fn scene(folder: &std::path::Path) -> Scene {
         let made = demo_scene::Scene::new(1500, 6);
         let path = folder.join("scene.gseq");
@@ -184,7 +185,7 @@ pub(crate) mod tests {
         super::score_scene(scene, recipe, user).unwrap()
     }
 
-    /// A container of `gaussians` Gaussians in 600 frames of two views.
+    /// Returns the workload of a container with `gaussians` Gaussians and 600 frames of two views.
     pub(crate) fn work(gaussians: u64) -> Workload {
         let info = SequenceInfo {
             count: gaussians as usize,

@@ -1,11 +1,11 @@
-//! Opening a scene that is to be measured; a stream is measured as it arrives, so that it is read once.
+//! Opens a scene for measuring. A stream is measured while it arrives, so that it is read only once.
 //!
-//! Memory of a stream: what packing it takes ([`crate::models::stream`]) and, when measuring, the accumulators of all
-//! Gaussians ([`crate::statistics::BYTES_PER_GAUSSIAN`] each) and what [`RunningContribution`] needs.
+//! Memory of a stream: packing ([`crate::models::stream`]) and, when measuring, the accumulators of all Gaussians
+//! ([`crate::statistics::BYTES_PER_GAUSSIAN`] each) and the memory of [`RunningContribution`].
 //!
-//! What only the end of the stream tells (time span, number of frames) is assumed meanwhile: even frames, and
-//! pictures taken at exactly the times that arrive. Where that proves wrong the packed frames are
-//! measured instead: the result is the same either way.
+//! The time span and the number of frames are known only at the end of the stream. Until then evenly spaced frames are
+//! assumed, and views whose times equal those of the frames. If an assumption proves wrong, the packed frames are
+//! measured instead; the result is the same in both cases.
 
 use std::cell::OnceCell;
 use std::io::Stdin;
@@ -38,11 +38,13 @@ use crate::source::{FrameSource, Reads};
 use crate::statistics::ScanPlan;
 use crate::statistics::pass::RunningScan;
 
-/// Opens a scene to be measured, with the limits of its budget; `plan` says what is to be done with such a scene. A
-/// stream is measured as it arrives, see [`receive_measured`]; the statistics come back then.
+/// Opens a scene for measuring and sets its limits within the memory budget. `plan` makes the plan of the run from
+/// facts about the scene. A stream is measured while it arrives, see [`receive_measured`]; then the statistics are
+/// returned, too.
 ///
 /// # Errors
-/// Whatever is wrong with input, cameras or budget; those of `plan`, before any frame of a stream is read.
+/// Fails if the input, the cameras or the budget is invalid, and if `plan` fails, which happens before any frame of a
+/// stream is read.
 pub fn open_to_measure(
     options: &InputOptions,
     plan: impl FnOnce(InputMeta, &Workload) -> Result<RunPlan>,
@@ -66,15 +68,15 @@ pub fn open_to_measure(
     let plan =
         Plan::fit(scene.workload(), options.memory, &options.events, |work, limits| stages.estimates(work, limits))?;
     scene.follow(&plan);
-    // What measuring beforehand reads is no part of the plan.
+    // Reads of the calibration are not part of the plan, so they are counted before it.
     let reads = scene.source().reads();
-    foretell(&mut scene, &plan, &stages, MeasuredOnArrival::default(), options, journal)?;
+    send_forecast(&mut scene, &plan, &stages, MeasuredOnArrival::default(), options, journal)?;
     journal.opened("read", start, scene.source().info().count, reads);
     Ok((scene, stages, None))
 }
 
-/// Says what is to come, if anybody asked.
-fn foretell(
+/// Sends the plan and the time forecast as messages, if the user asked for them.
+fn send_forecast(
     scene: &mut Scene,
     plan: &Plan,
     stages: &RunPlan,
@@ -83,7 +85,7 @@ fn foretell(
     journal: &mut Journal,
 ) -> Result<()> {
     let tell = options.memory.tell;
-    // Of a part nobody knows how much of the run it is.
+    // A shard cannot tell which fraction of the run it does, so it has no forecast.
     let is_part = options.work.as_ref().is_some_and(|work| work.part.is_some());
     if tell == Verbosity::Plan && stages.output.is_some() {
         options.events.send(Message::Plan(&stages.text()));
@@ -96,8 +98,8 @@ fn foretell(
     Ok(())
 }
 
-/// Packs a stream that `loaded` looks at into a scratch container and measures it meanwhile, if there is memory for that
-/// beside the frames held. Gives the statistics if what was assumed held.
+/// Packs a stream into a scratch container. Measures it meanwhile if memory suffices beside the frames held. `loaded`
+/// is the rig of the user's cameras, if any. Returns the statistics if the assumptions about the stream proved right.
 fn receive_measured(
     stream: FrameStream<Stdin>,
     loaded: Option<Rig>,
@@ -107,10 +109,10 @@ fn receive_measured(
 ) -> Result<(Scene, RunPlan, Option<Measured>)> {
     let has_cameras = loaded.is_some();
     let count = stream.header().count;
-    let of_rig = loaded.clone().unwrap_or_else(|| cameras::virtual_rig(DVec3::ZERO, 1.0));
+    let assumed_rig = loaded.clone().unwrap_or_else(|| cameras::virtual_rig(DVec3::ZERO, 1.0));
     let block = frame_block(stream.header());
     let header = *stream.header();
-    let counting = |frames| Workload::of_stream(&header, block, &of_rig, frames);
+    let counting = |frames| Workload::of_stream(&header, block, &assumed_rig, frames);
     let work = counting(0);
     let stages = plan(InputMeta { gaussians: count, has_cameras, own_output: OWN_OUTPUT }, &work)?;
     let Measure { scan, visible, .. } = &stages.measure;
@@ -125,35 +127,26 @@ fn receive_measured(
     };
     let measures = fit(Verbosity::Nothing, Some(visible.is_some())).is_ok();
     let memory = fit(options.memory.tell, measures.then_some(visible.is_some()))?;
-    if options.memory.tell == Verbosity::Time {
-        let text = format!("memory: at most {}; nobody knows how many frames will arrive", size(memory.peak()));
-        options.events.send(Message::Plan(&text));
-    }
     let receive = |budget: u64, measuring: Option<bool>, frames: u64| {
         let limits = memory.limits;
         Plan::closest(work, budget, |work, _| vec![receiving(work, &limits, held, measuring, frames)]).peak()
     };
-    let mut room = FrameQuota::new(options.memory, |budget, frames| {
+    let mut quota = FrameQuota::new(options.memory, |budget, frames| {
         let later = Plan::closest(counting(frames), budget, |work, limits| stages.estimates(work, limits));
         later.peak().max(receive(budget, None, frames))
     });
     let to_measure =
         FrameQuota::new(options.memory, |budget, frames| receive(budget, Some(visible.is_some()), frames)).most;
-    if options.memory.tell == Verbosity::Plan {
-        let most = room.most;
-        let text =
-            format!("frames: at most {most} fit the memory limit; up to {to_measure} are measured while they arrive");
-        options.events.send(Message::Plan(&text));
-    }
-    // Without cameras the rig stands around the first frame, and everything else around the rig.
+    announce_limits(options, memory.peak(), quota.most, to_measure);
+    // Without cameras the virtual rig is placed around the first frame; the plan of the scan follows from the rig.
     let (rig, plan_of_scan) = (OnceCell::new(), OnceCell::new());
     if let Some(loaded) = loaded {
         let _ = rig.set(loaded);
     }
     let mut measuring: Option<Measuring<'_>> = None;
     let streamed = Streamed::receive(stream, &options.scratch_folder(), &options.events, |held| {
-        room.admit(held.len())?;
-        if room.arrived() > to_measure {
+        quota.admit(held.len())?;
+        if quota.arrived() > to_measure {
             measuring = None;
             return Ok(());
         }
@@ -172,55 +165,78 @@ fn receive_measured(
     let rig_given = has_cameras.then(|| rig.get().cloned()).flatten();
     let opened = Opened { rig: rig_given, input: Box::new(streamed), notes: Vec::new() };
     let mut scene = scene_of(opened, options)?;
-    // Now that the frames are counted.
+    // The number of frames is known now.
     let counted = Budget { tell: Verbosity::Nothing, ..options.memory };
     let later = Plan::fit(scene.workload(), counted, &options.events, |work, limits| stages.estimates(work, limits))?;
     scene.follow(&later);
-    if measures && measuring.is_none() && room.arrived() > 0 {
+    if measures && measuring.is_none() && quota.arrived() > 0 {
         let note = format!(
-            "statistics were taken from the packed frames, not as they arrived: there is memory for {to_measure} that way"
+            "statistics were taken from the packed frames, not as they arrived: memory suffices \
+             for measuring {to_measure} of them on arrival"
         );
         scene.notes.push(note);
     }
-    let mut arrived = None;
-    if let Some(measuring) = measuring {
-        let complete = ScanPlan::new(&scan.recipe, &scene.source().info().times, &scene.schedule)?;
-        let found = match measuring.wrong(&complete, &scene) {
-            None => {
-                let found = measuring.finish(&complete);
-                // Frames were looked at with them before they turned out not to be finite.
-                match stages.measure.score.absent(&found.scanned.rows).is_empty() {
-                    true => Ok(found),
-                    false => Err("Gaussians with NaN or infinity are dropped from all frames"),
-                }
-            }
-            Some(why) => Err(why),
-        };
-        match found {
-            Ok(found) => arrived = Some(found),
-            Err(why) => {
-                let note = format!("statistics were taken from the packed frames, not as they arrived: {why}");
-                scene.notes.push(note);
-            }
-        }
-    }
+    let arrived = match measuring {
+        Some(measuring) => finish_measuring(measuring, &stages.measure, &mut scene)?,
+        None => None,
+    };
     let measured = arrived.as_ref().map(Measured::kinds).unwrap_or_default();
-    foretell(&mut scene, &later, &stages, measured, options, journal)?;
+    send_forecast(&mut scene, &later, &stages, measured, options, journal)?;
     Ok((scene, stages, arrived))
 }
 
-/// A virtual rig around the first of the frames.
+/// Sends the limits of a stream as a message, if the user asked for the plan or the forecast: the maximum memory `peak`,
+/// bytes, or the numbers of frames that fit the memory limit (`most`) and that are measured on arrival (`to_measure`).
+fn announce_limits(options: &InputOptions, peak: u64, most: u64, to_measure: u64) {
+    let text = match options.memory.tell {
+        Verbosity::Time => {
+            format!("memory: at most {}; the number of frames is unknown until the stream ends", size(peak))
+        }
+        Verbosity::Plan => {
+            format!("frames: at most {most} fit the memory limit; up to {to_measure} are measured while they arrive")
+        }
+        Verbosity::Nothing => return,
+    };
+    options.events.send(Message::Plan(&text));
+}
+
+/// Returns the statistics that were taken while the frames arrived. Returns `None` and adds a note to the scene if an
+/// assumption about the stream proved wrong.
+fn finish_measuring(measuring: Measuring<'_>, measure: &Measure, scene: &mut Scene) -> Result<Option<Measured>> {
+    let complete = ScanPlan::new(&measure.scan.recipe, &scene.source().info().times, &scene.schedule)?;
+    let found = match measuring.failed_assumption(&complete, scene) {
+        None => {
+            let found = measuring.finish(&complete);
+            // The frames were measured with these Gaussians before they proved not to be finite.
+            match measure.score.absent(&found.scanned.rows).is_empty() {
+                true => Ok(found),
+                false => Err("Gaussians with NaN or infinity are dropped from all frames"),
+            }
+        }
+        Some(why) => Err(why),
+    };
+    match found {
+        Ok(found) => Ok(Some(found)),
+        Err(why) => {
+            let note = format!("statistics were taken from the packed frames, not as they arrived: {why}");
+            scene.notes.push(note);
+            Ok(None)
+        }
+    }
+}
+
+/// Returns a virtual rig around the first of the held frames.
 fn rig_around(held: &HeldFrames) -> Rig {
     let bounds = RobustBox::from_positions(held.position(0));
     cameras::virtual_rig(bounds.middle, bounds.extent())
 }
 
-/// Statistics of the frames so far.
+/// Running statistics of the frames received so far.
 struct Measuring<'a> {
     plan: &'a ScanPlan,
     cameras: &'a [Camera],
     assumed: AssumedTimes<'a>,
-    /// Which cameras see the frames so far, as assumed.
+    /// Assignment of cameras to the frames so far, as assumed.
     schedule: Schedule,
     scan: RunningScan<'a>,
     seen: Option<(Sampler, RunningContribution)>,
@@ -259,8 +275,8 @@ impl<'a> Measuring<'a> {
         Ok(())
     }
 
-    /// What was assumed wrongly, if anything was.
-    fn wrong(&self, complete: &ScanPlan, scene: &Scene) -> Option<&'static str> {
+    /// Returns which assumption proved wrong, if any.
+    fn failed_assumption(&self, complete: &ScanPlan, scene: &Scene) -> Option<&'static str> {
         if !complete.finishes(self.plan) {
             return Some("the frames are not evenly spaced in time");
         }
@@ -272,11 +288,11 @@ impl<'a> Measuring<'a> {
     }
 }
 
-/// Which cameras see a frame, while the other frames are unknown: those whose pictures were taken at its very
-/// time, and those without a time.
+/// Cameras that see a frame, assigned while the other frames are still unknown: views taken at exactly the time of the
+/// frame, and views without a time.
 struct AssumedTimes<'a> {
     rig: &'a Rig,
-    /// Places in the rig of the pictures of the split, by time, then place.
+    /// (Time, index in the rig) of the views of the split that have a time, sorted by time, then index.
     timed: Vec<(f64, usize)>,
     timeless: Vec<usize>,
     tolerance: f64,
@@ -297,7 +313,7 @@ impl<'a> AssumedTimes<'a> {
         AssumedTimes { rig, timed, timeless, tolerance: rig.time_tolerance() }
     }
 
-    /// (View number, camera index) of the cameras that see a frame at `time`, in the order of the rig.
+    /// Returns (view number, camera index) of the cameras that see a frame at `time`, in the order of the rig.
     fn at(&self, time: f64) -> Vec<(u32, u32)> {
         let near = self.timed.partition_point(|&(other, _)| other < time - self.tolerance);
         let near = self.timed[near..].iter().take_while(|&&(other, _)| other <= time + self.tolerance);

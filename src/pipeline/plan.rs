@@ -1,5 +1,5 @@
-//! The plan of a run: its stages with their parameters, what is left out and why, and how many Gaussians ranking and
-//! refinement leave. Made in one place, before any work.
+//! The plan of a run: its stages with their parameters, the omitted stages and their reasons, and the numbers of
+//! Gaussians that ranking and refinement leave. It is made in one place, before any work.
 
 use std::path::Path;
 
@@ -20,17 +20,17 @@ use crate::pruning::visible::Visible;
 use crate::refinement::RefineStage;
 use crate::scene::Scene;
 
-/// The plan of a run.
+/// Plan of a run.
 pub struct RunPlan {
-    /// The stages in their order.
+    /// Stages in their order.
     pub(super) stages: StageList,
-    /// The stages that measure, by which a stream is measured as it arrives.
+    /// Stages that measure; a stream is measured by them while it arrives.
     pub measure: Measure,
-    /// What is written; none where only statistics are asked for.
+    /// Stage that writes the result; `None` if only statistics are wanted.
     pub output: Option<Emit>,
-    /// Repeats the stages of [`Phase::Reduce`] until a quality is reached.
+    /// Search that repeats the stages of [`Phase::Reduce`] until a quality is reached.
     pub search: Option<SearchStage>,
-    /// Exact number of Gaussians in the output, where it is asked for.
+    /// Exact number of Gaussians in the output, if requested.
     pub target: Option<usize>,
     gaussians: usize,
     merges: bool,
@@ -39,28 +39,30 @@ pub struct RunPlan {
 }
 
 impl RunPlan {
-    /// Returns the plan of a run that compresses as `request` says, whatever memory it takes.
+    /// Returns the plan of a compression by `request`, regardless of memory.
     ///
     /// # Errors
-    /// A recipe out of range; a target or ids that such an input does not have; options that exclude each other.
+    /// Fails if the recipe is out of range, if the input does not have the target count or the ids, or if options
+    /// exclude each other.
     pub fn new(request: &Request, input: InputMeta) -> Result<RunPlan> {
         RunPlan::with_fallback(request, input, MemoryFallback::Nothing, true)
     }
 
-    /// Returns the plan of a run that measures and scores.
+    /// Returns the plan of a run that only measures and scores.
     pub fn to_measure(measure: Measure, input: InputMeta) -> RunPlan {
         let mut plan = RunPlan::empty(measure.clone(), input.gaussians);
         plan.stages.add(Phase::Rank, measure);
         plan
     }
 
-    /// Returns the plan of a run within the memory limit of `request`. Where refinement does not fit, parameter deltas are
-    /// constant in time; else SH coefficients above degree 0 are not refined either; else nothing is refined. Where not even
-    /// that fits, the plan is the whole one, which is then refused with the smallest sufficient limit. The quality of the result is
-    /// measured if there is memory for this as well.
+    /// Returns the plan of a run within the memory limit of `request`. If full refinement does not fit, parameter
+    /// deltas are constant in time; if that does not fit, SH coefficients above degree 0 are not refined either; if
+    /// that does not fit, nothing is refined. If even this exceeds the limit, the full plan is returned; it is refused
+    /// later with the smallest sufficient limit. The quality of the
+    /// result is measured if there is memory for this as well.
     ///
     /// # Errors
-    /// Those of [`RunPlan::new`].
+    /// Fails where [`RunPlan::new`] fails.
     pub fn within_memory(request: &Request, input: InputMeta, work: &Workload) -> Result<RunPlan> {
         let fits =
             |plan: &RunPlan| Plan::fits(*work, request.input.memory, |work, limits| plan.estimates(work, limits));
@@ -78,22 +80,22 @@ impl RunPlan {
     ) -> Result<RunPlan> {
         let with = |fallback| RunPlan::with_fallback(request, input, fallback, false);
         let least = |plan: &RunPlan| Plan::closest(*work, 1, |work, limits| plan.estimates(work, limits)).peak();
-        let whole = with(MemoryFallback::Nothing)?;
-        if whole.refine.is_none() || fits(&whole) {
-            return Ok(whole);
+        let full_plan = with(MemoryFallback::Nothing)?;
+        if full_plan.refine.is_none() || fits(&full_plan) {
+            return Ok(full_plan);
         }
-        let of_whole = least(&whole);
-        let constant = with(MemoryFallback::ConstantInTime { required_bytes: of_whole })?;
-        let of_constant = least(&constant);
-        if of_constant < of_whole && fits(&constant) {
+        let full_bytes = least(&full_plan);
+        let constant = with(MemoryFallback::ConstantInTime { required_bytes: full_bytes })?;
+        let constant_bytes = least(&constant);
+        if constant_bytes < full_bytes && fits(&constant) {
             return Ok(constant);
         }
-        let low_degree = with(MemoryFallback::WithoutHarmonics { required_bytes: of_constant })?;
+        let low_degree = with(MemoryFallback::WithoutHarmonics { required_bytes: constant_bytes })?;
         if work.sh_degree > 0 && fits(&low_degree) {
             return Ok(low_degree);
         }
         let unrefined = with(MemoryFallback::WithoutRefinement { required_bytes: least(&low_degree) })?;
-        Ok(if fits(&unrefined) { unrefined } else { whole })
+        Ok(if fits(&unrefined) { unrefined } else { full_plan })
     }
 
     fn empty(measure: Measure, gaussians: usize) -> RunPlan {
@@ -124,14 +126,14 @@ impl RunPlan {
         let user =
             UserOverrides { keep: ids(&request.keep_ids)?, drop: ids(&request.drop_ids)?, keep_box: request.keep_box };
         let prunes = *only != Only::Merge;
-        let looks = Visible::from_recipe(&recipe.scan, input.has_cameras).is_some();
+        let renders_views = Visible::from_recipe(&recipe.scan, input.has_cameras).is_some();
         let mut planning = Planning {
             request,
             input,
             output,
             target,
             user,
-            looks,
+            renders_views,
             prunes,
             merges: false,
             refine: None,
@@ -145,7 +147,8 @@ impl RunPlan {
             MemoryFallback::WithoutHarmonics { .. } => Some(refine.without_course().without_bands()),
             MemoryFallback::WithoutRefinement { .. } => None,
         });
-        // Refinement gains more at a count than merging ever did; prune steps rank anew, whatever ranked before.
+        // At the same count refinement gains more quality than merging. Prune steps rank anew, so the order does not
+        // matter.
         let prunes_alone = *only == Only::Prune || request.goal.is_some() || (planning.refine.is_some() && prunes);
         planning.merges = !prunes_alone && !recipe.merge.passes.is_empty();
 
@@ -162,24 +165,24 @@ impl RunPlan {
         Ok(plan)
     }
 
-    /// Returns the estimates of all stages.
+    /// Returns the resource estimates of all stages.
     pub fn estimates(&self, work: &Workload, limits: &Limits) -> Vec<ResourceEstimate> {
         self.remaining_estimates(work, limits, MeasuredOnArrival::default())
     }
 
-    /// Returns the estimates of the stages that are still to run: those of a stream need not measure what was measured while it
-    /// arrived.
+    /// Returns the resource estimates of the stages that are still to run. They exclude statistics that were taken
+    /// while a stream arrived.
     pub fn remaining_estimates(
         &self,
         work: &Workload,
         limits: &Limits,
         measured: MeasuredOnArrival,
     ) -> Vec<ResourceEstimate> {
-        self.estimates_of(self.estimate_input(work, limits, measured), |_| true)
+        self.estimates_where(self.estimate_input(work, limits, measured), |_| true)
     }
 
-    /// Returns the estimates of the stages that are still to run, without those that may turn out to be unnecessary because
-    /// views hardly differ without a part `hardly_seen` of the Gaussians.
+    /// Returns the resource estimates of the stages that are still to run, without stages that may turn out to be
+    /// unnecessary because views hardly change when the fraction `hardly_seen` of the Gaussians is removed.
     pub fn shortest_estimates(
         &self,
         work: &Workload,
@@ -188,7 +191,7 @@ impl RunPlan {
         hardly_seen: f64,
     ) -> Vec<ResourceEstimate> {
         let input = self.estimate_input(work, limits, measured);
-        self.estimates_of(input, |stage| !stage.may_be_skipped(input, hardly_seen))
+        self.estimates_where(input, |stage| !stage.may_be_skipped(input, hardly_seen))
     }
 
     fn estimate_input<'a>(
@@ -201,33 +204,34 @@ impl RunPlan {
         EstimateInput { work, limits, left, measured }
     }
 
-    fn estimates_of(&self, input: EstimateInput<'_>, runs: impl Fn(&dyn Stage) -> bool) -> Vec<ResourceEstimate> {
-        let of = |phase: Phase| -> Vec<ResourceEstimate> {
+    fn estimates_where(&self, input: EstimateInput<'_>, runs: impl Fn(&dyn Stage) -> bool) -> Vec<ResourceEstimate> {
+        let phase_estimates = |phase: Phase| -> Vec<ResourceEstimate> {
             self.stages.in_phase(phase).filter(|stage| runs(*stage)).flat_map(|stage| stage.estimates(input)).collect()
         };
         let reduce = match &self.search {
-            Some(search) => vec![search.estimate(input, &of(Phase::Reduce))],
-            None => of(Phase::Reduce),
+            Some(search) => vec![search.estimate(input, &phase_estimates(Phase::Reduce))],
+            None => phase_estimates(Phase::Reduce),
         };
-        [of(Phase::Rank), reduce, of(Phase::Write)].concat()
+        [phase_estimates(Phase::Rank), reduce, phase_estimates(Phase::Write)].concat()
     }
 
-    /// Returns whether the amount of work depends on what stages find, so that time estimates are wide.
+    /// Returns whether the amount of work depends on results of stages, which widens the range of time estimates.
     pub fn is_open_ended(&self) -> bool {
         self.search.is_some() || self.stages.is_open_ended()
     }
 
-    /// Returns the stages that several processes can divide among themselves, as a work folder names them, with their units.
+    /// Returns the stages that several processes can divide among themselves, with their units of work. Stages have the
+    /// names under which the cache keeps them.
     pub fn shardable_units(&self, scene: &Scene) -> Vec<String> {
         self.stages.all().flat_map(|stage| stage.shardable_units(scene, &self.stages.counts)).collect()
     }
 
-    /// Returns how many Gaussians ranking and refinement leave, for a person.
+    /// Returns the numbers of Gaussians that ranking and refinement leave, as text for display.
     pub fn counts_text(&self) -> String {
         self.stages.counts.text(self.target, self.gaussians, self.merges)
     }
 
-    /// Returns the plan for a person: counts, parameters of the stages, and what is left out.
+    /// Returns the plan as text for display: counts, parameters of the stages, and omitted stages.
     pub fn text(&self) -> String {
         let parameters = self.stages.all().map(|stage| stage.parameters()).filter(|text| !text.is_empty());
         let search = self.search.as_ref().map(SearchStage::parameters);
@@ -236,18 +240,18 @@ impl RunPlan {
         self.counts_text() + &lines.collect::<String>()
     }
 
-    /// Confirms, before the input is opened, that a run which reads `input` may write its result.
+    /// Checks, before the input is opened, that a run which reads `input` may write its output.
     ///
     /// # Errors
-    /// Outputs that are there already, or cannot be.
+    /// Fails if the output exists already or cannot be created.
     pub fn check_target(&self, input: &Path) -> Result<()> {
         self.output.as_ref().map_or(Ok(()), |output| output.check_target(&[input]))
     }
 
-    /// Confirms, before any work, that the scene has what the stages need.
+    /// Checks, before any work, that the scene has the files that the stages need.
     ///
     /// # Errors
-    /// Those of the stages.
+    /// Fails if the check of a stage fails.
     pub fn check(&self, scene: &Scene) -> Result<()> {
         if let Some(search) = &self.search {
             search.check(scene)?;
@@ -256,15 +260,16 @@ impl RunPlan {
     }
 }
 
-/// Returns the kind of result that `request` asks for, of an input whose own kind of result is `own`.
+/// Returns the kind of output that `request` asks for. `own` is the default kind of the input.
 ///
 /// # Errors
-/// A name that says nothing; options of which an output or a goal allows one only.
+/// Fails if the name of the output does not tell its kind, or if options exclude each other.
 fn checked_output(request: &Request, own: OutputKind) -> Result<OutputKind> {
     let Request { goal, archive_psnr, .. } = request;
     if goal.is_some() && (request.only == Only::Merge || request.target.is_some()) {
         return Err(Error::usage(
-            "a quality or a size on disk is found by pruning: not with --merge-only, nor beside a target",
+            "a quality or a size on disk is reached by pruning: it cannot be combined with --merge-only or a \
+             target count or ratio",
         ));
     }
     if request.kind.is_none() {
@@ -280,12 +285,12 @@ fn checked_output(request: &Request, own: OutputKind) -> Result<OutputKind> {
     }
     match goal {
         Some(Goal::Quality(Quality::Loss { .. })) if is_archive => Err(Error::usage(
-            "the size of an archive is found by --target-ratio, --target-count, --min-psnr or --target-size\n  \
-             give one of these, or write a model folder",
+            "--max-loss cannot be used for an archive\n  \
+             give --ratio, --count, --min-psnr or --size, or write a model folder",
         )),
-        Some(Goal::Bytes(_)) if archive_psnr.is_some() => {
-            Err(Error::usage("--archive-psnr and --target-size both say how coarse: expected one of them"))
-        }
+        Some(Goal::Bytes(_)) if archive_psnr.is_some() => Err(Error::usage(
+            "--archive-psnr and --size both determine the quantization: expected only one of them",
+        )),
         _ => Ok(kind),
     }
 }
@@ -302,7 +307,7 @@ mod tests {
     use crate::recipe::Recipe;
     use crate::scene::InputOptions;
 
-    const OUTLOOK: InputMeta = InputMeta { gaussians: 1000, has_cameras: true, own_output: OutputKind::Gseq };
+    const INPUT: InputMeta = InputMeta { gaussians: 1000, has_cameras: true, own_output: OutputKind::Gseq };
 
     fn request(recipe: Recipe) -> Request {
         Request::new(InputOptions::default(), "out.gseq".into(), recipe)
@@ -312,24 +317,24 @@ mod tests {
         Budget { bytes: Some(bytes), ..Budget::default() }
     }
 
-    /// Everything compressing does under `preset`.
-    fn everything(preset: &str) -> impl Fn(&Workload, &Limits) -> Vec<ResourceEstimate> {
+    /// Returns a function that estimates all stages of a compression with the recipe `preset`.
+    fn all_estimates(preset: &str) -> impl Fn(&Workload, &Limits) -> Vec<ResourceEstimate> {
         let recipe = Recipe::preset(preset).unwrap();
-        let plan = RunPlan::new(&request(recipe), OUTLOOK).unwrap();
+        let plan = RunPlan::new(&request(recipe), INPUT).unwrap();
         move |work, limits| plan.estimates(work, limits)
     }
 
     #[test]
-    fn every_plan_keeps_to_its_budget_down_to_the_least_and_no_further() {
+    fn plan_fits_every_budget_down_to_the_smallest() {
         for preset in ["default", "strong"] {
-            let least = Plan::closest(work(200_000), 1, everything(preset)).peak();
+            let least = Plan::closest(work(200_000), 1, all_estimates(preset)).peak();
             let mut before = 0;
             for bytes in [least, least + (8 << 20), 2 * least, 4 * least, 64 * least] {
-                let plan = Plan::fit(work(200_000), budget(bytes), &Events::IGNORED, everything(preset)).unwrap();
+                let plan = Plan::fit(work(200_000), budget(bytes), &Events::IGNORED, all_estimates(preset)).unwrap();
                 assert!((before..=bytes).contains(&plan.peak()), "{bytes}: {}", plan.text());
                 before = plan.peak();
             }
-            let message = Plan::fit(work(200_000), budget(least - 1), &Events::IGNORED, everything(preset))
+            let message = Plan::fit(work(200_000), budget(least - 1), &Events::IGNORED, all_estimates(preset))
                 .unwrap_err()
                 .to_string();
             assert!(message.contains(&format!("at least {}MiB", least.div_ceil(1 << 20))), "{message}");
@@ -337,17 +342,18 @@ mod tests {
     }
 
     #[test]
-    fn a_small_budget_leaves_out_time_then_bands_then_refining_and_names_what_there_would_have_to_be() {
+    fn small_budget_omits_time_then_sh_then_refinement() {
         let mut request = request(Recipe::preset("default").unwrap());
         let work = work(200_000);
         let mut within = |bytes: u64| {
             request.input.memory = budget(bytes);
-            let plan = RunPlan::within_memory(&request, OUTLOOK, &work).unwrap();
+            let plan = RunPlan::within_memory(&request, INPUT, &work).unwrap();
             let mut journal = Journal::default();
             plan.stages.record_left_out(&work, &Limits::NONE, &mut journal);
             let left_out =
                 |what: &str| journal.left_out.iter().find(|left| left.what == what).map(|left| left.why.clone());
-            let whats = ["refining along time", "refining of harmonics above the first", "refinement"];
+            let whats =
+                ["time-varying deltas of refinement", "refinement of SH coefficients above degree 0", "refinement"];
             let [time, bands, all] = whats.map(left_out);
             assert_eq!(
                 plan.refine.as_ref().is_some_and(|refine| refine.knots > 0),
@@ -361,17 +367,17 @@ mod tests {
             | MemoryFallback::WithoutRefinement { required_bytes } => required_bytes,
             MemoryFallback::Nothing => 0,
         };
-        let whole = Plan::closest(work, 1, everything("default")).peak();
-        assert_eq!(within(whole).0, MemoryFallback::Nothing);
-        let (spared, degree, named, none) = within(whole - 1);
+        let full_bytes = Plan::closest(work, 1, all_estimates("default")).peak();
+        assert_eq!(within(full_bytes).0, MemoryFallback::Nothing);
+        let (spared, degree, named, none) = within(full_bytes - 1);
         assert_eq!(
             (spared, degree, none),
-            (MemoryFallback::ConstantInTime { required_bytes: whole }, Some(ALL_HARMONICS), None)
+            (MemoryFallback::ConstantInTime { required_bytes: full_bytes }, Some(ALL_HARMONICS), None)
         );
-        assert!(named.unwrap().contains(&format!("{}MiB", whole.div_ceil(1 << 20))));
-        let (spared, ..) = (1..).map(|k| within(whole - k * (1 << 20))).find(|found| found.1 == Some(0)).unwrap();
+        assert!(named.unwrap().contains(&format!("{}MiB", full_bytes.div_ceil(1 << 20))));
+        let (spared, ..) = (1..).map(|k| within(full_bytes - k * (1 << 20))).find(|found| found.1 == Some(0)).unwrap();
         let all = least(spared);
-        assert!(matches!(spared, MemoryFallback::WithoutHarmonics { .. }) && all < whole, "{spared:?}");
+        assert!(matches!(spared, MemoryFallback::WithoutHarmonics { .. }) && all < full_bytes, "{spared:?}");
         assert!(matches!(within(all).0, MemoryFallback::ConstantInTime { .. }));
         let (spared, degree, named, none) = within(all - 1);
         assert_eq!((spared, degree, none), (MemoryFallback::WithoutHarmonics { required_bytes: all }, Some(0), None));
@@ -383,13 +389,13 @@ mod tests {
         let (spared, refine, _, named) = within(bands - 1);
         assert_eq!((spared, refine), (MemoryFallback::WithoutRefinement { required_bytes: bands }, None));
         assert!(named.unwrap().contains(&format!("{}MiB", bands.div_ceil(1 << 20))));
-        // What nothing can be done about is refused as it was asked for.
+        // A limit below every fallback returns the full plan, which is refused later.
         assert_eq!(within(1 << 20).0, MemoryFallback::Nothing);
     }
 
     #[test]
-    fn ten_times_the_gaussians_take_ten_times_the_stated_bytes_and_ten_times_the_frames_next_to_nothing() {
-        let least = |work: Workload| Plan::closest(work, 1, everything("default"));
+    fn memory_is_linear_in_gaussians_and_constant_in_frames() {
+        let least = |work: Workload| Plan::closest(work, 1, all_estimates("default"));
         let peaks = [100_000, 1_000_000, 1_900_000].map(|count| least(work(count)).peak());
         let (first, second) = (peaks[1] - peaks[0], peaks[2] - peaks[1]);
         assert!(first.abs_diff(second) <= first / 1000, "not linear: {peaks:?}");
@@ -398,11 +404,11 @@ mod tests {
     }
 
     #[test]
-    fn what_a_recipe_does_not_do_takes_nothing_and_is_named() {
+    fn unused_stages_cost_nothing_and_are_named() {
         let mut recipe = Recipe::preset("paper").unwrap();
         recipe.merge.passes.clear();
         let request = request(recipe);
-        let plan = RunPlan::new(&request, OUTLOOK).unwrap();
+        let plan = RunPlan::new(&request, INPUT).unwrap();
         let needs = plan.estimates(&work(1000), &Limits::NONE);
         assert_eq!(needs.iter().map(|need| need.stage).collect::<Vec<_>>(), ["scan", "score", "emit"]);
         let mut journal = Journal::default();
@@ -412,11 +418,11 @@ mod tests {
     }
 
     #[test]
-    fn the_plan_says_how_many_gaussians_ranking_and_refinement_leave() {
+    fn plan_text_names_counts_of_ranking_and_refinement() {
         let counts = |recipe: Recipe, ratio: Option<f64>, goal: Option<Goal>| {
             let target = ratio.map(Target::Ratio);
             let request = Request { target, goal, ..request(recipe) };
-            let plan = RunPlan::new(&request, OUTLOOK).unwrap();
+            let plan = RunPlan::new(&request, INPUT).unwrap();
             let after = [plan.stages.counts.after_ranking(100, 1000), plan.stages.counts.before_refinement(100, 1000)];
             (after, plan.text())
         };
@@ -431,7 +437,7 @@ mod tests {
         let (unrefined, text) = counts(default().unrefined(), Some(0.1), None);
         assert_eq!(unrefined, [100, 100]);
         assert!(text.contains("leave 100 of 1000 Gaussians (10%); refinement removes none"), "{text}");
-        // A search ranks once for all of its sizes.
+        // A search ranks once, down to the smallest size that it may try.
         let psnr = || Some(Goal::Quality(Quality::Psnr(30.0)));
         assert_eq!(counts(default(), None, psnr()).0, [400, 400]);
         assert_eq!(counts(default().unrefined(), None, psnr()).0, [20, 100]);

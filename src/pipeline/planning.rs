@@ -1,4 +1,4 @@
-//! What stages are planned from: the request and the input, as far as several stages depend on them.
+//! Inputs of planning: the request, and facts about the input that several stages depend on.
 
 use super::request::{Goal, Request};
 use crate::outputs::kind::OutputKind;
@@ -7,19 +7,19 @@ use crate::recipe::WhichBands;
 use crate::refinement::RefineStage;
 use crate::scene::Scene;
 
-/// What is known of a scene before its frames are read.
+/// Facts about a scene that are known before its frames are read.
 #[derive(Debug, Clone, Copy)]
 pub struct InputMeta {
-    /// N.
+    /// Number of Gaussians, N.
     pub gaussians: usize,
-    /// Whether the cameras are the scene's own, not a virtual rig.
+    /// Whether the cameras belong to the scene; `false` for a virtual rig.
     pub has_cameras: bool,
-    /// The kind of result to which neither the user nor its name gives one.
+    /// Kind of output that is written if neither the user nor the output's name determines one.
     pub own_output: OutputKind,
 }
 
 impl InputMeta {
-    /// Of an open scene.
+    /// Returns the facts about an open scene.
     pub fn from_scene(scene: &Scene) -> InputMeta {
         InputMeta {
             gaussians: scene.source().info().count,
@@ -29,81 +29,87 @@ impl InputMeta {
     }
 }
 
-/// What the stages are planned from: the request as far as several stages depend on it.
+/// Inputs from which stages are planned.
 pub struct Planning<'a> {
-    /// What was asked for.
+    /// Request of the user.
     pub request: &'a Request,
-    /// What is known of the input.
+    /// Facts about the input.
     pub input: InputMeta,
-    /// What is written.
+    /// Kind of output that is written.
     pub output: OutputKind,
-    /// Exact number of Gaussians in the output.
+    /// Exact number of Gaussians in the output, if requested.
     pub target: Option<usize>,
-    /// What the user decided about single Gaussians.
+    /// Decisions of the user about single Gaussians: ids and boxes to keep or drop.
     pub user: UserOverrides,
-    /// Whether views of the scene are looked at to measure what Gaussians add to them.
-    pub looks: bool,
-    /// Whether Gaussians are removed that were not asked to be dropped.
+    /// Whether views of the scene are rendered to measure the contribution of every Gaussian.
+    pub renders_views: bool,
+    /// Whether Gaussians are pruned by rank, beside those that the user drops.
     pub prunes: bool,
     /// Whether survivors are merged.
     pub merges: bool,
-    /// How what is left is refined.
+    /// Refinement of the survivors, if there is any.
     pub refine: Option<RefineStage>,
     /// Whether the quality of the result is measured before it is written.
     pub measures_quality: bool,
-    /// What refinement goes without for lack of memory.
+    /// Parts of refinement that are omitted to stay within the memory limit.
     pub(super) fallback: MemoryFallback,
 }
 
 impl Planning<'_> {
-    /// Returns the part of the Gaussians that is asked for.
+    /// Returns the requested fraction of the Gaussians, if a target was requested.
     pub fn part(&self) -> Option<f64> {
         self.target.map(|target| target as f64 / self.input.gaussians.max(1) as f64)
     }
 
-    /// Returns whether the SH degree is chosen of which most Gaussians fit a size on disk: refinement tells which is best.
+    /// Returns whether the SH degree is chosen by refinement: among the degrees whose Gaussians fit a size on disk, the
+    /// one with the best quality is taken.
     pub fn chooses_degree(&self) -> bool {
         let has_byte_limit = matches!(self.request.goal, Some(Goal::Bytes(_)));
         has_byte_limit && self.refine.is_some() && self.request.recipe.bands.bands == WhichBands::Needed
     }
 
-    /// Returns whether Gaussians are ranked by views of the scene and removed.
+    /// Returns whether Gaussians are ranked by rendered views and removed.
     pub fn prunes_by_views(&self) -> bool {
-        self.looks && self.prunes
+        self.renders_views && self.prunes
     }
 }
 
-/// Parts of refinement that are left out because they do not fit within the memory limit.
+/// Parts of refinement that are omitted because they do not fit within the memory limit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(crate) enum MemoryFallback {
-    /// No part is left out.
+    /// Full refinement.
     #[default]
     Nothing,
     /// Parameter deltas are constant in time.
     ConstantInTime {
-        /// Memory with which deltas could vary in time, bytes.
+        /// Smallest memory limit with which deltas vary in time, bytes.
         required_bytes: u64,
     },
-    /// SH coefficients above degree 0 are not refined either.
+    /// Parameter deltas are constant in time, and SH coefficients above degree 0 are not refined.
     WithoutHarmonics {
-        /// Memory with which they could be, bytes.
+        /// Smallest memory limit with which these coefficients are refined, bytes.
         required_bytes: u64,
     },
-    /// Nothing is refined.
+    /// No refinement.
     WithoutRefinement {
-        /// Memory with which it could be, bytes.
+        /// Smallest memory limit with which anything is refined, bytes.
         required_bytes: u64,
     },
 }
 
 impl MemoryFallback {
-    /// Returns the parts of refinement that are left out, and the memory with which they would not be, bytes.
+    /// Returns the omitted parts of refinement, each with the memory limit at which it would be included, bytes.
     pub(super) fn left_out(self) -> Vec<(&'static str, u64)> {
         match self {
             MemoryFallback::Nothing => Vec::new(),
-            MemoryFallback::ConstantInTime { required_bytes } => vec![("refining along time", required_bytes)],
+            MemoryFallback::ConstantInTime { required_bytes } => {
+                vec![("time-varying deltas of refinement", required_bytes)]
+            }
             MemoryFallback::WithoutHarmonics { required_bytes } => {
-                vec![("refining along time", required_bytes), ("refining of harmonics above the first", required_bytes)]
+                vec![
+                    ("time-varying deltas of refinement", required_bytes),
+                    ("refinement of SH coefficients above degree 0", required_bytes),
+                ]
             }
             MemoryFallback::WithoutRefinement { required_bytes } => vec![("refinement", required_bytes)],
         }

@@ -1,4 +1,4 @@
-//! What the quality of a reduction is measured by, and what of it is held back.
+//! Quality of a compressed model, measured on views for the search and on views held back for the report.
 
 use rayon::prelude::*;
 
@@ -12,48 +12,50 @@ use crate::scene::Scene;
 use crate::scene::photographs::Photographs;
 use crate::source::FrameSource;
 
-/// What pictures are compared with.
-pub(super) enum With<'a> {
-    /// The original's own, by their numbers.
+/// Images that renders of a model are compared with.
+pub(super) enum Comparison<'a> {
+    /// Renders of the original: targets, and the indices of the views among them.
     Original(&'a Targets, Vec<usize>),
-    /// Photographs.
+    /// Photographs of the scene.
     Photographs(Photographs),
 }
 
-/// Pictures that models are measured on.
+/// Set of views on which models are measured.
 pub(super) struct QualityMeter<'a> {
     scene: &'a Scene,
     cameras: &'a [Camera],
-    /// By frame, and whether each is held back.
+    /// Views in order of frames; the flag tells whether a view is held back.
     pictures: Vec<(Picture, bool)>,
-    with: With<'a>,
+    comparison: Comparison<'a>,
 }
 
 impl<'a> QualityMeter<'a> {
-    /// By `pictures`, by frame, of which some are held back.
+    /// Returns a meter for `pictures`, in order of frames, each with a flag that tells whether it is held back.
     ///
     /// # Errors
-    /// None that is held back, or none that is not.
+    /// Fails if no view is held back, or all are.
     pub(super) fn new(
         scene: &'a Scene,
         cameras: &'a [Camera],
         pictures: Vec<(Picture, bool)>,
-        with: With<'a>,
+        comparison: Comparison<'a>,
     ) -> Result<QualityMeter<'a>> {
         let held = pictures.iter().filter(|picture| picture.1).count();
         if held == 0 || held == pictures.len() {
             let found = pictures.len();
             return Err(Error::usage(format!(
-                "a quality is searched on some pictures and reported by others: expected 4 or more, found {found}"
+                "a search for a quality uses some views to search and others to report: expected 4 or more views, \
+                 found {found}"
             )));
         }
-        Ok(QualityMeter { scene, cameras, pictures, with })
+        Ok(QualityMeter { scene, cameras, pictures, comparison })
     }
 
-    /// Mean PSNR, dB, of what `source` shows, by the pictures that are searched on or by those held back.
+    /// Returns the mean PSNR of renders of `source`, dB: on the views held back if `held`, otherwise on the views for
+    /// the search.
     ///
     /// # Errors
-    /// Frames or photographs that cannot be read.
+    /// Fails if frames or photographs cannot be read.
     pub(super) fn measure(&self, source: &dyn FrameSource, held: bool) -> Result<f64> {
         let background = self.scene.background;
         let places: Vec<usize> = (0..self.pictures.len()).filter(|&k| self.pictures[k].1 == held).collect();
@@ -61,33 +63,34 @@ impl<'a> QualityMeter<'a> {
         let mut found = Vec::with_capacity(pictures.len());
         show([Subject::all(source)], self.cameras, &pictures, Batch::of_frame(&self.scene.limits), |views| {
             let first = found.len();
-            let of_view = |(place, view): (usize, &ViewStates<'_, 1>)| {
-                match &self.with {
-                    With::Photographs(photographs) => {
+            let view_psnr = |(place, view): (usize, &ViewStates<'_, 1>)| {
+                match &self.comparison {
+                    Comparison::Photographs(photographs) => {
                         let picture = view.render(0, background);
                         Ok(psnr(&picture, &photographs.read(view.picture, view.camera, background)?))
                     }
-                    With::Original(targets, numbers) => {
-                        // As the targets are made.
+                    Comparison::Original(targets, numbers) => {
+                        // Rendered like the targets.
                         let picture = render(view.states[0], view.camera, background);
                         Ok(decibels(mean_square(&picture, &targets.values(numbers[places[first + place]])?)))
                     }
                 }
             };
-            let of_batch: Vec<f64> = views.par_iter().enumerate().map(of_view).collect::<Result<_>>()?;
+            let of_batch: Vec<f64> = views.par_iter().enumerate().map(view_psnr).collect::<Result<_>>()?;
             found.extend(of_batch);
             Ok(())
         })?;
         Ok(found.iter().sum::<f64>() / found.len() as f64)
     }
 
-    /// How many pictures are searched on.
-    pub(super) fn searched(&self) -> usize {
+    /// Returns the number of views for the search.
+    pub(super) fn search_view_count(&self) -> usize {
         self.pictures.iter().filter(|picture| !picture.1).count()
     }
 
-    /// Names of the pictures held back: frame and view; of those in between the scene's cameras the frame.
-    pub(super) fn held(&self) -> Vec<String> {
+    /// Returns the names of the views held back, made of frame and view. A view between the cameras of the scene is
+    /// named by its frame.
+    pub(super) fn held_back_names(&self) -> Vec<String> {
         let name = |picture: &Picture| match picture.view {
             u32::MAX => format!("t{:03}_between", picture.frame),
             _ => picture.name(),

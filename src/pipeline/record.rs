@@ -1,7 +1,7 @@
-//! What a run was asked for, as `recipe.toml` beside its result keeps it, so that the recipe repeats the run.
+//! The file `recipe.toml` beside a result: everything that is needed to repeat the run.
 //!
-//! The file: `[provenance]`, the tool and the digest of the input; `[run]`, everything beside the hyper-parameters that
-//! decides a byte of the result; then every hyper-parameter.
+//! Contents of the file: `[provenance]` with the tool and the digest of the input; `[run]` with every option beside the
+//! parameters that affects a byte of the result; then every parameter of the method.
 
 use std::path::{Path, PathBuf};
 
@@ -16,34 +16,34 @@ use crate::models::{Link, ZeroRotation};
 use crate::outputs::kind::OutputKind;
 use crate::pruning::score::UserOverrides;
 
-/// Where a recipe comes from.
+/// Origin of a recipe.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Provenance {
-    /// Program and version.
+    /// Name and version of the program.
     pub tool: String,
     /// Digest of the input.
     pub input_digest: String,
 }
 
-/// What decides a result beside its hyper-parameters. What is none was not asked for.
+/// Options that affect the result, beside the parameters of the recipe. `None` means not given.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RunOptions {
-    /// Which of pruning and merging was done.
+    /// Choice of pruning, merging or both.
     pub mode: Only,
     /// Exact number of Gaussians in the output.
     pub target_count: Option<u64>,
-    /// Exact fraction of them.
+    /// Exact fraction of the Gaussians in the output.
     pub target_ratio: Option<f64>,
-    /// Least PSNR against the original's own pictures, dB.
+    /// Minimum PSNR against renders of the original, dB.
     pub min_psnr: Option<f64>,
-    /// Most loss of PSNR against photographs, dB.
+    /// Maximum loss of PSNR against photographs, dB.
     pub max_loss: Option<f64>,
-    /// Folder of these photographs; in a file, seen from the folder of the recipe.
+    /// Folder of these photographs. In a file the path is relative to the folder of the recipe.
     pub ground_truth: Option<PathBuf>,
-    /// Most bytes of everything that is written.
+    /// Maximum number of bytes of all written files.
     pub target_size: Option<u64>,
-    /// PSNR of an archive's pictures against those of the result before, dB.
+    /// Minimum PSNR of an archive's views against views of the result before quantization, dB.
     pub archive_psnr: Option<f64>,
     /// Ids to keep, as a list with ranges.
     pub keep_ids: Option<String>,
@@ -51,55 +51,56 @@ pub struct RunOptions {
     pub drop_ids: Option<String>,
     /// Box whose Gaussians are kept: low corner, high corner.
     pub keep_box: Option<[f64; 6]>,
-    /// What was written, as `--as` names it.
+    /// Kind of output, as `--as` names it.
     pub output: Option<OutputKind>,
     /// Training iteration of a model folder.
     pub iteration: Option<u32>,
-    /// `--time-duration` of a model.
+    /// Value of `--time-duration` for the model.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub time_duration: Option<f64>,
-    /// Whether `--rot4d unflipped` was said of it.
+    /// Whether `--rot4d unflipped` was given for the model.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub rot4d_unflipped: bool,
-    /// `--zero-rotation` of a `.splatv`.
+    /// Value of `--zero-rotation` for a `.splatv`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub zero_rotation: Option<ZeroRotation>,
-    /// File or folder of the cameras; in a file, seen from the folder of the recipe.
+    /// File or folder of the cameras. In a file the path is relative to the folder of the recipe.
     pub cameras: Option<PathBuf>,
-    /// Part of their pictures that was scored; none: all.
+    /// Split of the views that was scored; `None`: all views.
     pub split: Option<Split>,
-    /// Evenly spaced frames of a model that is continuous in time.
+    /// Number of evenly spaced frames of a model that is continuous in time.
     pub frames: Option<usize>,
-    /// Picture size where the cameras name none.
+    /// Width and height of views in pixels, for cameras that do not name any.
     pub size: Option<(u32, u32)>,
-    /// Where the times of pictures came from, as `--times` says it; none: their own. A table is seen from the folder of
-    /// the recipe.
+    /// Source of the times of views, as for `--times`; `None`: the views' own times. In a file the path of a table is
+    /// relative to the folder of the recipe.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub times: Option<String>,
-    /// Whether frames were linked, where that was not left to them.
+    /// Whether frames were linked; `None` if this was determined automatically.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub link: Option<Link>,
 }
 
-/// A recipe file's tables beside its hyper-parameters.
+/// Tables of a recipe file beside the parameters of the method.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct RecipeRecord {
-    /// Where it comes from.
+    /// Origin of the recipe.
     pub provenance: Option<Provenance>,
-    /// What was asked for.
+    /// Options of the run.
     pub run: Option<RunOptions>,
 }
 
 impl RunOptions {
-    /// The exact size that was asked for.
+    /// Returns the requested number or fraction of Gaussians, if any.
     pub fn target(&self) -> Option<Target> {
         self.target_count.map(Target::Count).or(self.target_ratio.map(Target::Ratio))
     }
 
-    /// The goal that was asked for.
+    /// Returns the requested goal, if any.
     ///
     /// # Errors
-    /// Several, a part of one, or decibels that no goal has, in words.
+    /// Fails with a message if several goals are given, if a goal is incomplete, or if a value in decibels is out of
+    /// range.
     pub fn goal(&self) -> std::result::Result<Option<Goal>, String> {
         match (self.target(), self.min_psnr, self.max_loss, &self.ground_truth, self.target_size) {
             (_, None, None, None, None) => Ok(None),
@@ -120,7 +121,7 @@ impl RunOptions {
 }
 
 impl RunOptions {
-    /// Replaces every path by what `path` makes of it.
+    /// Returns the options with every path replaced by the result of `path`.
     fn with_paths(mut self, path: impl Fn(&Path) -> PathBuf) -> RunOptions {
         self.cameras = self.cameras.as_deref().map(&path);
         self.ground_truth = self.ground_truth.as_deref().map(&path);
@@ -133,7 +134,7 @@ impl RunOptions {
 }
 
 impl RecipeRecord {
-    /// Of `request`, whose ids are those of `user`.
+    /// Returns the record of `request`, with the ids that `user` keeps and drops.
     pub(super) fn new(request: &Request, user: &UserOverrides, input_digest: String) -> RecipeRecord {
         let (target_count, target_ratio) = match request.target {
             None => (None, None),
@@ -176,17 +177,17 @@ impl RecipeRecord {
         RecipeRecord { provenance: Some(Provenance { tool, input_digest }), run: Some(run) }
     }
 
-    /// Parses what the text of a recipe file in `folder` says beside its hyper-parameters. Files that it names by relative
-    /// paths are those that `folder` leads to.
+    /// Parses the tables beside the parameters from the text of a recipe file in `folder`. Relative paths in the text
+    /// are resolved against `folder`.
     ///
     /// # Errors
-    /// A table that is not as [`RunOptions`] has it, in words.
+    /// Fails with a message if a table does not have the form of [`RunOptions`].
     pub fn read(text: &str, folder: &Path) -> std::result::Result<RecipeRecord, String> {
         let record: RecipeRecord = toml::from_str(text).map_err(|error| error.to_string())?;
         Ok(RecipeRecord { run: record.run.map(|run| run.with_paths(|path| folder.join(path))), ..record })
     }
 
-    /// Returns the record for a recipe file in `folder`: with paths seen from there, without those of this machine.
+    /// Returns the record for a recipe file in `folder`, with paths relative to this folder and without absolute paths.
     fn seen_from(&self, folder: &Path) -> RecipeRecord {
         RecipeRecord {
             run: self.run.clone().map(|run| run.with_paths(|path| from_folder(path, folder))),
@@ -194,7 +195,7 @@ impl RecipeRecord {
         }
     }
 
-    /// Returns the text of `recipe.toml` in `folder`.
+    /// Returns the text of the file `recipe.toml` in `folder`.
     pub(super) fn text(&self, request: &Request, folder: &Path) -> String {
         format!(
             "# What this result was made with; give it to --recipe to repeat the run.\n{}\n{}",
@@ -212,7 +213,7 @@ mod tests {
     use crate::scene::InputOptions;
 
     #[test]
-    fn a_record_reads_back_as_itself_and_leaves_the_recipe_as_it_was() {
+    fn record_reads_back_unchanged_beside_the_recipe() {
         let input = InputOptions {
             cameras: Some("data, \"odd\" name".into()),
             split: Some(Split::Test),
@@ -228,7 +229,7 @@ mod tests {
         let record = RecipeRecord::new(&request, &user, "00ff".to_owned());
         let folder = Path::new("/somewhere/else");
         let text = record.text(&request, folder);
-        // The folder is far from the working directory, so that the cameras keep their name alone.
+        // The folder is far from the working directory, so only the file name of the cameras is kept.
         let read = RecipeRecord::read(&text, folder).unwrap();
         assert_eq!(read.run.as_ref().unwrap().cameras.as_deref(), Some(&*folder.join("data, \"odd\" name")), "{text}");
         let cameras = record.run.as_ref().unwrap().cameras.clone();
@@ -239,7 +240,7 @@ mod tests {
     }
 
     #[test]
-    fn a_recipe_names_files_seen_from_its_folder() {
+    fn recipe_paths_are_relative_to_its_folder() {
         let here = std::env::current_dir().unwrap();
         let run = RunOptions {
             cameras: Some(here.join("data/cameras.json")),
@@ -263,13 +264,13 @@ mod tests {
     }
 
     #[test]
-    fn a_misspelt_option_of_a_run_is_named() {
+    fn misspelled_run_option_is_named_in_the_error() {
         let message = RecipeRecord::read("[run]\ntarget_rato = 0.3\n", Path::new("")).unwrap_err();
         assert!(message.contains("target_rato"), "{message}");
     }
 
     #[test]
-    fn ranges_parse_into_the_ids_they_stand_for() {
+    fn formatted_ranges_parse_back_into_the_same_ids() {
         for ids in [&[][..], &[7], &[0, 1, 2], &[1, 3, 4, 5, 9, 11, 12]] {
             assert_eq!(parse_ids(&ranges(ids).join(","), 20).unwrap(), ids);
         }

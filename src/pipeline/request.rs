@@ -1,4 +1,4 @@
-//! What a user asks for.
+//! The request of a user: input, output, recipe and size or quality of the result.
 
 use std::path::PathBuf;
 
@@ -10,55 +10,55 @@ use crate::outputs::kind::OutputKind;
 use crate::recipe::Recipe;
 use crate::scene::InputOptions;
 
-/// Which of pruning and merging to do.
+/// Choice of pruning, merging or both.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Only {
-    /// Prune, then merge.
+    /// Prunes, then merges.
     #[default]
     Both,
-    /// The paper's "pruned".
+    /// Prunes only (the paper's "pruned").
     Prune,
-    /// The paper's "merged".
+    /// Merges only (the paper's "merged").
     Merge,
 }
 
-/// How many Gaussians the output is to have.
+/// Requested number of Gaussians in the output.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Target {
-    /// This many.
+    /// Exact number.
     Count(u64),
-    /// This fraction of the input, in (0, 1], rounded to the nearest and at least one.
+    /// Fraction of the input in (0, 1], rounded to the nearest number and at least one.
     Ratio(f64),
 }
 
-/// What the size of the output is to be found by.
+/// Goal by which the size of the output is found.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Goal {
-    /// The smallest that is as good as this.
+    /// Smallest output that has at least this quality.
     Quality(Quality),
-    /// The best with at most this many bytes of everything that is written.
+    /// Best output whose files together have at most this many bytes.
     Bytes(u64),
 }
 
-/// How good an output is to be.
+/// Requested quality of an output.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Quality {
-    /// At least this mean PSNR against the original's own pictures, dB.
+    /// Minimum mean PSNR against renders of the original, dB.
     Psnr(f64),
-    /// At most this much PSNR against photographs less than the original has, dB.
+    /// Maximum loss of mean PSNR against photographs, compared with the original model.
     Loss {
-        /// dB.
+        /// Maximum loss, dB.
         most: f64,
         /// Folder of the photographs.
         photographs: PathBuf,
     },
 }
 
-/// `value` of the parameter `name`, if it is one of a quality.
+/// Returns `value` if it is a valid quality in decibels: above 0 and at most 100.
 ///
 /// # Errors
-/// One that is not, in words.
+/// Fails with a message that names the parameter `name` if it is not.
 pub(super) fn decibels(name: &str, value: f64) -> std::result::Result<f64, String> {
     match value > 0.0 && value <= 100.0 {
         true => Ok(value),
@@ -66,39 +66,41 @@ pub(super) fn decibels(name: &str, value: f64) -> std::result::Result<f64, Strin
     }
 }
 
-/// Everything a compression is asked for.
+/// Complete request of a compression.
 #[derive(Debug, Clone)]
 pub struct Request {
-    /// What to read.
+    /// Input to read.
     pub input: InputOptions,
-    /// Where to write.
+    /// Path to write to.
     pub output: PathBuf,
-    /// What to write; none: by the output's name.
+    /// Kind of output; `None`: determined by the output's name.
     pub kind: Option<OutputKind>,
-    /// All hyper-parameters.
+    /// Recipe with the parameters of the method.
     pub recipe: Recipe,
-    /// Digest of the input that the recipe was written beside, if it was: another input is noted.
+    /// Digest of the input for which the recipe was written, if known. A different input causes a note.
     pub made_for: Option<String>,
-    /// PSNR of an archive's pictures against those of the result before, dB; none: by the result's own level.
+    /// Minimum PSNR of an archive's views against views of the result before quantization, dB. `None`: derived from the
+    /// quality of the result.
     pub archive_psnr: Option<f64>,
-    /// Which stages to run.
+    /// Choice of pruning, merging or both.
     pub only: Only,
-    /// Exact size of the output, if asked for.
+    /// Exact number or fraction of Gaussians in the output, if requested.
     pub target: Option<Target>,
-    /// What the output's size is to be found by, if it is; then there is no target.
+    /// Goal by which the number of Gaussians is found, if requested; then `target` is `None`.
     pub goal: Option<Goal>,
-    /// Ids to keep: a list or a file.
+    /// Ids to keep: a list such as `3,10-20`, or a file.
     pub keep_ids: Option<String>,
-    /// Ids to drop: a list or a file.
+    /// Ids to drop: a list such as `3,10-20`, or a file.
     pub drop_ids: Option<String>,
-    /// Box whose Gaussians are kept.
+    /// Box whose Gaussians are kept: low corner, high corner, scene units.
     pub keep_box: Option<[f64; 6]>,
-    /// Replace an earlier output.
+    /// Policy for an output that exists already.
     pub overwrite: Replace,
 }
 
 impl Request {
-    /// Prunes and merges `input` to the recipe's own size, keeps and drops nobody in particular, replaces nothing.
+    /// Returns a request that prunes and merges `input` to the size that the recipe gives. It keeps and drops no single
+    /// Gaussians and replaces no existing output.
     pub fn new(input: InputOptions, output: PathBuf, recipe: Recipe) -> Self {
         Request {
             input,
@@ -119,23 +121,27 @@ impl Request {
 }
 
 impl Target {
-    /// The number of Gaussians it means for an input of `count`.
+    /// Returns the target number of Gaussians for an input of `count` Gaussians.
+    ///
+    /// # Errors
+    /// Fails if the ratio is not in (0, 1] or the number is not in 1..=`count`. An input without Gaussians always gives
+    /// 0.
     pub fn count(self, count: usize) -> Result<usize> {
         let wanted = match self {
             Target::Count(wanted) => wanted,
             Target::Ratio(ratio) if ratio > 0.0 && ratio <= 1.0 => ((ratio * count as f64).round() as u64).max(1),
             Target::Ratio(ratio) => {
                 return Err(Error::usage(format!(
-                    "--target-ratio: expected a number above 0 and at most 1, found {ratio}"
+                    "--ratio: expected a number above 0 and at most 1, found {ratio}"
                 )));
             }
         };
         match usize::try_from(wanted) {
             Ok(wanted @ 1..) if wanted <= count => Ok(wanted),
-            // The empty scene has one size only.
+            // An empty scene has only the size 0.
             _ if count == 0 => Ok(0),
             _ => Err(Error::usage(format!(
-                "--target-count: expected 1 to {count}, the Gaussians of the input, found {wanted}"
+                "--count: expected 1 to {count}, the Gaussians of the input, found {wanted}"
             ))),
         }
     }

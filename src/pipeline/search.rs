@@ -1,18 +1,18 @@
-//! The search for the smallest model that is as good as asked for: a loop around the stages that reduce the model.
+//! Search for the smallest model that has the requested quality: a loop around the stages that reduce the model.
 //!
-//! Sizes are tried one after the other, each refined as if it had been asked for; the next one follows from how much
-//! quality the last ones had to spare, and lies between the largest that did not do and the smallest that did. Cuts on the
-//! way down are kept, so that a smaller size goes on from there. A quarter of the pictures is never searched on and gives
-//! the figure that is reported (method.md, section 6.3).
+//! Sizes are tried one after the other, each refined as if it had been requested. The next size follows from the
+//! surplus of quality at the last sizes, and lies between the largest size that failed and the smallest that passed.
+//! Refinement states after prune steps are kept, so that a smaller size continues from there. A quarter of the views is
+//! never used by the search and gives the reported figure (method.md, section 6.3).
 
 use super::planning::Planning;
-use super::quality_meter::{QualityMeter, With};
+use super::quality_meter::{Comparison, QualityMeter};
 use super::request::{Goal, Quality};
 use super::stage::{EstimateInput, Phase, RunState};
 use super::stages::bands::ShDegreeStage;
 use super::stages::choose::CLUSTERED;
 use super::stages::field::FieldPrecisionStage;
-use super::stages::reference_views::LEFT_BY_SEARCH;
+use super::stages::reference_views::ARCHIVE_HEADROOM;
 use super::summary::GoalSummary;
 use crate::cache::CacheKey;
 use crate::compressed_model::CompressedModel;
@@ -34,44 +34,45 @@ use crate::scene::pictures::{PictureSet, pictures};
 use crate::scene::stamps;
 use crate::source::FrameSource;
 
-/// What the stage is called.
+/// Name of the stage.
 const NAME: &str = "search";
-/// Part of the Gaussians that is tried first.
-const FIRST: f64 = 0.2;
-/// Sizes that are usually tried, for estimates.
+/// Fraction of the Gaussians that is tried first.
+const FIRST_FRACTION: f64 = 0.2;
+/// Usual number of sizes that are tried, for estimates.
 const SIZES_USUALLY_TRIED: f64 = 4.0;
-/// Sizes that are tried at most.
-const MOST_TRIED: usize = 8;
-/// Neighboring sizes whose ratio is this or less are not told apart.
-const SAME_SIZE: f64 = 1.04;
-/// What a halving of the number of Gaussians costs, about: dB, and the factor of a loss. Guesses follow from it.
-const HALVING: (f64, f64) = (4.5, 3.0);
-/// Halvings that a size may have to spare and still be the one.
-const CLOSE: f64 = 0.03;
-/// Losses are not told apart below this, dB.
-const LEAST_LOSS: f64 = 1e-3;
-/// Of the photographs every fourth is held back.
+/// Maximum number of sizes that are tried.
+const MAX_SIZES: usize = 8;
+/// Ratio of two sizes up to which they count as equal, so that the search ends.
+const SAME_SIZE_RATIO: f64 = 1.04;
+/// Approximate cost of halving the number of Gaussians: PSNR in dB, and the factor by which a loss grows. The search
+/// derives its guesses from it.
+const COST_OF_HALVING: (f64, f64) = (4.5, 3.0);
+/// Maximum surplus of quality of an accepted size, in halvings of the number of Gaussians.
+const MAX_SURPLUS: f64 = 0.03;
+/// Smallest loss that the search distinguishes, dB.
+const MIN_LOSS: f64 = 1e-3;
+/// Interval of held-back views among those with photographs: every fourth is held back.
 const HELD_EVERY: usize = 4;
 
-/// The search of a run: repeats the stages that reduce the model, once for every size it tries.
+/// Search of a run: repeats the stages that reduce the model, once for every size it tries.
 #[derive(Debug, Clone)]
 pub struct SearchStage {
-    /// What is asked for.
+    /// Quality that the user requested.
     quality: Quality,
-    /// What is searched for: an archive takes some of the quality that is found.
+    /// Quality that is searched for. For an archive it is higher than requested, because quantization costs quality.
     searched: Quality,
-    /// Pictures of the original that sizes are compared and refined by.
+    /// Number of views of the original by which sizes are refined and compared.
     pictures: usize,
-    /// How a size is refined.
+    /// Refinement of each size; `None` if nothing is refined.
     refine: Option<RefineStage>,
-    /// Margins, dB, by which the field of a size is rounded and bands of its harmonics are dropped; none: they stay.
+    /// Margins, dB, of the half-precision field and of dropped SH degrees; `None`: the field or the degree stays.
     margins: [Option<f64>; 2],
 }
 
-/// A size that was tried.
+/// Size that was tried, with its result.
 struct TriedSize {
     result: CompressedModel,
-    /// dB or dB lost, by the pictures that are searched on.
+    /// PSNR or loss of PSNR, dB, on the views of the search.
     value: f64,
     journal: Journal,
 }
@@ -82,7 +83,7 @@ impl SearchStage {
         let Planning { request, output, .. } = *planning;
         let Some(Goal::Quality(quality)) = &request.goal else { return None };
         let searched = match quality {
-            Quality::Psnr(least) if output == OutputKind::Archive => Quality::Psnr(least + LEFT_BY_SEARCH),
+            Quality::Psnr(least) if output == OutputKind::Archive => Quality::Psnr(least + ARCHIVE_HEADROOM),
             other => other.clone(),
         };
         let field = FieldPrecisionStage::from_request(request, output).map(|stage| stage.margin);
@@ -96,13 +97,14 @@ impl SearchStage {
         })
     }
 
-    /// Returns what is searched for, for a person.
+    /// Returns the parameters of the search as text for display.
     pub(super) fn parameters(&self) -> String {
-        format!("search: {} sizes at most, for {} {}", MOST_TRIED, self.name(), self.goal())
+        format!("search: {} sizes at most, for {} {}", MAX_SIZES, self.name(), self.goal())
     }
 
-    /// Returns the estimate of the search. `repeated` are those of the stages that every size goes through: memory is that of
-    /// the largest of them and of the models that the search keeps, time and reads are those of all, for each size.
+    /// Returns the estimate of the search. `repeated` are the estimates of the stages that run for every size. Memory
+    /// is that of the largest of them plus the models that the search keeps; time and reads are the sums over all, for
+    /// each size.
     pub fn estimate(&self, input: EstimateInput<'_>, repeated: &[ResourceEstimate]) -> ResourceEstimate {
         let EstimateInput { work, limits, .. } = input;
         let whole = work.state(Columns::all());
@@ -126,18 +128,18 @@ impl SearchStage {
         need.stage = NAME;
         need.seconds = SIZES_USUALLY_TRIED * seconds.max(measured.seconds);
         need.reads = SIZES_USUALLY_TRIED * reads.max(measured.reads);
-        // A picture, what it is compared with as it is read, and as it is used.
+        // A rendered view, and its comparison image as it is read and as it is used.
         need.fixed.push(("compared", work.threads * (render::STRIP_BYTES as u64 + 28 * work.pixels)));
         need.fixed.push(("field", work.input.fixed));
-        // Prune steps of a fifth from two fifths: twice the Gaussians.
+        // Prune steps remove a fifth each, starting from two fifths: together twice the Gaussians.
         need.per_gaussian.extend([("ways", 3 * (whole + 8)), ("result", work.input.reduced), ("kept", CLUSTERED)]);
         need
     }
 
-    /// Finds the smallest result that is as good as asked for, and leaves it and what it was found by in `run`.
+    /// Finds the smallest result with the requested quality. Stores the result and the summary of the search in `run`.
     ///
     /// # Errors
-    /// Frames or photographs that cannot be read; too few pictures.
+    /// Fails if frames or photographs cannot be read, or if there are too few views.
     pub fn run(&self, run: &mut RunState<'_>) -> Result<()> {
         let (scene, scored, ranking) = (run.scene, run.scored()?, run.ranking()?);
         let key = self.key(scene, &scored, &ranking, &run.template)?;
@@ -149,26 +151,27 @@ impl SearchStage {
             let meter = self.meter(scene, &targets, &parts, photographs, journal)?;
             let mut trial = RunState::new(scene, request, stages, template.clone());
             (trial.scored, trial.ranking) = (Some(scored.clone()), Some(ranking.clone()));
-            let steps =
-                |stage| PruneSteps::new(RefineRun::new(NAME, stage, scene, &scored, &targets, parts.clone()));
+            let steps = |stage| PruneSteps::new(RefineRun::new(NAME, stage, scene, &scored, &targets, parts.clone()));
             trial.prune_steps = self.refine.as_ref().map(steps);
             let (best, tried) = self.bracket(&mut trial, &meter)?;
             if best.value.is_nan() {
                 return Err(Error::usage(format!(
-                    "--{}: the PSNR of pictures cannot be measured: expected numbers in every pixel, found NaN in some\n  \
+                    "--{}: the PSNR of renders cannot be measured: expected numbers in every pixel, found NaN in \
+                     some\n  \
                      --non-finite drop removes the Gaussians that are not finite",
                     self.name().replace('_', "-")
                 )));
             }
             let result = scene.input.reduced(&best.result)?;
-            let summary = self.summary(&best, self.value(&meter, &*result, scene, true)?, meter.held(), tried);
+            let held = self.value(&meter, &*result, scene, true)?;
+            let summary = self.summary(&best, held, meter.held_back_names(), tried);
             drop(result);
-            let (count, does) = (best.result.len(), self.spare(summary.searched) >= 0.0);
+            let (count, is_met) = (best.result.len(), self.surplus(summary.searched) >= 0.0);
             journal.left_out.extend(best.journal.left_out);
             journal.notes.extend(best.journal.notes);
             (journal.field, journal.bands) = (best.journal.field, best.journal.bands);
             journal.refined = best.journal.refined;
-            journal.notes.push(note(&summary, meter.searched(), count, does));
+            journal.notes.push(note(&summary, meter.search_view_count(), count, is_met));
             Ok(((best.result, AsToml(summary)), count))
         });
         let (result, AsToml(mut goal)) = found?;
@@ -179,7 +182,7 @@ impl SearchStage {
         Ok(())
     }
 
-    /// Returns what sizes are compared by: photographs, or pictures of the original.
+    /// Returns the meter by which sizes are compared: against photographs, or against renders of the original.
     fn meter<'a>(
         &self,
         scene: &'a Scene,
@@ -189,23 +192,24 @@ impl SearchStage {
         journal: &mut Journal,
     ) -> Result<QualityMeter<'a>> {
         match photographs {
-            Some((of, photographs)) => {
-                journal.notes.push(format!("{} held-out pictures have photographs", of.len()));
-                let of = of.into_iter().enumerate().map(|(k, of)| (of, k % HELD_EVERY == HELD_EVERY - 1));
-                QualityMeter::new(scene, &scene.rig.cameras, of.collect(), With::Photographs(photographs))
+            Some((views, photographs)) => {
+                journal.notes.push(format!("{} test views have photographs", views.len()));
+                let is_held = |k: usize| k % HELD_EVERY == HELD_EVERY - 1;
+                let views = views.into_iter().enumerate().map(|(k, view)| (view, is_held(k)));
+                QualityMeter::new(scene, &scene.rig.cameras, views.collect(), Comparison::Photographs(photographs))
             }
             None => {
                 let mut numbers = [&parts.apart[..], &parts.held[..]].concat();
                 numbers.sort_unstable();
-                let of = |&k: &usize| (targets.pictures[k], parts.held.contains(&k));
-                let of = numbers.iter().map(of).collect();
-                QualityMeter::new(scene, &targets.cameras, of, With::Original(targets, numbers))
+                let view = |&k: &usize| (targets.pictures[k], parts.held.contains(&k));
+                let views = numbers.iter().map(view).collect();
+                QualityMeter::new(scene, &targets.cameras, views, Comparison::Original(targets, numbers))
             }
         }
     }
 
-    /// What the search follows from.
-    fn key(&self, scene: &Scene, scored: &Scored, ranked: &Ranking, like: &CompressedModel) -> Result<CacheKey> {
+    /// Returns the cache key of everything that the search depends on.
+    fn key(&self, scene: &Scene, scored: &Scored, ranked: &Ranking, template: &CompressedModel) -> Result<CacheKey> {
         let (asked, folder) = match &self.searched {
             Quality::Psnr(least) => (*least, None),
             Quality::Loss { most, photographs } => (*most, Some(photographs)),
@@ -219,62 +223,64 @@ impl SearchStage {
             (asked, files, self.pictures, self.margins[0], self.margins[1], refine),
             &scored.protected,
             ranked,
-            like,
+            template,
         )))
     }
 
-    /// Confirms, before any work, that there are photographs, where a loss is asked for.
+    /// Checks, before any work, that there are enough photographs if a maximum loss is requested.
     ///
     /// # Errors
-    /// Photographs that are not there, or too few.
+    /// Fails if photographs are missing or too few.
     pub fn check(&self, scene: &Scene) -> Result<()> {
         self.photographs(scene).map(|_| ())
     }
 
-    /// The held-out pictures that have a photograph, and these, where a loss is asked for.
+    /// Returns the test views that have a photograph, with their photographs; `None` unless a maximum loss is
+    /// requested.
     fn photographs(&self, scene: &Scene) -> Result<Option<(Vec<Picture>, Photographs)>> {
         let Quality::Loss { photographs, .. } = &self.searched else { return Ok(None) };
         let times = &scene.source().info().times;
-        let of = pictures(&scene.rig, times, PictureSet::HeldOut)?;
-        let found = Photographs::of_some(photographs, &scene.rig, times, of)?;
+        let views = pictures(&scene.rig, times, PictureSet::HeldOut)?;
+        let found = Photographs::of_some(photographs, &scene.rig, times, views)?;
         if found.0.len() < HELD_EVERY {
             let (folder, found) = (photographs.shown(), found.0.len());
             return Err(Error::usage(format!(
-                "--ground-truth {folder}: expected photographs of {HELD_EVERY} or more held-out pictures, found {found}"
+                "--ground-truth {folder}: expected photographs of {HELD_EVERY} or more test views, found {found}"
             )));
         }
         Ok(Some(found))
     }
 
-    /// Tries sizes from all protected Gaussians to all that may stay. Returns the smallest that does, or everything, and every
-    /// size tried with what it has.
+    /// Tries sizes between the number of protected Gaussians and the number that may stay. Returns the smallest size
+    /// that has the requested quality, or the model with all Gaussians that may stay if none has. Also returns every
+    /// tried size with its value in dB.
     fn bracket(&self, trial: &mut RunState<'_>, meter: &QualityMeter<'_>) -> Result<(TriedSize, Vec<(usize, f64)>)> {
         let (least, all) = (trial.scored()?.protected.len().max(1), trial.ranking()?.order().len());
         let mut tried: Vec<(usize, f64)> = Vec::new();
         let mut best: Option<TriedSize> = None;
-        // Sizes, and halvings that each has to spare: below what does not do, above what does.
+        // Sizes, each with its surplus in halvings: `low` fails, `high` passes. `None`: not tried.
         let (mut low, mut high) = ((least.saturating_sub(1), None), (all, None));
-        let mut next = FIRST * all as f64;
-        while tried.len() < MOST_TRIED && high.0 - low.0 > 1 && high.0 as f64 > SAME_SIZE * low.0 as f64 {
+        let mut next = FIRST_FRACTION * all as f64;
+        while tried.len() < MAX_SIZES && high.0 - low.0 > 1 && high.0 as f64 > SAME_SIZE_RATIO * low.0 as f64 {
             let size = (next.round() as usize).clamp(low.0 + 1, high.0 - 1);
             let now = self.try_size(trial, meter, size)?;
-            let spare = self.spare(now.value);
+            let surplus = self.surplus(now.value);
             tried.push((size, now.value));
-            if spare >= 0.0 {
-                (high, best) = ((size, Some(spare)), Some(now));
-                if spare <= CLOSE {
+            if surplus >= 0.0 {
+                (high, best) = ((size, Some(surplus)), Some(now));
+                if surplus <= MAX_SURPLUS {
                     break;
                 }
             } else {
-                low = (size, Some(spare));
+                low = (size, Some(surplus));
             }
             next = match (low, high) {
                 ((low, Some(below)), (high, Some(above))) => {
-                    // A little above where the line between both crosses zero.
-                    let part = ((0.5 * CLOSE - below) / (above - below)).clamp(0.1, 0.9);
+                    // Slightly above the size at which the line between both surpluses crosses zero.
+                    let part = ((0.5 * MAX_SURPLUS - below) / (above - below)).clamp(0.1, 0.9);
                     low as f64 * (high as f64 / low as f64).powf(part)
                 }
-                _ => size as f64 * (0.5 * CLOSE - spare).clamp(-2.0, 2.0).exp2(),
+                _ => size as f64 * (0.5 * MAX_SURPLUS - surplus).clamp(-2.0, 2.0).exp2(),
             };
         }
         let best = match best {
@@ -288,7 +294,7 @@ impl SearchStage {
         Ok((best, tried))
     }
 
-    /// Runs the stages that reduce the model to `size` Gaussians and measures what comes out.
+    /// Runs the stages that reduce the model to `size` Gaussians and measures the result.
     fn try_size(&self, trial: &mut RunState<'_>, meter: &QualityMeter<'_>, size: usize) -> Result<TriedSize> {
         (trial.journal, trial.target) = (Journal::default(), Some(size));
         trial.stages.run(Phase::Reduce, trial)?;
@@ -299,7 +305,8 @@ impl SearchStage {
         Ok(TriedSize { result, value, journal })
     }
 
-    /// What the goal is about, dB or dB lost, of `result`, by the pictures that are searched on or by those held back.
+    /// Returns the value that the goal limits, PSNR or loss of PSNR in dB, of `result`: on the views held back if
+    /// `held`, otherwise on the views of the search.
     fn value(&self, meter: &QualityMeter<'_>, result: &dyn FrameSource, scene: &Scene, held: bool) -> Result<f64> {
         let found = meter.measure(result, held)?;
         match self.searched {
@@ -308,17 +315,18 @@ impl SearchStage {
         }
     }
 
-    /// Halvings of the number of Gaussians that `value` has to spare, about.
-    fn spare(&self, value: f64) -> f64 {
+    /// Returns the surplus of quality of `value` over the goal, in approximate halvings of the number of Gaussians.
+    /// Negative if the goal is missed.
+    fn surplus(&self, value: f64) -> f64 {
         match self.searched {
-            // Of pictures that are not finite.
+            // Renders that are not finite never pass.
             _ if value.is_nan() => f64::NEG_INFINITY,
-            Quality::Loss { most, .. } => (most / value.max(LEAST_LOSS)).ln() / HALVING.1.ln(),
-            Quality::Psnr(least) => (value - least) / HALVING.0,
+            Quality::Loss { most, .. } => (most / value.max(MIN_LOSS)).ln() / COST_OF_HALVING.1.ln(),
+            Quality::Psnr(least) => (value - least) / COST_OF_HALVING.0,
         }
     }
 
-    /// Returns what is searched for, dB.
+    /// Returns the PSNR or the loss that is searched for, dB.
     fn goal(&self) -> f64 {
         match self.searched {
             Quality::Psnr(least) => least,
@@ -326,7 +334,7 @@ impl SearchStage {
         }
     }
 
-    /// Name of what is asked for, as a recipe has it.
+    /// Returns the name of the goal as in a recipe file.
     fn name(&self) -> &'static str {
         match self.quality {
             Quality::Psnr(_) => "min_psnr",
@@ -346,17 +354,18 @@ impl SearchStage {
     }
 }
 
-/// What was found, for a person: of `gaussians`, by so many pictures searched on, and whether it `does`.
-fn note(summary: &GoalSummary, searched: usize, gaussians: usize, does: bool) -> String {
+/// Returns a note about the result of the search for display. `searched` is the number of views of the search, `is_met`
+/// tells whether the result has the requested quality.
+fn note(summary: &GoalSummary, searched: usize, gaussians: usize, is_met: bool) -> String {
     let GoalSummary { name, asked, searched: by_searched, held, held_pictures, tried } = summary;
     let (sizes, others) = (tried.len(), held_pictures.len());
-    let (at, unit) = if name == "max_loss" { ("most", "dB lost against photographs") } else { ("least", "dB") };
-    let found = match does {
-        true => format!("of {sizes} sizes tried {gaussians} Gaussians are the fewest that do"),
-        false => format!("none of {sizes} sizes tried does, and everything that may stay is written"),
+    let (at, unit) = if name == "max_loss" { ("most", "dB loss against photographs") } else { ("least", "dB PSNR") };
+    let found = match is_met {
+        true => format!("{gaussians} Gaussians are the smallest of {sizes} tried sizes that reach this"),
+        false => format!("none of {sizes} tried sizes reaches this; all Gaussians that may stay are written"),
     };
     format!(
-        "at {at} {asked} {unit} asked for: {found}; {by_searched:.2} dB by the {searched} pictures searched on, \
-         {held:.2} dB by {others} held back (goal.held_pictures in the summary)"
+        "search for at {at} {asked} {unit}: {found}; {by_searched:.2} dB on the {searched} views of the search, \
+         {held:.2} dB on {others} other views (goal.held_pictures in the summary)"
     )
 }

@@ -1,7 +1,7 @@
-//! What the stages of a run have in common, and what they pass on to one another.
+//! Interface of the stages of a run, and the state that they pass on to one another.
 //!
-//! A stage is one file in [`stages`](super::stages): a type that implements [`Stage`], and a function that plans it. The
-//! list `STAGES` there has these functions in the order in which stages run.
+//! A stage is one file in [`stages`](super::stages): a type that implements [`Stage`], and a function that plans it.
+//! The list `STAGES` there holds these functions in the order in which stages run.
 
 use std::fmt::Debug;
 use std::sync::Arc;
@@ -27,121 +27,124 @@ use crate::refinement::start_count;
 use crate::scene::Scene;
 use crate::statistics::pass::Scanned;
 
-/// Part of the Gaussians that ranking leaves where a search refines nothing.
-const RANKED_BY_SEARCH: f64 = 0.02;
+/// Fraction of the Gaussians that ranking leaves in a search without refinement.
+const SEARCH_RANK_FRACTION: f64 = 0.02;
 
-/// Which part of a run a stage belongs to.
+/// Phase of a run that a stage belongs to.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Phase {
     /// From frames to a ranking of all Gaussians.
     Rank,
-    /// From a ranking to a model of one size. A search for a quality repeats these stages, once for every size it tries.
+    /// From a ranking to a model of one size. A search for a quality repeats these stages, once for every size it
+    /// tries.
     Reduce,
     /// From the model to files.
     Write,
 }
 
-/// What estimates of memory and time depend on.
+/// Inputs of the estimates of memory and time.
 #[derive(Debug, Clone, Copy)]
 pub struct EstimateInput<'a> {
     /// Size of the input and of its views.
     pub work: &'a Workload,
-    /// How much is held in memory at a time.
+    /// Limits on the data that is in memory at a time.
     pub limits: &'a Limits,
-    /// Part of the Gaussians in the output, above 0 and at most 1; 1 where it is not known before.
+    /// Fraction of the Gaussians in the output, above 0 and at most 1; 1 if it is not known in advance.
     pub left: f64,
-    /// What has been measured while a stream arrived.
+    /// Statistics that were taken while a stream arrived.
     pub measured: MeasuredOnArrival,
 }
 
 /// A stage of a run, with its parameters.
 pub trait Stage: Debug + Send + Sync {
-    /// Returns what the stage takes, one entry for each of its parts that progress lines name; none where such an input
-    /// leaves it nothing to do or it takes next to nothing.
+    /// Returns the estimates of the stage, one for each part that progress lines name. Empty if the stage has nothing
+    /// to do for such an input or takes a negligible amount.
     fn estimates(&self, input: EstimateInput<'_>) -> Vec<ResourceEstimate>;
 
-    /// Returns the parameters that decide how long the stage takes, for a person: "NAME: 3000 steps". Empty where there are
-    /// none.
+    /// Returns the parameters that determine the duration of the stage, for display: "NAME: 3000 steps". Empty if there
+    /// are none.
     fn parameters(&self) -> String {
         String::new()
     }
 
-    /// Returns whether the stage may find nothing to do where views hardly differ without a part `hardly_seen` of the
-    /// Gaussians. The shortest time of a run is estimated without such stages.
+    /// Returns whether the stage may find nothing to do if views hardly change when the fraction `hardly_seen` of the
+    /// Gaussians is removed. The shortest time of a run is estimated without such stages.
     fn may_be_skipped(&self, _input: EstimateInput<'_>, _hardly_seen: f64) -> bool {
         false
     }
 
-    /// Returns what several processes can divide among themselves, a line each: "NAME: 12 blocks of Gaussians".
+    /// Returns the work that several processes can divide among themselves, one line per unit kind: "NAME: 12 blocks of
+    /// Gaussians".
     fn shardable_units(&self, _scene: &Scene, _counts: &CountPlan) -> Vec<String> {
         Vec::new()
     }
 
-    /// Confirms, before any work, that the scene has what the stage needs.
+    /// Checks, before any work, that the scene has the files that the stage needs.
     ///
     /// # Errors
-    /// Files that are missing or too few.
+    /// Fails if files are missing or too few.
     fn check(&self, _scene: &Scene) -> Result<()> {
         Ok(())
     }
 
-    /// Runs the stage: reads what it needs from `run`, leaves there what it finds, and records in the journal what belongs
-    /// into the summary. Results are cached by the stage's own key, so that a run that was interrupted goes on from there.
+    /// Runs the stage. It reads its input from `run`, stores its results there, and records in the journal its part of
+    /// the summary. Results are cached under the stage's own key, so that an interrupted run continues from them.
     ///
     /// # Errors
-    /// Input that cannot be read, output that cannot be written, requests that the input cannot meet.
+    /// Fails if the input cannot be read, the output cannot be written, or the input cannot meet the request.
     fn run(&self, run: &mut RunState<'_>) -> Result<()>;
 }
 
-/// Which statistics of a stream were taken as it arrived.
+/// Kinds of statistics of a stream that were taken while it arrived.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct MeasuredOnArrival {
-    /// Every Gaussian at every frame.
+    /// Whether the scan was done: statistics of every Gaussian at every frame.
     pub scanned: bool,
-    /// What views show of each.
+    /// Whether the visible contribution of every Gaussian was measured on views.
     pub seen: bool,
 }
 
-/// What the frames say before anything is scored.
+/// Statistics of the frames before scoring.
 pub struct Measured {
-    /// Statistics of every Gaussian.
+    /// Statistics of every Gaussian from the scan.
     pub scanned: Scanned,
-    /// What the pictures show of each, where they were looked at.
+    /// Visible contribution of every Gaussian, if views were rendered.
     pub seen: Option<VisibleContribution>,
 }
 
 impl Measured {
-    /// Returns which statistics these are.
+    /// Returns the kinds of statistics that were taken.
     pub fn kinds(&self) -> MeasuredOnArrival {
         MeasuredOnArrival { scanned: true, seen: self.seen.is_some() }
     }
 }
 
-/// How many Gaussians each part of a run leaves: ranking removes the first, refinement the rest between its steps.
+/// Number of Gaussians that each part of a run leaves: ranking removes the first ones, refinement the rest in prune
+/// steps.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct CountPlan {
-    /// Part of all Gaussians with which refinement begins at least, where it removes the rest in prune steps; none: ranking
-    /// alone removes them.
+    /// Smallest fraction of all Gaussians with which refinement begins, if it removes the rest in prune steps. `None`:
+    /// ranking alone removes Gaussians.
     pub refinement_starts_at: Option<f64>,
-    /// Whether the number in the output is searched for.
+    /// Whether the number of Gaussians in the output is searched for.
     pub searches: bool,
 }
 
 impl CountPlan {
-    /// Returns how many of `all` Gaussians refinement begins with, if `wanted` are to stay.
+    /// Returns the number of Gaussians, of `all`, with which refinement begins if `wanted` are to stay.
     pub fn before_refinement(&self, wanted: usize, all: usize) -> usize {
         start_count(self.refinement_starts_at, wanted, all)
     }
 
-    /// Returns how many of `all` Gaussians ranking goes down to, if `wanted` are to stay. A search ranks as far down as its
-    /// smallest size needs.
+    /// Returns the number of Gaussians, of `all`, that ranking leaves if `wanted` are to stay. A search ranks down to
+    /// the number that its smallest size needs.
     pub fn after_ranking(&self, wanted: usize, all: usize) -> usize {
         let smallest =
-            if self.refinement_starts_at.is_some() { 0 } else { (RANKED_BY_SEARCH * all as f64).ceil() as usize };
+            if self.refinement_starts_at.is_some() { 0 } else { (SEARCH_RANK_FRACTION * all as f64).ceil() as usize };
         self.before_refinement(if self.searches { smallest } else { wanted }, all)
     }
 
-    /// Returns both counts for a person, on the way from `all` Gaussians to `target`.
+    /// Returns both counts as text for display, for a run from `all` Gaussians to `target`.
     pub(super) fn text(&self, target: Option<usize>, all: usize, merges: bool) -> String {
         let share =
             |count: usize| format!("{count} of {all} Gaussians ({:.0}%)", 100.0 * count as f64 / all.max(1) as f64);
@@ -154,48 +157,49 @@ impl CountPlan {
             }
             (Some(wanted), None) => format!("counts: {alone} {}; refinement removes none", share(wanted)),
             (None, Some(_)) => format!(
-                "counts: ranking leaves {} or more, refinement removes the rest; how many stay is found on the way",
+                "counts: ranking leaves {} or more, refinement removes the rest; the number that stays is found \
+                 during the run",
                 share(self.before_refinement(0, all))
             ),
-            (None, None) => format!("counts: {alone} as many as are found on the way; refinement removes none"),
+            (None, None) => format!("counts: {alone} a number that is found during the run; refinement removes none"),
         }
     }
 }
 
-/// Returns what a stage takes for an input, within limits.
+/// Function that returns the resource estimate of a stage for an input, within limits.
 type Estimate = Box<dyn Fn(&Workload, &Limits) -> ResourceEstimate + Send + Sync>;
 
-/// A stage that a run goes without.
+/// Stage that a run omits.
 struct LeftOutStage {
     what: &'static str,
     why: String,
-    /// What it would take.
+    /// Estimate of the omitted work.
     estimate: Option<Estimate>,
 }
 
-/// The stages of a run in their order, and what the run goes without.
+/// Stages of a run in their order, and the stages that it omits.
 #[derive(Default)]
 pub struct StageList {
     stages: Vec<(Phase, Box<dyn Stage>)>,
     left_out: Vec<LeftOutStage>,
-    /// How many Gaussians ranking and refinement leave.
+    /// Numbers of Gaussians that ranking and refinement leave.
     pub counts: CountPlan,
-    /// Whether the amount of work depends on what stages find, so that time estimates are wide.
+    /// Whether the amount of work depends on results of stages, which widens the range of time estimates.
     is_open_ended: bool,
 }
 
 impl StageList {
-    /// Adds a stage behind those before.
+    /// Appends a stage to the list.
     pub fn add(&mut self, phase: Phase, stage: impl Stage + 'static) {
         self.stages.push((phase, Box::new(stage)));
     }
 
-    /// Records that the run goes without `what`, and why.
+    /// Adds the omitted work `what` with the reason `why`.
     pub fn leave_out(&mut self, what: &'static str, why: impl Into<String>) {
         self.left_out.push(LeftOutStage { what, why: why.into(), estimate: None });
     }
 
-    /// Records that the run goes without `what`, which would take what `estimate` returns.
+    /// Adds the omitted stage `what` with the reason `why`; `estimate` returns its cost.
     pub fn leave_out_stage(
         &mut self,
         what: &'static str,
@@ -205,12 +209,12 @@ impl StageList {
         self.left_out.push(LeftOutStage { what, why: why.into(), estimate: Some(Box::new(estimate)) });
     }
 
-    /// Records that the amount of work depends on what stages find.
+    /// Marks the amount of work as dependent on results of stages.
     pub fn set_open_ended(&mut self) {
         self.is_open_ended = true;
     }
 
-    /// Returns whether the amount of work depends on what stages find.
+    /// Returns whether the amount of work depends on results of stages.
     pub fn is_open_ended(&self) -> bool {
         self.is_open_ended
     }
@@ -222,23 +226,23 @@ impl StageList {
 
     /// Returns the stages of `phase`.
     pub fn in_phase(&self, phase: Phase) -> impl Iterator<Item = &dyn Stage> {
-        self.stages.iter().filter(move |(of, _)| *of == phase).map(|(_, stage)| &**stage)
+        self.stages.iter().filter(move |(stage_phase, _)| *stage_phase == phase).map(|(_, stage)| &**stage)
     }
 
-    /// Runs the stages of `phase`.
+    /// Runs the stages of `phase` in order.
     ///
     /// # Errors
-    /// Those of the stages.
+    /// Fails if a stage fails; later stages do not run then.
     pub fn run(&self, phase: Phase, run: &mut RunState<'_>) -> Result<()> {
         self.in_phase(phase).try_for_each(|stage| stage.run(run))
     }
 
-    /// Returns what the run goes without, a line each, for a person.
+    /// Returns the omitted stages for display, one line each.
     pub fn left_out(&self) -> impl Iterator<Item = String> {
         self.left_out.iter().map(|left| format!("left out: {} ({})", left.what, left.why))
     }
 
-    /// Writes down what the run goes without.
+    /// Records the omitted stages in the journal, with the saved time and reads where an estimate exists.
     pub fn record_left_out(&self, work: &Workload, limits: &Limits, journal: &mut Journal) {
         for LeftOutStage { what, why, estimate } in &self.left_out {
             match estimate.as_ref().map(|estimate| estimate(work, limits)) {
@@ -252,72 +256,72 @@ impl StageList {
     }
 }
 
-/// What an archive is written from.
+/// Content of an archive.
 #[derive(Debug, Serialize, Deserialize)]
 pub enum Archived {
-    /// A model, or a cloud.
+    /// Encoded model or point cloud.
     Content(Encoded),
-    /// What is left of frames, within bounds.
+    /// Error bounds within which the frames are stored.
     Frames(Bounds),
 }
 
-/// What fits into so many bytes.
+/// Number of Gaussians that fits a byte limit at one SH degree.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ByteLimitFit {
-    /// Highest SH degree.
+    /// Highest SH degree of the result.
     pub sh_degree: usize,
-    /// How many Gaussians of that degree.
+    /// Number of Gaussians that fits at this degree.
     pub gaussians: usize,
 }
 
-/// What a run has found so far.
+/// State of a run: its inputs and the results of its stages so far.
 pub struct RunState<'a> {
-    /// The scene that is compressed.
+    /// Scene that is compressed.
     pub scene: &'a Scene,
-    /// What was asked for.
+    /// Request of the user.
     pub request: &'a Request,
-    /// The stages, and how many Gaussians each part of the run leaves.
+    /// Stages of the run, and the numbers of Gaussians that its parts leave.
     pub stages: &'a StageList,
-    /// What goes into the summary.
+    /// Records for the summary.
     pub journal: Journal,
-    /// The input for the summary. Its digest reads the whole input, so that it is computed once.
+    /// Description of the input for the summary. Its digest reads the whole input, so it is computed once.
     pub input: Option<InputSummary>,
     /// Text of the file `recipe.toml` beside the result.
     pub recipe: String,
-    /// Statistics of a stream, taken as it arrived.
+    /// Statistics of a stream that were taken while it arrived.
     pub arrived: Option<Measured>,
-    /// Statistics and scores.
+    /// Statistics and scores of all Gaussians.
     pub scored: Option<Arc<Scored>>,
-    /// All Gaussians that may stay, the most important first.
+    /// Ranking of all Gaussians that may stay, most important first.
     pub ranking: Option<Arc<Ranking>>,
-    /// Number of Gaussians in the output, where it is asked for or has been found.
+    /// Number of Gaussians in the output, if it was requested or has been found.
     pub target: Option<usize>,
-    /// Numbers of Gaussians that fit the size on disk that was asked for, by falling SH degree.
+    /// Numbers of Gaussians that fit the requested size on disk, in order of decreasing SH degree.
     pub fits: Vec<ByteLimitFit>,
-    /// A model without Gaussians that has what all results of this run share: SH degree, rule of merging.
+    /// Model without Gaussians that holds the settings shared by all results of this run: SH degree, merge parameters.
     pub template: CompressedModel,
-    /// What is left of the scene.
+    /// Compressed model so far.
     pub result: CompressedModel,
-    /// Number of Gaussians that refinement leaves of [`result`](RunState::result).
+    /// Number of Gaussians of [`result`](RunState::result) that refinement leaves.
     pub wanted: usize,
-    /// States of a search on the way to smaller sizes, from which the next size goes on.
+    /// Refinement state of a search after its prune steps, from which the next smaller size continues.
     pub prune_steps: Option<PruneSteps<'a>>,
-    /// Counts of merging.
+    /// Counts of the merge stage.
     pub merge: Option<MergeSummary>,
-    /// What a search has found.
+    /// Result of the search for a quality.
     pub goal: Option<GoalSummary>,
-    /// The encoded archive.
+    /// Content of the archive, if one is written.
     pub archived: Option<Archived>,
-    /// How close the archive is.
+    /// Quality and size of the archive.
     pub archive: Option<ArchiveSummary>,
     /// Quality of the result, where it was measured.
     pub quality: Option<QualitySummary>,
-    /// The summary, and where each Gaussian of the input is in the output, once the result is written.
+    /// Summary, and the index of every input Gaussian in the output; set once the result is written.
     pub written: Option<(Summary, Vec<Option<u32>>)>,
 }
 
 impl<'a> RunState<'a> {
-    /// Returns the state before the first stage.
+    /// Returns the state of a run before its first stage.
     pub fn new(
         scene: &'a Scene,
         request: &'a Request,
@@ -352,7 +356,7 @@ impl<'a> RunState<'a> {
     /// Returns statistics and scores.
     ///
     /// # Errors
-    /// An internal error where no stage has measured before.
+    /// Fails with an internal error if no earlier stage has computed them.
     pub fn scored(&self) -> Result<Arc<Scored>> {
         self.scored.clone().ok_or_else(|| Error::internal("a stage needs scores before they were computed"))
     }
@@ -360,12 +364,12 @@ impl<'a> RunState<'a> {
     /// Returns the ranking.
     ///
     /// # Errors
-    /// An internal error where no stage has ranked before.
+    /// Fails with an internal error if no earlier stage has computed it.
     pub fn ranking(&self) -> Result<Arc<Ranking>> {
         self.ranking.clone().ok_or_else(|| Error::internal("a stage needs the ranking before it was computed"))
     }
 
-    /// Takes the model out of the state, to be changed.
+    /// Takes the model out of the state so that a stage can change it; leaves the template.
     pub fn take_result(&mut self) -> CompressedModel {
         std::mem::replace(&mut self.result, self.template.clone())
     }

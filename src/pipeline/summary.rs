@@ -1,8 +1,8 @@
-//! What a run did, for people and for programs: counts in and out of every stage, what was left out
-//! and why, memory and time. The only output whose bytes differ between runs.
+//! Summary of a run for people and programs: counts before and after every stage, omitted stages with reasons, memory
+//! and time. It is the only output whose bytes differ between runs.
 //!
-//! These types are the one schema of `summary.json`: `compress` writes it by them and `report` reads it by them. What
-//! its fields mean to other programs stands in `format/SUMMARY.md`.
+//! These types are the only definition of the schema of `summary.json`: `compress` writes and `report` reads the file
+//! through them. `format/SUMMARY.md` documents the fields for other programs.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -23,86 +23,87 @@ use crate::pruning::Counts;
 use crate::recipe::ProxyOpacity;
 use crate::scene::Scene;
 
-/// What the output's size was found by.
+/// Result of the search for a quality.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct GoalSummary {
-    /// `min_psnr` or `max_loss`, dB.
+    /// Kind of the goal: `min_psnr` or `max_loss`, both in dB.
     pub name: String,
-    /// What was asked for.
+    /// Requested value, dB.
     pub asked: f64,
-    /// What the output has, by what was searched on.
+    /// Value of the output on the views of the search, dB.
     #[serde(deserialize_with = "number")]
     pub searched: f64,
-    /// The same by pictures that nothing was searched on.
+    /// Value of the output on views that were held back from the search, dB.
     #[serde(deserialize_with = "number")]
     pub held: f64,
-    /// Names of these pictures; of those that no camera of the scene takes, their frames.
+    /// Names of the held-back views. A view between the cameras of the scene is named by its frame.
     pub held_pictures: Vec<String>,
-    /// Every size that was tried, and what it has by what was searched on.
+    /// Every tried number of Gaussians, with its value on the views of the search, dB.
     #[serde(deserialize_with = "sizes")]
     pub tried: Vec<(usize, f64)>,
 }
 
-/// What an archive is made of.
+/// Quality and contents of an archive.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ArchiveSummary {
-    /// PSNR of its pictures against those of the result before it was put on grids, dB: asked for.
+    /// Requested PSNR of the archive's views against views of the result before quantization, dB.
     pub asked: f64,
-    /// The same, found.
+    /// PSNR that was reached, dB.
     pub psnr: f64,
-    /// PSNR of the result's pictures against the original's on the same pictures, dB.
+    /// PSNR of the result before quantization against the original, on the same views, dB.
     pub level: f64,
-    /// How much less the archive's pictures have against the original's, dB.
+    /// Loss of PSNR against the original caused by quantization, dB.
     pub loss: f64,
-    /// Bytes of its parts; none of frames, which are one.
+    /// Bytes by part; `None` for an archive of frames, which has one part.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub parts: Option<ArchiveSize>,
-    /// Of frames the bound of every column, by name, in its unit.
+    /// Error bound of every attribute, by name, in the attribute's unit; only for an archive of frames.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub bounds: Option<BTreeMap<String, f64>>,
-    /// Bits of every attribute and tensor, by name; of frames none.
+    /// Bits of every attribute and tensor, by name; empty for an archive of frames.
     pub bits: BTreeMap<String, f64>,
-    /// Of every attribute and tensor, or column of frames, its name, log2 of a step (twice the bound), the squared error that
-    /// this alone adds to pictures, and the bits that it then takes, of frames in some blocks: where the steps were found from.
+    /// Measurements from which the quantization steps were derived, one entry per attribute or tensor: name, log2 of
+    /// the step (twice the error bound for frames), squared error of views caused by this step alone, and bits at this
+    /// step (for frames: in some blocks of Gaussians).
     pub measured: Vec<(String, f64, f64, f64)>,
 }
 
-/// The input, as the summary names it.
+/// Description of the input.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct InputSummary {
-    /// Last name of its path in files; the path as given on standard output.
+    /// Path of the input: only the last component in files, the path as given on standard output.
     pub path: String,
-    /// "4DGaussians model", "PLY sequence", ...
+    /// Kind of the input: "4DGaussians model", "PLY sequence", ...
     pub kind: String,
-    /// Hash over the bytes read.
+    /// Digest of the bytes read.
     pub digest: String,
-    /// N.
+    /// Number of Gaussians, N.
     pub gaussians: usize,
-    /// T; none for a model whose frames nobody has chosen yet.
+    /// Number of frames, T; `None` for a model whose frames have not been chosen yet.
     pub frames: Option<usize>,
-    /// Degree of the spherical harmonics.
+    /// SH degree.
     pub sh_degree: usize,
-    /// Columns that differ between frames.
+    /// Names of the attributes that differ between frames.
     pub varying: Vec<String>,
-    /// Bytes of everything that a renderer opens of the model, or that arrived of a stream.
+    /// Bytes of all files that a renderer opens, or bytes that arrived of a stream.
     pub bytes: u64,
-    /// The same by part.
+    /// Bytes by part.
     pub size: Size,
 }
 
 impl InputSummary {
-    /// Of the input of an open scene.
+    /// Returns the description of the input of an open scene.
     ///
     /// # Errors
-    /// A file that cannot be read.
+    /// Fails if a file cannot be read.
     pub fn from_scene(scene: &Scene) -> Result<InputSummary> {
         InputSummary::new(&*scene.input, &scene.path, scene.digest()?)
     }
 
-    /// Of an open input, whose path and digest are given.
+    /// Returns the description of an open input with the given path and digest.
     ///
     /// # Errors
-    /// A file that cannot be read.
+    /// Fails if a file cannot be read.
     pub fn new(input: &dyn InputModel, path: &Path, digest: String) -> Result<InputSummary> {
         let info = input.source().info();
         Ok(InputSummary {
@@ -120,25 +121,25 @@ impl InputSummary {
 }
 
 impl InputSummary {
-    /// Returns the summary with the last name of the input's path alone, for a file.
+    /// Returns the description with only the last component of the input's path, for a file that may be published.
     pub fn without_folders(self) -> InputSummary {
         InputSummary { path: name_of(Path::new(&self.path)), ..self }
     }
 }
 
-/// The cameras, as the summary names them.
+/// Description of the cameras.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct CameraSummary {
-    /// File, or the recipe of a virtual rig.
+    /// File of the cameras, or the description of a virtual rig.
     pub origin: String,
-    /// Distinct cameras.
+    /// Number of distinct cameras.
     pub cameras: usize,
-    /// M, (time, view) pairs that were scored.
+    /// Number of scored (time, view) pairs, M.
     pub pairs: usize,
 }
 
 impl CameraSummary {
-    /// Of the pictures that are scored.
+    /// Returns the description of the views of `scene` that are scored.
     pub fn from_scene(scene: &Scene) -> CameraSummary {
         CameraSummary {
             origin: scene.rig.origin.clone(),
@@ -148,109 +149,110 @@ impl CameraSummary {
     }
 }
 
-/// What merging did.
+/// Counts of the merge stage.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct MergeSummary {
     /// Frame at which Gaussians were compared and merged.
     pub reference_frame: usize,
-    /// Proxies in the output.
+    /// Number of proxies in the output.
     pub proxies: usize,
-    /// Gaussians that went into them.
+    /// Number of Gaussians that were merged into proxies.
     pub members: usize,
-    /// Rule by which a proxy's opacity was made.
+    /// Rule for the opacity of a proxy.
     pub opacity: ProxyOpacity,
-    /// One entry per pass.
+    /// Counts of every merge pass.
     pub passes: Vec<PassCounts>,
-    /// Furthest that a proxy strays from its place among its members over sampled frames, scene units;
-    /// none without a deformation field.
+    /// Largest distance between a proxy and its position among its members over sampled frames, scene units; `None`
+    /// without a deformation field.
     pub deviation: Option<f64>,
 }
 
 impl MergeSummary {
-    /// Counts what became of `clusters`.
+    /// Sets the numbers of proxies and members from `clusters`.
     pub(super) fn count(&mut self, clusters: &[Cluster]) {
         self.proxies = clusters.len();
         self.members = clusters.iter().map(|cluster| cluster.members.len()).sum();
     }
 }
 
-/// How much of a summary a person is told.
+/// Amount of detail in the text of a summary.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Detail {
-    /// What was kept, what it costs and where it lies.
+    /// Kept Gaussians, size, quality, time, output and a few notes.
     Most,
-    /// And every stage, what was left out and why, and all notes.
+    /// Additionally every stage, omitted stages with reasons, and all notes.
     All,
 }
 
-/// Version of the schema: grows when a field changes its meaning or goes.
+/// Version of the schema; grows when a field is removed or changes its meaning.
 pub const SCHEMA: u32 = 3;
 
-/// A run from input to output.
+/// Summary of a run from input to output.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Summary {
-    /// [`SCHEMA`].
+    /// Version of the schema, [`SCHEMA`].
     pub schema: u32,
-    /// Program and version.
+    /// Name and version of the program.
     pub tool: String,
-    /// What was read.
+    /// Description of the input.
     pub input: InputSummary,
-    /// From where it was looked at.
+    /// Cameras whose views were scored.
     pub cameras: CameraSummary,
-    /// Last name of the output in files; its path as given on standard output.
+    /// Path of the output: only the last component in files, the path as given on standard output.
     #[serde(default, skip_serializing_if = "String::is_empty")]
     pub output: String,
-    /// Gaussians in the output.
+    /// Number of Gaussians in the output.
     pub gaussians: usize,
-    /// Bytes of everything that a renderer opens of the output.
+    /// Bytes of all files of the output that a renderer opens.
     pub output_bytes: u64,
-    /// The same by part.
+    /// Bytes of the output by part.
     pub output_size: Size,
-    /// Stages 1 and 2.
+    /// Counts of scoring and selection (stages 1 and 2 of the paper).
     pub selection: Counts,
-    /// Full reads of the input that the plan named at most; none where nothing was planned.
+    /// Maximum number of full reads of the input in the memory plan; `None` if there was no plan.
     pub planned_reads: Option<f64>,
-    /// What the run was expected to take before it began, where that was said.
+    /// Forecast that was made before the run, if there was one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub forecast: Option<Forecast>,
-    /// Everything in order.
+    /// Records of all stages in order.
     pub stages: Vec<StageRecord>,
-    /// Percentiles of every term.
+    /// Percentiles of every term of the score.
     pub terms: Vec<TermSummary>,
-    /// Odd Gaussians.
+    /// Counts of unusual Gaussians.
     pub flags: FlagSummary,
-    /// Stage 3, unless it was left out.
+    /// Counts of merging (stage 3 of the paper), unless it was omitted.
     pub merge: Option<MergeSummary>,
-    /// What its size was found by, if by a quality.
+    /// Result of the search for a quality, if one was requested.
     pub goal: Option<GoalSummary>,
-    /// What half precision does to the field that is written; none where it was not asked for.
+    /// Measured effect of half precision on the deformation field; `None` if half precision was not requested.
     pub field: Option<FieldSummary>,
-    /// What fewer bands of spherical harmonics do; none where they were not asked for or cannot be.
+    /// Measured effect of lower SH degrees; `None` if they were not requested or are impossible.
     pub bands: Option<BandsSummary>,
-    /// What refining gained; none where nothing was refined.
+    /// Quality gained by refinement; `None` if nothing was refined.
     pub refined: Option<RefinedSummary>,
     /// Quality of the result on test views, else on validation or training views, and render times.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub quality: Option<QualitySummary>,
-    /// What an archive is made of, if one was written.
+    /// Quality and contents of the archive, if one was written.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub archive: Option<ArchiveSummary>,
-    /// What the scene did not need.
+    /// Stages that the run omitted, with reasons.
     pub left_out: Vec<LeftOut>,
-    /// Things a person should know.
+    /// Notes for the user.
     pub notes: Vec<String>,
-    /// Files of the result, relative to the summary's folder: what overwriting it replaces. Entered once all lie there.
+    /// Files of the result, relative to the folder of the summary; overwriting the result replaces them. Filled in once
+    /// all files are written.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub files: Vec<String>,
 }
 
 impl Summary {
-    /// Full reads of the input, all stages together.
+    /// Returns the number of full reads of the input, summed over all stages.
     pub fn full_reads(&self) -> f64 {
         self.stages.iter().map(|stage| stage.full_reads).sum()
     }
 
-    /// As JSON, for programs.
+    /// Returns the summary as JSON, for programs.
     pub fn json(&self) -> String {
         let mut text = serde_json::to_string_pretty(self).expect("a summary is plain data");
         text.push('\n');

@@ -1,7 +1,8 @@
-//! How fast this machine is at this scene: some states read, and some pictures made on all threads, before a run says what
-//! it will take.
+//! Calibration of time estimates before a run: reads some frame states and renders some views on all threads to find
+//! out how fast this machine handles this scene.
 //!
-//! Memory: a state of all Gaussians and what a picture takes, which is less than any stage that looks at pictures takes.
+//! Memory: the state of all Gaussians and the memory of one rendered view, less than any stage that renders views
+//! takes.
 
 use std::num::NonZeroU32;
 use std::sync::{Mutex, PoisonError};
@@ -21,26 +22,27 @@ use crate::render::{Contribution, RemovalError, Renderer};
 use crate::scene::Scene;
 use crate::source::{Ids, ReadPlan};
 
-/// Part of what a run is expected to take that may go into finding out, ...
-const PART: f64 = 0.04;
-/// ... and at most so many seconds on all threads.
-const MOST_SECONDS: f64 = 1.0;
-/// Frames that are read of each block, unless some are stored together.
-const FRAMES: u64 = 16;
-/// Pictures that each thread makes in every way.
-const PICTURES: usize = 2;
-/// PSNR, dB, of what the pictures that were looked at lose by pruning alone, above which there may be nothing to refine
+/// Maximum time of a calibration as a fraction of the expected time of the run.
+const MAX_TIME_FRACTION: f64 = 0.04;
+/// Maximum time of a calibration on all threads, seconds.
+const MAX_SECONDS: f64 = 1.0;
+/// Number of frames that are read of each block of Gaussians; more if blocks store more frames together.
+const FRAMES_PER_BLOCK: u64 = 16;
+/// Number of views that each thread renders in each way (contribution, removal error, image).
+const VIEWS_PER_THREAD: usize = 2;
+/// PSNR, dB, above which the loss by pruning alone may leave nothing to refine
 /// ([`crate::refinement::CLOSE_ENOUGH`]).
-const HARDLY_LOST: f64 = 60.0;
+const CLOSE_PSNR: f64 = 60.0;
 
-/// Runs that are expected to take less seconds than this are not measured beforehand.
-const SHORT: f64 = 2.0;
+/// Minimum expected time of a run that is calibrated, seconds.
+const MIN_RUN_SECONDS: f64 = 2.0;
 
-/// What `stages` will take, as `plan` has them, but for those that are `measured` already, on `scene`, once it follows that plan; measures
-/// first, unless the run is short. The scene's pace is set by that.
+/// Returns the expected time and memory of `stages` with the memory plan `plan`, without statistics that are `measured`
+/// already. Calibrates first unless the run is short. The scene must follow the plan already; its throughput is set to
+/// the result.
 ///
 /// # Errors
-/// Frames that cannot be read.
+/// Fails if frames cannot be read.
 pub(super) fn forecast(
     scene: &mut Scene,
     plan: &Plan,
@@ -49,7 +51,7 @@ pub(super) fn forecast(
 ) -> Result<Forecast> {
     let work = scene.workload();
     let expected = core_seconds(&stages.remaining_estimates(&work, &scene.limits, measured)) / work.threads as f64;
-    let found = if expected < SHORT { Calibration::NONE } else { Calibration::measure(scene, expected)? };
+    let found = if expected < MIN_RUN_SECONDS { Calibration::NONE } else { Calibration::measure(scene, expected)? };
     scene.pace = found.pace;
     let work = scene.workload();
     let shortest = stages.shortest_estimates(&work, &scene.limits, measured, found.hardly_seen);
@@ -57,98 +59,103 @@ pub(super) fn forecast(
     Ok(Forecast::new(&work, &estimates, core_seconds(&shortest), stages.is_open_ended(), plan.peak()))
 }
 
-/// What was found before a run.
+/// Result of a calibration.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Calibration {
-    /// How fast.
+    /// Measured throughput.
     pace: Throughput,
-    /// Part of the Gaussians that pictures hardly differ without; 0 if nothing was looked at.
+    /// Fraction of the Gaussians whose removal hardly changes views; 0 if no view was rendered.
     hardly_seen: f64,
 }
 
 impl Calibration {
-    /// Of nothing.
+    /// Result without any measurement.
     const NONE: Calibration = Calibration { pace: Throughput::UNKNOWN, hardly_seen: 0.0 };
 
-    /// Of `scene`, for a run that is expected to take so many seconds on all threads; of a short one nothing but the states
-    /// of some Gaussians is looked at.
+    /// Calibrates on `scene` for a run that is expected to take `expected` seconds on all threads. For a short run only
+    /// states of some Gaussians are read; no view is rendered.
     ///
     /// # Errors
-    /// Frames that cannot be read.
+    /// Fails if frames cannot be read.
     fn measure(scene: &Scene, expected: f64) -> Result<Calibration> {
         let work = scene.workload();
         if work.gaussians == 0 || work.frames == 0 {
             return Ok(Calibration::NONE);
         }
-        let room = (PART * expected).min(MOST_SECONDS) * work.threads as f64;
-        let mut spent = Spent::default();
-        let states = states(scene, &work, room, &mut spent)?;
+        let budget = (MAX_TIME_FRACTION * expected).min(MAX_SECONDS) * work.threads as f64;
+        let mut spent = MeasuredTime::default();
+        let states = measure_states(scene, &work, budget, &mut spent)?;
         let machine = Throughput { states, look: states, remove: states, render: states, processors: None };
         let work = Workload { pace: machine, ..work };
-        let each = PICTURES as f64 * work.threads as f64;
-        let pictures = [LOOK, REMOVE, RENDER].map(|way| work.picturing(each, work.count(), way));
-        let takes = work.reading(work.count(), work.input.frame_block.max(1) as f64)
+        let views_per_way = VIEWS_PER_THREAD as f64 * work.threads as f64;
+        let pictures = [LOOK, REMOVE, RENDER].map(|way| work.picturing(views_per_way, work.count(), way));
+        let needed_seconds = work.reading(work.count(), work.input.frame_block.max(1) as f64)
             + pictures.iter().sum::<f64>()
             + pictures[2];
         let mut found = Calibration { pace: machine, hardly_seen: 0.0 };
-        if takes <= room && work.pictures > 0 {
-            found.look_at(scene, pictures, &mut spent)?;
+        if needed_seconds <= budget && work.pictures > 0 {
+            found.render_views(scene, pictures, &mut spent)?;
         }
         found.pace.processors = spent.processors(work.threads);
         Ok(found)
     }
 
-    /// Makes pictures of one frame, which are expected to take so long in each way.
-    fn look_at(&mut self, scene: &Scene, expected: [f64; 3], spent: &mut Spent) -> Result<()> {
+    /// Renders views of one frame and updates throughput and `hardly_seen`. `expected` holds the core-seconds that the
+    /// contribution, the removal error and the images are expected to take.
+    fn render_views(&mut self, scene: &Scene, expected: [f64; 3], spent: &mut MeasuredTime) -> Result<()> {
         let schedule = &scene.schedule;
         let middle = schedule.iter().count() / 2;
         let seen = schedule.iter().enumerate().filter(|(_, views)| !views.is_empty());
         let Some((frame, views)) = seen.min_by_key(|(frame, _)| frame.abs_diff(middle)) else { return Ok(()) };
         let state = gather_all(scene.source(), frame, Columns::all())?;
         let threads = rayon::current_num_threads();
-        let camera =
-            |k: usize| &schedule.cameras[views[k * views.len() / (PICTURES * threads) % views.len()].1 as usize];
+        let camera = |k: usize| {
+            &schedule.cameras[views[k * views.len() / (VIEWS_PER_THREAD * threads) % views.len()].1 as usize]
+        };
         let renderers: Vec<_> = (0..threads).map(|_| Mutex::new(Renderer::new())).collect();
-        let each = |visit: &(dyn Fn(&mut Renderer, usize, &Camera) + Sync)| {
+        let on_all_threads = |visit: &(dyn Fn(&mut Renderer, usize, &Camera) + Sync)| {
             (0..threads).into_par_iter().for_each(|thread| {
                 let mut renderer = renderers[thread].lock().unwrap_or_else(PoisonError::into_inner);
-                (0..PICTURES).for_each(|k| visit(&mut renderer, thread, camera(thread * PICTURES + k)));
+                (0..VIEWS_PER_THREAD).for_each(|k| visit(&mut renderer, thread, camera(thread * VIEWS_PER_THREAD + k)));
             });
         };
-        // Its first pictures also make room for themselves.
-        each(&|renderer, _, camera| _ = renderer.render(&state, camera, scene.background));
+        // The first views also allocate the buffers of the renderers, so they are not timed.
+        on_all_threads(&|renderer, _, camera| _ = renderer.render(&state, camera, scene.background));
         let [look, remove, render] = expected;
         let pace = &mut self.pace;
-        let looked = spent.on(|| {
-            each(&|renderer, _, camera| {
+        let looked = spent.time(|| {
+            on_all_threads(&|renderer, _, camera| {
                 renderer.contribution(&state, camera, NonZeroU32::MIN, &mut Contribution::new(state.len()));
             });
         });
         let errors: Vec<_> = (0..threads).map(|_| Mutex::new(RemovalError::new(state.len(), 0.0))).collect();
-        let removed = spent.on(|| {
-            each(&|renderer, thread, camera| {
+        let removed = spent.time(|| {
+            on_all_threads(&|renderer, thread, camera| {
                 let mut errors = errors[thread].lock().unwrap_or_else(PoisonError::into_inner);
                 renderer.removal_error(&state, camera, scene.background, &mut errors);
             });
         });
-        let rendered = spent.on(|| each(&|renderer, _, camera| _ = renderer.render(&state, camera, scene.background)));
+        let rendered =
+            spent.time(|| on_all_threads(&|renderer, _, camera| _ = renderer.render(&state, camera, scene.background)));
         for (measured, expected, pace) in
             [(looked, look, &mut pace.look), (removed, remove, &mut pace.remove), (rendered, render, &mut pace.render)]
         {
             *pace *= measured.unwrap_or(expected) / expected;
         }
         let mut sum = RemovalError::new(state.len(), 0.0);
-        errors.into_iter().for_each(|of| sum.merge(&of.into_inner().unwrap_or_else(PoisonError::into_inner)));
-        let pixels: f64 = (0..PICTURES * threads).map(camera).map(|c| f64::from(c.width) * f64::from(c.height)).sum();
+        errors.into_iter().for_each(|errors| sum.merge(&errors.into_inner().unwrap_or_else(PoisonError::into_inner)));
+        let pixels: f64 =
+            (0..VIEWS_PER_THREAD * threads).map(camera).map(|c| f64::from(c.width) * f64::from(c.height)).sum();
         self.hardly_seen = hardly_seen(sum.sum, 3.0 * pixels);
         Ok(())
     }
 }
 
-/// Part of the Gaussians whose `errors`, the least ones, together leave so many `values` that close.
+/// Returns the fraction of the Gaussians with the smallest `errors` whose sum keeps views within [`CLOSE_PSNR`].
+/// `errors` are in units of [`RemovalError::UNIT`]; `values` is the number of color values that were rendered.
 fn hardly_seen(mut errors: Vec<u64>, values: f64) -> f64 {
     errors.sort_unstable();
-    let most = values * 10f64.powf(-HARDLY_LOST / 10.0) / RemovalError::UNIT;
+    let most = values * 10f64.powf(-CLOSE_PSNR / 10.0) / RemovalError::UNIT;
     let mut sum = 0.0;
     let few = errors.iter().take_while(|&&error| {
         sum += error as f64;
@@ -157,14 +164,17 @@ fn hardly_seen(mut errors: Vec<u64>, values: f64) -> f64 {
     few.count() as f64 / errors.len().max(1) as f64
 }
 
-/// Times the expected seconds that states take.
-fn states(scene: &Scene, work: &Workload, room: f64, spent: &mut Spent) -> Result<f64> {
+/// Measures the reading of frame states. Returns the measured core-seconds divided by the expected ones, from 0.05 to
+/// 20; 1 where the system does not report processor time. `budget` is the time that the calibration may take,
+/// core-seconds.
+fn measure_states(scene: &Scene, work: &Workload, budget: f64, spent: &mut MeasuredTime) -> Result<f64> {
     let source = scene.source();
-    let frames = work.frames.min(FRAMES.max(work.input.frame_block)) as usize;
-    let of_block = work.reading(BLOCK.min(source.info().count) as f64, frames as f64);
+    let frames = work.frames.min(FRAMES_PER_BLOCK.max(work.input.frame_block)) as usize;
+    let block_seconds = work.reading(BLOCK.min(source.info().count) as f64, frames as f64);
     let all = source.info().count.div_ceil(BLOCK);
-    let blocks = ((0.3 * room / of_block) as usize).clamp(1, 4 * work.threads as usize).min(all);
-    // Most stages read everything but harmonics; readers are opened once for many frames.
+    let blocks = ((0.3 * budget / block_seconds) as usize).clamp(1, 4 * work.threads as usize).min(all);
+    // Most stages read every attribute but SH. Readers are opened before the clock starts because stages open them once
+    // for many frames.
     let columns = Columns::all().difference(Columns::SH);
     let open = |k: usize| -> Result<_> {
         let start = k * all / blocks * BLOCK;
@@ -176,26 +186,26 @@ fn states(scene: &Scene, work: &Workload, room: f64, spent: &mut Spent) -> Resul
     };
     let mut readers = (0..blocks).into_par_iter().map(open).collect::<Result<Vec<_>>>()?;
     let mut done = Ok(());
-    let took = spent.on(|| {
+    let took = spent.time(|| {
         done = readers
             .par_iter_mut()
             .try_for_each(|(reader, state)| (0..frames).try_for_each(|frame| reader.read(frame, columns, state)));
     });
     done?;
-    let expected = of_block * blocks as f64;
+    let expected = block_seconds * blocks as f64;
     Ok(took.map_or(1.0, |took| took / expected).clamp(0.05, 20.0))
 }
 
-/// Seconds of all threads, and of the wall, that measuring took.
+/// Time that measuring took: seconds of all processors, and wall-clock seconds.
 #[derive(Debug, Default)]
-struct Spent {
+struct MeasuredTime {
     processors: f64,
     wall: f64,
 }
 
-impl Spent {
-    /// Seconds of all processors that `work` takes; none where the system does not say.
-    fn on(&mut self, work: impl FnOnce()) -> Option<f64> {
+impl MeasuredTime {
+    /// Runs `work` and returns its processor time in seconds; `None` where the system does not report it.
+    fn time(&mut self, work: impl FnOnce()) -> Option<f64> {
         let clock = Clock::start();
         work();
         let (processors, wall) = (clock.processor_seconds()?, clock.seconds());
@@ -204,7 +214,7 @@ impl Spent {
         Some(processors)
     }
 
-    /// Processors at work at a time; none where it took no time.
+    /// Returns the average number of busy processors; `None` if measuring took almost no time.
     fn processors(&self, threads: u64) -> Option<f64> {
         (self.wall > 0.01).then(|| (self.processors / self.wall).clamp(0.1, threads as f64))
     }
@@ -216,7 +226,7 @@ mod tests {
     use crate::pipeline::tests::scene;
 
     #[test]
-    fn a_calibration_measures_what_it_has_room_for_and_leaves_the_scene_as_it_was() {
+    fn calibration_fits_its_time_and_leaves_the_scene_unchanged() {
         let folder = tempfile::tempdir().unwrap();
         let scene = scene(folder.path());
         let before = scene.workload();
@@ -229,8 +239,8 @@ mod tests {
     }
 
     #[test]
-    fn the_part_that_is_hardly_seen_is_of_least_errors_that_leave_pictures_close() {
-        // 1000 values of 60 dB: a squared error of 0.001 in all.
+    fn hardly_seen_counts_smallest_errors_within_60_db() {
+        // 1000 values at 60 dB allow a squared error of 0.001 in total.
         let units = |error: f64| (error / RemovalError::UNIT) as u64;
         let errors = vec![0, units(0.05), units(0.0004), units(0.0005), 0, units(0.0002), units(0.1), 0];
         assert_eq!(hardly_seen(errors, 1000.0), 5.0 / 8.0);

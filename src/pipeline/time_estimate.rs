@@ -1,4 +1,4 @@
-//! What a run will take, with ranges, before it begins.
+//! Forecast of a run: expected time with a range, and memory, before the run begins.
 
 use std::fmt::Write as _;
 
@@ -6,20 +6,21 @@ use crate::journal::records::{Forecast, Range, StageForecast};
 use crate::memory_plan::{ResourceEstimate, Verbosity, Workload, size};
 use crate::progress::duration;
 
-/// How far off core-seconds were on three trained models at several sizes after a calibration (`scripts/estimate.py`), as
-/// parts of what was expected, and somewhat more.
-const OFF: [f64; 2] = [0.5, 1.6];
-/// The same where nothing was measured.
-const OFF_UNMEASURED: [f64; 2] = [0.25, 4.0];
-/// The same where the size itself is searched for: how often pictures are refined is found on the way.
-const OFF_SEARCHING: [f64; 2] = [0.15, 2.5];
-/// Part of the processors that stages keep at work, at least: not everything is divided among threads.
-const TOGETHER: f64 = 0.6;
-/// Seconds that starting, opening and writing take, whatever is done.
-const AT_LEAST: f64 = 0.5;
+/// Range of measured core-seconds relative to expected ones after a calibration: lowest and highest ratio on three
+/// trained models at several sizes (`scripts/estimate.py`), slightly widened.
+const ERROR_RANGE: [f64; 2] = [0.5, 1.6];
+/// Range of the same ratio without a calibration.
+const ERROR_RANGE_UNCALIBRATED: [f64; 2] = [0.25, 4.0];
+/// Range of the same ratio for a search, whose number of refinements is not known in advance.
+const ERROR_RANGE_SEARCH: [f64; 2] = [0.15, 2.5];
+/// Minimum fraction of the processors that stages keep busy; some work is not divided among threads.
+const MIN_UTILIZATION: f64 = 0.6;
+/// Time for starting, opening and writing in every run, seconds.
+const FIXED_SECONDS: f64 = 0.5;
 
 impl Forecast {
-    /// Of stages that need what `needs` says, or at best take `least` core-seconds.
+    /// Returns the forecast of stages with the estimates `needs`. `least` is the number of core-seconds if all stages
+    /// are skipped that may be. `searches` tells whether the amount of work depends on results of stages.
     pub(super) fn new(
         work: &Workload,
         needs: &[ResourceEstimate],
@@ -29,16 +30,16 @@ impl Forecast {
     ) -> Forecast {
         let likely = core_seconds(needs);
         let measured = work.pace.processors;
-        let off = match (searches, measured) {
-            (true, _) => OFF_SEARCHING,
-            (_, Some(_)) => OFF,
-            (_, None) => OFF_UNMEASURED,
+        let error_range = match (searches, measured) {
+            (true, _) => ERROR_RANGE_SEARCH,
+            (_, Some(_)) => ERROR_RANGE,
+            (_, None) => ERROR_RANGE_UNCALIBRATED,
         };
-        let core = Range { least: off[0] * least, likely, most: off[1] * likely + AT_LEAST };
+        let core = Range { least: error_range[0] * least, likely, most: error_range[1] * likely + FIXED_SECONDS };
         let threads = work.threads as f64;
-        let got = measured.unwrap_or(threads).min(threads);
-        let usual = (0.9 * got).max(1f64.min(got));
-        let fewest = (TOGETHER * got).max(1f64.min(got));
+        let processors = measured.unwrap_or(threads).min(threads);
+        let usual = (0.9 * processors).max(1f64.min(processors));
+        let fewest = (MIN_UTILIZATION * processors).max(1f64.min(processors));
         Forecast {
             seconds: Range { least: core.least / threads, likely: core.likely / usual, most: core.most / fewest },
             core_seconds: core,
@@ -52,7 +53,8 @@ impl Forecast {
         }
     }
 
-    /// For a person: time and memory, a line each; stage by stage too where everything is to be explained.
+    /// Returns the forecast as text for display: time and memory, one line each; with [`Verbosity::Plan`] also the
+    /// core-seconds of every stage.
     pub fn text(&self, tell: Verbosity) -> String {
         let Forecast { seconds, core_seconds: core, threads, stages, .. } = self;
         let mut out = String::new();
@@ -62,11 +64,11 @@ impl Forecast {
             _ => writeln!(
                 out,
                 "time: about {}, {} to {} on {threads} threads; {} to {} core-seconds",
-                rounded(seconds.likely),
-                rounded(seconds.least),
-                rounded(seconds.most),
-                digits(core.least),
-                digits(core.most)
+                approximate_time(seconds.likely),
+                approximate_time(seconds.least),
+                approximate_time(seconds.most),
+                two_digits(core.least),
+                two_digits(core.most)
             ),
         };
         if tell == Verbosity::Plan {
@@ -78,13 +80,13 @@ impl Forecast {
     }
 }
 
-/// Seconds of all processors together that stages take, about.
+/// Returns the expected core-seconds of all stages together.
 pub(super) fn core_seconds(needs: &[ResourceEstimate]) -> f64 {
     needs.iter().map(|need| need.seconds).sum()
 }
 
-/// Two digits: more would claim what nobody knows.
-fn digits(value: f64) -> String {
+/// Formats `value` with two significant digits; more would suggest a precision that a forecast does not have.
+fn two_digits(value: f64) -> String {
     match value {
         ..0.95 => format!("{value:.1}"),
         ..100.0 => format!("{value:.0}"),
@@ -95,10 +97,10 @@ fn digits(value: f64) -> String {
     }
 }
 
-/// A time that is about known.
-fn rounded(seconds: f64) -> String {
+/// Formats an approximate time in seconds with about two significant digits.
+fn approximate_time(seconds: f64) -> String {
     match seconds {
-        ..60.0 => format!("{} s", digits(seconds)),
+        ..60.0 => format!("{} s", two_digits(seconds)),
         ..600.0 => duration((seconds / 10.0).round() * 10.0),
         _ => duration((seconds / 60.0).round() * 60.0),
     }
@@ -115,14 +117,14 @@ mod tests {
     }
 
     #[test]
-    fn a_range_holds_what_is_likely_and_is_wider_where_less_is_known() {
+    fn range_contains_expected_value_and_widens_if_uncertain() {
         let unmeasured = work(1000);
         let measured = crate::memory_plan::Workload {
             pace: Throughput { processors: Some(1.5), ..Throughput::UNKNOWN },
             ..unmeasured
         };
-        let of = |work: &Workload, searches| Forecast::new(work, &[need(40.0)], 40.0, searches, 1 << 20);
-        let all = [of(&measured, false), of(&unmeasured, false), of(&measured, true)];
+        let forecast = |work: &Workload, searches| Forecast::new(work, &[need(40.0)], 40.0, searches, 1 << 20);
+        let all = [forecast(&measured, false), forecast(&unmeasured, false), forecast(&measured, true)];
         for Forecast { seconds, core_seconds, .. } in &all {
             for range in [seconds, core_seconds] {
                 assert!(range.least < range.likely && range.likely < range.most, "{range:?}");
@@ -137,10 +139,10 @@ mod tests {
     }
 
     #[test]
-    fn what_is_about_known_has_two_digits() {
+    fn approximate_values_are_formatted_with_two_digits() {
         for (value, text) in [(0.44, "0.4"), (9.6, "10"), (47.4, "47"), (1234.0, "1200"), (99.7, "100")] {
-            assert_eq!(digits(value), text);
+            assert_eq!(two_digits(value), text);
         }
-        assert_eq!([42.4, 127.0, 4000.0].map(rounded), ["42 s", "2 min 10 s", "1 h 07 min"]);
+        assert_eq!([42.4, 127.0, 4000.0].map(approximate_time), ["42 s", "2 min 10 s", "1 h 07 min"]);
     }
 }

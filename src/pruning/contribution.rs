@@ -1,7 +1,8 @@
-//! Visible contribution: what every Gaussian adds to the scored pictures, occlusion included.
+//! Visible contribution: what every Gaussian adds to the scored views, occlusion included.
 //!
-//! In: a source, its cameras frame by frame, which pictures to look at. Out: C `visible` and W (method.md,
-//! section 1). Sums of integers and maxima: the same bits whatever the order, the threads and the batches.
+//! Input: a source, its cameras frame by frame, and the views to render. Output: C `visible` and W (method.md, section
+//! 1). The results are sums of integers and maxima, so the order of the views, the threads and the batches do not
+//! change a bit.
 
 use std::num::NonZeroU32;
 
@@ -15,20 +16,20 @@ use crate::progress::Events;
 use crate::render::{Contribution, Renderer};
 use crate::source::{FrameSource, Ids};
 
-/// What contributions depend on: all but color.
+/// Attributes that contributions depend on: all but color.
 const GEOMETRY: Columns = Columns::all().difference(Columns::SH);
 
-/// What was seen of N Gaussians.
+/// Contributions of N Gaussians to the scored views.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct VisibleContribution {
-    /// `[N]`, C: Σ alpha · transmittance per picture, pixels; a sampled pixel stands for stride² of them.
+    /// `[N]`, C: mean over views of Σ alpha · transmittance, in pixels; a sampled pixel counts for stride² pixels.
     pub coverage: Vec<f64>,
-    /// `[N]`, W: largest alpha · transmittance of any pixel looked at, in [0, 0.99].
+    /// `[N]`, W: maximum alpha · transmittance over all sampled pixels, in [0, 0.99].
     pub peak: Vec<f64>,
 }
 
 impl VisibleContribution {
-    /// What `found` in so many pictures comes to.
+    /// Converts the sums and maxima `found` in `pictures` views to C and W.
     pub fn new(found: &Contribution, pictures: usize, pixel_stride: NonZeroU32) -> VisibleContribution {
         let per_pixel = f64::from(pixel_stride.get()).powi(2);
         let coverage = (0..found.len()).map(|i| found.pixels(i) * per_pixel / pictures.max(1) as f64).collect();
@@ -36,10 +37,11 @@ impl VisibleContribution {
     }
 }
 
-/// Looks at every `pixel_stride`-th pixel each way of `pictures`; [`VisibleContribution::new`] says what that comes to.
+/// Accumulates contributions over every `pixel_stride`-th pixel in each direction of the views `pictures`;
+/// [`VisibleContribution::new`] converts them to C and W.
 ///
-/// A Gaussian with NaN or infinity in a frame adds nothing there, nor does a picture without pixels; no
-/// pictures at all give zeros.
+/// A Gaussian with NaN or infinity in a frame adds nothing there, nor does a view without pixels. Without views all
+/// results are zero.
 ///
 /// Memory per Gaussian: its reader, and that of [`RunningContribution`]. Nothing grows with frames or views.
 pub fn visible_contribution(
@@ -55,11 +57,10 @@ pub fn visible_contribution(
     Ok(running.sum())
 }
 
-/// Contributions to the pictures so far.
+/// Accumulator of the contributions to the views rendered so far.
 ///
-/// Memory per Gaussian: 44 bytes for each frame of a batch (of 4 × threads pictures, within `limits`) and for a
-/// block's state; for each picture at a time 12 bytes of sums and the picture's buffers
-/// ([`crate::render`]).
+/// Memory per Gaussian: 44 bytes for each frame of a batch (of 4 × threads views, within `limits`) and for a block's
+/// state; for each view rendered at the same time 12 bytes of sums and the view's buffers ([`crate::render`]).
 pub struct RunningContribution {
     count: usize,
     pixel_stride: NonZeroU32,
@@ -68,12 +69,12 @@ pub struct RunningContribution {
 }
 
 impl RunningContribution {
-    /// No pictures yet of `count` Gaussians.
+    /// Creates an accumulator for `count` Gaussians, without views.
     pub fn new(count: usize, pixel_stride: NonZeroU32, limits: Limits) -> Self {
         RunningContribution { count, pixel_stride, pictures: 0, workers: Workers::new(limits) }
     }
 
-    /// Looks at `pictures` of `source`, by frame. Every source that is added must have the same Gaussians.
+    /// Adds the views `pictures` of `source`, in the order of frames. All sources added must have the same Gaussians.
     pub fn add(
         &mut self,
         source: &dyn FrameSource,
@@ -95,7 +96,7 @@ impl RunningContribution {
         )
     }
 
-    /// What was seen in all pictures.
+    /// Returns the contributions C and peaks W over all views added.
     pub fn finish(self) -> VisibleContribution {
         let (pictures, pixel_stride) = (self.pictures, self.pixel_stride);
         VisibleContribution::new(&self.sum(), pictures, pixel_stride)
@@ -103,7 +104,7 @@ impl RunningContribution {
 
     fn sum(self) -> Contribution {
         let mut sum = Contribution::new(self.count);
-        self.workers.into_inner().iter().for_each(|(_, of_thread)| sum.merge(of_thread));
+        self.workers.into_inner().iter().for_each(|(_, thread_sum)| sum.merge(thread_sum));
         sum
     }
 }
@@ -136,17 +137,17 @@ mod tests {
     }
 
     #[test]
-    fn contributions_are_the_bits_of_a_plain_loop_over_pictures_whatever_the_threads() {
+    fn contributions_equal_a_plain_loop_on_any_thread_count() {
         let scene = Scene::new(2500, 7);
         let schedule = scene.rig().schedule(&scene.info().times, Some(Split::Train)).unwrap();
         for (pixel, view, frame) in [(1, 1, 1), (3, 2, 2)] {
             let scan = strides(pixel, view, frame);
             let mut plain = Contribution::new(2500);
             let mut pictures = 0;
-            for (turn, t) in (0..7).step_by(frame as usize).enumerate() {
+            for (frame_index, t) in (0..7).step_by(frame as usize).enumerate() {
                 let mut state = Gaussians::zeros(2500, scene.info().sh_degree);
                 scene.open(Ids::Range(0..2500)).unwrap().read(t, Columns::all(), &mut state).unwrap();
-                for &(_, camera) in schedule.views(t).iter().skip(turn % view as usize).step_by(view as usize) {
+                for &(_, camera) in schedule.views(t).iter().skip(frame_index % view as usize).step_by(view as usize) {
                     let camera = &schedule.cameras[camera as usize];
                     render::contribution(&state, camera, scan.pixel_stride, &mut plain);
                     pictures += 1;
@@ -178,7 +179,7 @@ mod tests {
     }
 
     #[test]
-    fn a_sampled_pixel_stands_for_all_it_skips() {
+    fn a_sampled_pixel_counts_for_all_it_skips() {
         let scene = Scene::new(1200, 3);
         let schedule = scene.rig().schedule(&scene.info().times, Some(Split::Train)).unwrap();
         let total = |pixel| {
@@ -193,10 +194,10 @@ mod tests {
     }
 
     #[test]
-    fn strides_leave_every_view_its_turn_and_never_no_picture() {
+    fn strides_rotate_views_and_keep_at_least_one() {
         let camera = Camera::look_at(glam::DVec3::X, glam::DVec3::ZERO, 1.0, (8, 8));
         let views = |from: u32, to: u32| (from..to).map(|view| (view, view)).collect::<Vec<_>>();
-        // The first frame has no picture in this split.
+        // The first frame has no view in this split.
         let mut schedule = Schedule::new((0..3).map(|_| camera.clone()).collect());
         for (count, seen) in [(1, views(0, 0)), (2, views(0, 3)), (1, views(0, 0)), (2, views(0, 3))] {
             schedule.push(count, &seen);
@@ -210,10 +211,10 @@ mod tests {
         assert_eq!(taken(100, 100), [(1, 0)]);
     }
 
-    /// One state for ever.
-    struct Still(Gaussians, SequenceInfo);
+    /// A source whose frames are all the same.
+    struct Static(Gaussians, SequenceInfo);
 
-    impl FrameSource for Still {
+    impl FrameSource for Static {
         fn info(&self) -> &SequenceInfo {
             &self.1
         }
@@ -232,8 +233,8 @@ mod tests {
     }
 
     #[test]
-    fn a_wholly_occluded_gaussian_has_no_visible_coverage_and_is_pruned_first() {
-        // Bright and large behind four opaque walls; before them one that is hardly there.
+    fn fully_occluded_gaussians_are_pruned_first() {
+        // A bright and large Gaussian is hidden behind four opaque walls; a faint one is in front of them.
         const HIDDEN: usize = 5;
         const FAINT: usize = 0;
         let count = 40;
@@ -261,7 +262,7 @@ mod tests {
         let recipe = Recipe::preset("default").unwrap();
         let sample = looked_at(&schedule, &recipe.scan, 1);
         let seen = visible_contribution(
-            &Still(state, info),
+            &Static(state, info),
             (&schedule.cameras, &sample),
             recipe.scan.pixel_stride,
             Limits::NONE,
@@ -291,7 +292,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_to_see_gives_zeros() {
+    fn without_views_or_gaussians_results_are_zero() {
         let scene = Scene::new(300, 2);
         let mut schedule = Schedule::default();
         schedule.push(2, &[]);
@@ -303,7 +304,7 @@ mod tests {
         };
         let seen = look(&scene, &schedule);
         assert_eq!(seen, VisibleContribution { coverage: vec![0.0; 300], peak: vec![0.0; 300] });
-        let none = Still(Gaussians::zeros(0, 0), SequenceInfo { count: 0, ..scene.info().clone() });
+        let none = Static(Gaussians::zeros(0, 0), SequenceInfo { count: 0, ..scene.info().clone() });
         let schedule = scene.rig().schedule(&scene.info().times, None).unwrap();
         let seen = look(&none, &schedule);
         assert!(seen.coverage.is_empty() && seen.peak.is_empty());

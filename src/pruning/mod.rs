@@ -1,9 +1,8 @@
-//! Sampling and pruning (method.md, section 4): which Gaussians stay.
+//! Sampling and pruning (method.md, section 4): selects the Gaussians that stay.
 //!
-//! In: scores. Out: a mask, and a ranking of all Gaussians of which the mask is a prefix, so that any
-//! other number can be kept by the same rule. Memory per Gaussian: [`BYTES_PER_GAUSSIAN`], and
-//! [`WORKING_BYTES_PER_GAUSSIAN`] meanwhile. Source: "Temporally-Aware
-//! Pruning for Compact 4D Gaussian Splatting Models", section 3.3.
+//! Input: scores. Output: a mask, and a ranking of all Gaussians of which the mask is a prefix, so that any other
+//! number can be kept by the same rule. Memory per Gaussian: [`BYTES_PER_GAUSSIAN`], and [`WORKING_BYTES_PER_GAUSSIAN`]
+//! while selecting. Source: "Temporally-Aware Pruning for Compact 4D Gaussian Splatting Models", section 3.3.
 
 pub mod contribution;
 mod ranking;
@@ -19,67 +18,67 @@ use crate::error::{Error, Result};
 use crate::recipe::{LowPriority, Select};
 use crate::statistics::score::Scores;
 
-/// What the user knows better than the scores. Ids in any order.
+/// Ids that the user keeps or drops whatever their scores, in any order.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Overrides {
-    /// These stay whatever their scores.
+    /// Ids that are always kept.
     pub keep_ids: Vec<u32>,
-    /// These go whatever their scores.
+    /// Ids that are always dropped.
     pub drop_ids: Vec<u32>,
 }
 
-/// The outcome of stages 1 and 2.
+/// Result of stages 1 and 2.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Selection {
-    /// For every Gaussian whether it stays.
+    /// Whether each Gaussian stays.
     pub keep: Vec<bool>,
-    /// All Gaussians but those dropped by the user, best first; the first `counts.kept` are those of `keep`.
+    /// Ranking of the Gaussians not dropped by the user, best first; the first `counts.kept` are those of `keep`.
     pub ranking: Ranking,
-    /// How many each stage kept and pruned.
+    /// Numbers of Gaussians kept and pruned by each stage.
     pub counts: Counts,
 }
 
-/// Gaussians at each stage. Before overrides: total = candidates + outside, and
-/// kept = candidates − pruned by stage 2 + rescued.
+/// Numbers of Gaussians at each stage. Before overrides: total = candidates + outside, and kept = candidates − pruned
+/// by stage 2 + rescued, where "outside" are the Gaussians that stage 1 does not take.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct Counts {
-    /// N.
+    /// N, the number of all Gaussians.
     pub total: usize,
-    /// Stage 1's top fraction by S.
+    /// Number of Gaussians in stage 1's top fraction by S.
     pub candidates: usize,
-    /// Outside stage 1 and kept by the OR rule; 0 under [`LowPriority::Drop`].
+    /// Number of Gaussians outside stage 1 that the OR rule keeps; 0 under [`LowPriority::Drop`].
     pub rescued: usize,
-    /// Outside stage 1 and pruned.
+    /// Number of Gaussians outside stage 1 that are pruned.
     pub pruned_by_stage_1: usize,
-    /// Candidates that fail the OR rule.
+    /// Number of candidates that fail the OR rule.
     pub pruned_by_stage_2: usize,
-    /// Kept by the user against the rule.
+    /// Number of Gaussians that the user keeps against the rule.
     pub forced_keep: usize,
-    /// Dropped by the user against the rule.
+    /// Number of Gaussians that the user drops against the rule.
     pub forced_drop: usize,
-    /// In the output.
+    /// Number of Gaussians in the output.
     pub kept: usize,
 }
 
-/// Memory of a selection per Gaussian, and of a second ranking beside its own.
+/// Memory of a selection and of one further ranking, in bytes per Gaussian.
 pub const BYTES_PER_GAUSSIAN: usize = size_of::<bool>() + 2 * size_of::<u32>();
-/// What selecting takes per Gaussian besides, while it lasts: fates, places in two orders, one of them being sorted,
-/// and what they are sorted by.
+/// Additional memory while selecting, in bytes per Gaussian: overrides, positions in two orders, one order being
+/// sorted, and the sort keys.
 pub const WORKING_BYTES_PER_GAUSSIAN: usize =
     size_of::<bool>() + size_of::<Option<bool>>() + 4 * size_of::<u32>() + 2 * size_of::<f64>();
 
 /// Applies both stages to N scored Gaussians, then the overrides.
 ///
-/// Stage 1 takes the round(`keep_fraction`·N) best (halves up) by S, ties by hashed id. Stage 2 keeps
-/// those with norm(S_static) ≥ τ_S or norm(S_dynamic) ≥ τ_D: of the candidates, or under
-/// [`LowPriority::Rescue`] of all. Where both norms are 0 throughout, as for a single Gaussian or for copies
-/// of one, nothing tells Gaussians apart and stage 2 prunes nobody.
+/// Stage 1 takes the round(`keep_fraction`·N) best (halves up) by S, ties by hashed id. Stage 2 keeps those with
+/// norm(S_static) ≥ τ_S or norm(S_dynamic) ≥ τ_D: of the candidates, or under [`LowPriority::Rescue`] of all Gaussians.
+/// If both norms are 0 for all Gaussians, as for a single Gaussian or for copies of one, the scores cannot distinguish
+/// them and stage 2 prunes none.
 ///
 /// # Errors
-/// [`Error::Usage`] for an id beyond N, or one to be both kept and dropped.
+/// Returns [`Error::Usage`] for an id beyond N, and for an id that is to be both kept and dropped.
 pub fn select(scores: &Scores, recipe: &Select, overrides: &Overrides) -> Result<Selection> {
     let n = scores.score.len();
-    let forced = forced_fates(n, overrides)?;
+    let forced = user_decisions(n, overrides)?;
     let candidates = (recipe.keep_fraction * n as f64).round() as usize;
     let passes = passes(scores, recipe);
     let ordered = ranking::orders(scores, recipe, candidates, &passes);
@@ -106,45 +105,49 @@ pub fn select(scores: &Scores, recipe: &Select, overrides: &Overrides) -> Result
             }
         })
         .collect();
-    for (keep, fate) in keep.iter_mut().zip(&forced) {
-        match fate {
+    for (keep, decision) in keep.iter_mut().zip(&forced) {
+        match decision {
             Some(true) if !*keep => counts.forced_keep += 1,
             Some(false) if *keep => counts.forced_drop += 1,
             _ => {}
         }
-        *keep = fate.unwrap_or(*keep);
+        *keep = decision.unwrap_or(*keep);
     }
     counts.kept = keep.iter().filter(|&&keep| keep).count();
     Ok(Selection { keep, ranking: ordered.ranking(&forced), counts })
 }
 
-/// Stage 2 for every Gaussian.
+/// Returns whether each Gaussian passes stage 2.
 fn passes(scores: &Scores, recipe: &Select) -> Vec<bool> {
     let Scores { static_norm, dynamic_norm, .. } = scores;
     let norms = || static_norm.iter().zip(dynamic_norm);
-    let ungraded = norms().all(|(&of_static, &of_dynamic)| of_static == 0.0 && of_dynamic == 0.0);
+    let indistinguishable = norms().all(|(&static_score, &dynamic_score)| static_score == 0.0 && dynamic_score == 0.0);
     norms()
-        .map(|(&of_static, &of_dynamic)| ungraded || of_static >= recipe.tau_static || of_dynamic >= recipe.tau_dynamic)
+        .map(|(&static_score, &dynamic_score)| {
+            indistinguishable || static_score >= recipe.tau_static || dynamic_score >= recipe.tau_dynamic
+        })
         .collect()
 }
 
-/// For every Gaussian what the user wants, if anything.
-fn forced_fates(n: usize, overrides: &Overrides) -> Result<Vec<Option<bool>>> {
-    let mut fates = vec![None; n];
+/// Returns the user's decision for every Gaussian: keep (`true`), drop (`false`) or `None`.
+fn user_decisions(n: usize, overrides: &Overrides) -> Result<Vec<Option<bool>>> {
+    let mut decisions = vec![None; n];
     for (ids, keep) in [(&overrides.keep_ids, true), (&overrides.drop_ids, false)] {
         for &id in ids {
-            let Some(fate) = fates.get_mut(id as usize) else {
-                return Err(Error::usage(format!("Gaussian {id} is to be kept or dropped, but there are only {n}")));
-            };
-            if *fate == Some(!keep) {
+            let Some(decision) = decisions.get_mut(id as usize) else {
                 return Err(Error::usage(format!(
-                    "Gaussian {id} is to be kept and to be dropped: name it in one list only"
+                    "Gaussian {id} is to be kept or dropped, but the model has only {n} Gaussians (ids start at 0)"
+                )));
+            };
+            if *decision == Some(!keep) {
+                return Err(Error::usage(format!(
+                    "Gaussian {id} is to be kept and to be dropped: list it in one of the two options only"
                 )));
             }
-            *fate = Some(keep);
+            *decision = Some(keep);
         }
     }
-    Ok(fates)
+    Ok(decisions)
 }
 
 #[cfg(test)]

@@ -1,5 +1,5 @@
-//! One order of all Gaussians of which the selection is a prefix, so that a target count is met
-//! exactly by the same two stages with both thresholds moved together.
+//! A ranking of all Gaussians whose first entries are the selection. It meets any target count exactly: it corresponds to
+//! the same two stages with both thresholds moved together.
 
 use rayon::slice::ParallelSliceMut;
 use serde::{Deserialize, Serialize};
@@ -8,24 +8,24 @@ use crate::model::hash_id;
 use crate::recipe::{LowPriority, Select};
 use crate::statistics::score::Scores;
 
-/// Gaussians from the one to keep first to the one to keep last.
+/// Gaussians in the order in which they are kept, best first.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Ranking {
     order: Vec<u32>,
 }
 
 impl Ranking {
-    /// Ids, each once, best first.
+    /// Creates a ranking from ids, each once, best first.
     pub fn new(order: Vec<u32>) -> Self {
         Ranking { order }
     }
 
-    /// The ids, best first.
+    /// Returns the ids, best first.
     pub fn order(&self) -> &[u32] {
         &self.order
     }
 
-    /// The first `m` ids (all, if there are fewer) in increasing order.
+    /// Returns the first `m` ids (all, if there are fewer) in increasing order.
     pub fn take(&self, m: usize) -> Vec<u32> {
         let mut ids = self.order[..m.min(self.order.len())].to_vec();
         ids.sort_unstable();
@@ -33,18 +33,20 @@ impl Ranking {
     }
 }
 
-/// The two orders behind a ranking, as the place of every Gaussian in each, from 0.
+/// The two orders that determine a ranking, as the 0-based position of every Gaussian in each.
 pub(super) struct Orders {
-    /// By S, ties by hashed id.
+    /// Position by S, ties by hashed id.
     pub(super) by_score: Vec<u32>,
-    /// By max(norm(S_static)/τ_S, norm(S_dynamic)/τ_D), ties by S.
+    /// Position by max(norm(S_static)/τ_S, norm(S_dynamic)/τ_D), ties by S.
     by_rule: Vec<u32>,
-    /// How many of each order the recipe keeps; stage 1 does not bind under `rescue`.
+    /// Number of Gaussians of `by_score` that stage 1 keeps; `None` under [`LowPriority::Rescue`], where stage 1
+    /// excludes none.
     stage_1: Option<usize>,
+    /// Number of Gaussians that pass stage 2.
     stage_2: usize,
 }
 
-/// Ranks all Gaussians in both orders; `passes` is stage 2's verdict on each.
+/// Ranks all Gaussians in both orders; `passes` says whether each passes stage 2.
 pub(super) fn orders(scores: &Scores, recipe: &Select, candidates: usize, passes: &[bool]) -> Orders {
     let n = scores.score.len();
     let mut by_score: Vec<u32> = (0..n as u32).collect();
@@ -53,12 +55,12 @@ pub(super) fn orders(scores: &Scores, recipe: &Select, candidates: usize, passes
     by_score.par_sort_unstable_by(|&a, &b| {
         score(b).total_cmp(&score(a)).then_with(|| hash_id(a.into()).cmp(&hash_id(b.into())))
     });
-    let by_score = places(&by_score);
+    let by_score = positions(&by_score);
 
     let rule: Vec<f64> = (0..n)
         .map(|i| {
-            let of_static = share(scores.static_norm[i], recipe.tau_static);
-            of_static.max(share(scores.dynamic_norm[i], recipe.tau_dynamic)) + 0.0
+            let static_ratio = ratio(scores.static_norm[i], recipe.tau_static);
+            static_ratio.max(ratio(scores.dynamic_norm[i], recipe.tau_dynamic)) + 0.0
         })
         .collect();
     let mut by_rule: Vec<u32> = (0..n as u32).collect();
@@ -67,7 +69,7 @@ pub(super) fn orders(scores: &Scores, recipe: &Select, candidates: usize, passes
         rule[b].total_cmp(&rule[a]).then_with(|| by_score[a].cmp(&by_score[b]))
     });
     Orders {
-        by_rule: places(&by_rule),
+        by_rule: positions(&by_rule),
         by_score,
         stage_1: (recipe.low_priority == LowPriority::Drop).then_some(candidates),
         stage_2: passes.iter().filter(|&&passes| passes).count(),
@@ -75,15 +77,15 @@ pub(super) fn orders(scores: &Scores, recipe: &Select, candidates: usize, passes
 }
 
 impl Orders {
-    /// Orders by the fraction of its share that each stage must admit for a Gaussian to stay, the
-    /// larger of both; those to be kept come first, those to be dropped not at all.
+    /// Returns the ranking by the fraction of its quota that each stage must admit for a Gaussian to stay, the larger
+    /// of the two. Gaussians that the user keeps come first; those that the user drops are left out.
     ///
-    /// A key is at most 1 exactly for what the recipe keeps. Ties, which come from ranks in two
-    /// orders, go by S.
+    /// A key is at most 1 exactly for the Gaussians that the recipe keeps. Ties, which occur because the keys are ranks
+    /// in two orders, go by S.
     pub(super) fn ranking(&self, forced: &[Option<bool>]) -> Ranking {
         let key = |i: usize| {
-            let of_stage_2 = place_over(self.by_rule[i], self.stage_2);
-            self.stage_1.map_or(of_stage_2, |kept| of_stage_2.max(place_over(self.by_score[i], kept)))
+            let stage_2_ratio = rank_over(self.by_rule[i], self.stage_2);
+            self.stage_1.map_or(stage_2_ratio, |kept| stage_2_ratio.max(rank_over(self.by_score[i], kept)))
         };
         let keys: Vec<f64> = (0..forced.len()).map(key).collect();
         let mut order: Vec<u32> = (0..forced.len() as u32).filter(|&i| forced[i as usize] != Some(false)).collect();
@@ -98,14 +100,15 @@ impl Orders {
     }
 }
 
-/// Rank over the number kept. None kept counts as half a Gaussian: every key then exceeds 1 and the
-/// order stays.
-fn place_over(place: u32, kept: usize) -> f64 {
+/// Returns the rank divided by the number kept. A number of zero counts as half a Gaussian: then every key exceeds 1
+/// and the order is unchanged.
+fn rank_over(place: u32, kept: usize) -> f64 {
     (f64::from(place) + 1.0) / (kept as f64).max(0.5)
 }
 
-/// x/τ, at least 1 exactly when x ≥ τ. A threshold of 0 is no measure: whatever reaches it ties.
-fn share(x: f64, tau: f64) -> f64 {
+/// Returns x/τ, which is at least 1 exactly if x ≥ τ. With τ ≤ 0 the ratio is undefined: all values that reach τ tie at
+/// infinity.
+fn ratio(x: f64, tau: f64) -> f64 {
     if tau > 0.0 {
         x / tau
     } else if x >= tau {
@@ -115,11 +118,11 @@ fn share(x: f64, tau: f64) -> f64 {
     }
 }
 
-/// Place of every id in `order`.
-fn places(order: &[u32]) -> Vec<u32> {
-    let mut places = vec![0; order.len()];
+/// Returns the position of every id in `order`.
+fn positions(order: &[u32]) -> Vec<u32> {
+    let mut positions = vec![0; order.len()];
     for (place, &id) in order.iter().enumerate() {
-        places[id as usize] = place as u32;
+        positions[id as usize] = place as u32;
     }
-    places
+    positions
 }

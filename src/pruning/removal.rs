@@ -1,4 +1,4 @@
-//! What the scored pictures would lose with each Gaussian of a part of the input.
+//! Removal error: the squared error of the scored views caused by removing each Gaussian of a subset of the input.
 
 use crate::error::Result;
 use crate::limits::Limits;
@@ -7,12 +7,12 @@ use crate::passes::pictures::{Subject, Workers};
 use crate::render::{RemovalError, Renderer};
 use crate::source::{FrameSource, Ids};
 
-/// `[ids]`, [`RemovalError`] of the Gaussians `ids` among each other, over `pictures`: the same bits whatever
-/// the threads.
+/// Returns the [`RemovalError`] of the Gaussians `ids` in renders of these Gaussians alone, `[ids]`, summed over the
+/// views `pictures`. The thread count does not change a bit.
 ///
-/// Memory per Gaussian of `ids`: its reader; 44 + 12·(d + 1)² bytes for each frame of a batch (frames with
-/// 4 × threads pictures between them, within `limits`) and for a block's state; for each picture at a time 8 bytes
-/// of sums and the picture's buffers. Nothing grows with frames or views.
+/// Memory per Gaussian of `ids`: its reader; 44 + 12·(d + 1)² bytes for each frame of a batch (frames with 4 × threads
+/// views between them, within `limits`) and for a block's state; for each view rendered at the same time 8 bytes of
+/// sums and the view's buffers. Nothing grows with frames or views.
 pub fn removal_error(
     source: &dyn FrameSource,
     ids: &[u32],
@@ -34,7 +34,7 @@ pub fn removal_error(
         },
     )?;
     let mut sum = RemovalError::new(ids.len(), contrast_floor);
-    workers.into_inner().iter().for_each(|(_, of_thread)| sum.merge(of_thread));
+    workers.into_inner().iter().for_each(|(_, thread_sum)| sum.merge(thread_sum));
     Ok(sum)
 }
 
@@ -46,7 +46,7 @@ mod tests {
     use crate::passes::{VIEWS_AT_ONCE, gather, spread};
 
     #[test]
-    fn errors_are_the_bits_of_a_plain_loop_over_pictures_of_those_ids_alone_whatever_the_threads() {
+    fn errors_equal_a_plain_loop_on_any_thread_count() {
         let scene = Scene::new(2500, 4);
         let schedule = scene.rig().schedule(&scene.info().times, Some(Split::Train)).unwrap();
         let ids: Vec<u32> = (0..2500).filter(|id| id % 3 != 1).collect();

@@ -1,4 +1,4 @@
-//! Stage `score`: statistics to scores, scores to a ranking and to who stays.
+//! Stage `score`: turns statistics into scores, and scores into a ranking and a selection.
 
 use std::borrow::Cow;
 use std::path::Path;
@@ -25,74 +25,76 @@ use crate::statistics::pass::Scanned;
 use crate::statistics::score::{Scores, Term, score};
 use crate::statistics::{fill_anisotropy, snap, ulp};
 
-/// What the stage is called.
+/// Name of the stage.
 pub(crate) const NAME: &str = "score";
 
-/// Bytes per Gaussian of statistics, scores and a selection: while scores are looked at.
+/// Memory of statistics, scores and a selection while scoring, in bytes per Gaussian.
 pub const SCORED: u64 = (Rows::BYTES_PER_GAUSSIAN + Scores::BYTES_PER_GAUSSIAN + pruning::BYTES_PER_GAUSSIAN) as u64;
 
-/// What stays of scoring: the selection, and the statistics unless they are set aside.
+/// Returns the memory kept after scoring: the selection, and the statistics unless they are written to a scratch file.
 pub fn scored_memory(limits: &Limits) -> Vec<MemoryPart> {
     let rows = if limits.rows_aside { 0 } else { Rows::BYTES_PER_GAUSSIAN as u64 };
     vec![("rows", rows), ("selection", pruning::BYTES_PER_GAUSSIAN as u64)]
 }
 
-/// The scoring of a run.
+/// Parameters of the stage.
 #[derive(Debug, Clone)]
 pub struct ScoreStage {
-    /// Whether motion within rounding is taken as none.
+    /// Whether motion within rounding noise is set to zero.
     pub snap_noise: bool,
-    /// What becomes of Gaussians with NaN or infinity.
+    /// Policy for Gaussians with NaN or infinity.
     pub non_finite: NonFinite,
-    /// Normalization and weights.
+    /// Normalization and weights of the scores.
     pub score: recipe::ScoreParams,
-    /// Stages 1 and 2 of the selection.
+    /// Parameters of stages 1 and 2 of the selection.
     pub select: recipe::Select,
-    /// What the user knows better.
+    /// Gaussians that the user keeps or drops.
     pub user: UserOverrides,
 }
 
-/// Lives of at most this part of all frames are short: it is worth asking which of them are one.
+/// Divisor of the number of frames: a median life span of at most 1/4 of the frames is short, and the user is told
+/// about linking.
 const SHORT_LIFE: usize = 4;
 
-/// A scene with statistics and a selection of every Gaussian.
+/// Statistics and a selection of every Gaussian of a scene.
 #[derive(Serialize, Deserialize)]
 pub struct Scored {
-    /// Statistics, noise snapped as the recipe says.
+    /// Statistics, with rounding noise set to zero if the recipe says so.
     statistics: StatisticsRows,
-    /// T.
+    /// T, the number of frames.
     frames: usize,
-    /// See [`frames_to_see`].
+    /// Number of frames to render so that Gaussians with short life spans are seen; see [`frames_to_see`].
     pub frames_to_see: usize,
-    /// How the terms of the scores were normalized.
+    /// Normalization of every term of the scores.
     pub terms: Vec<Term>,
-    /// Counts of odd Gaussians.
+    /// Counts of Gaussians with unusual values.
     pub flags: FlagSummary,
-    /// Stages 1 and 2, with the user's overrides.
+    /// Result of stages 1 and 2, with the user's overrides.
     pub selection: Selection,
-    /// Ids that are to be kept as they are, unmerged; increasing.
+    /// Ids that are kept unchanged and unmerged, increasing.
     pub protected: Vec<u32>,
-    /// Ids that were dropped because their values are not finite, increasing: the scene is read without them.
+    /// Ids that were dropped because their values are not finite, increasing; the scene is read without them.
     pub absent: Vec<u32>,
-    /// Where Gaussians are compared with one another.
+    /// Reference frame, at which Gaussians are compared with one another, and scene extent.
     pub reference: Reference,
-    /// Distance between f32 values at the scene's largest coordinate: the noise floor of a position.
+    /// Distance between neighboring f32 values at the scene's largest coordinate, in scene units: the noise level of a
+    /// position.
     pub position_ulp: f64,
 }
 
-/// What the user knows better, before ids are resolved.
+/// Gaussians that the user keeps or drops, before the box is resolved to ids.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
 pub struct UserOverrides {
     /// Ids to keep.
     pub keep: Vec<u32>,
     /// Ids to drop.
     pub drop: Vec<u32>,
-    /// Box (low corner, high corner) whose Gaussians at the reference frame are kept.
+    /// Box (low corner, high corner) in scene units; Gaussians inside it at the reference frame are kept.
     pub keep_box: Option<[f64; 6]>,
 }
 
 impl ScoreStage {
-    /// Statistics, scores and a selection, and the states at one frame.
+    /// Estimates the memory and time of the stage: statistics, scores, a selection, and the states at one frame.
     pub fn need(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
         ResourceEstimate {
             stage: NAME,
@@ -107,16 +109,16 @@ impl ScoreStage {
         }
     }
 
-    /// Returns the ids of the Gaussians that are to be dropped because their values are not finite, increasing.
+    /// Returns the ids of the Gaussians that are dropped because their values are not finite, increasing.
     pub fn absent(&self, rows: &Rows) -> Vec<u32> {
         if self.non_finite == NonFinite::Drop { non_finite(rows).collect() } else { Vec::new() }
     }
 
-    /// Scores and selects by what was measured.
+    /// Computes scores and a selection from the measured statistics.
     ///
     /// # Errors
-    /// Values that are not finite, unless the recipe says what to do with them; cameras that see nothing; ids that are
-    /// to be kept and to be dropped.
+    /// Fails for values that are not finite, unless the recipe says what to do with them; for cameras that see no
+    /// Gaussian; and for ids that are to be both kept and dropped.
     pub fn run(
         &self,
         scene: &Scene,
@@ -151,7 +153,8 @@ impl ScoreStage {
             check_views(scene, &rows)?;
             let mut protected = self.user.keep.clone();
             if let Some(corners) = self.user.keep_box {
-                protected.extend(all.iter().copied().filter(|&id| inside(&corners, state.position.row(id as usize))));
+                protected
+                    .extend(all.iter().copied().filter(|&id| is_inside(&corners, state.position.row(id as usize))));
             }
             let mut drop = self.user.drop.clone();
             let absent = self.absent(&rows);
@@ -185,7 +188,7 @@ impl ScoreStage {
                 reference,
                 position_ulp,
             };
-            scored.write_down(scene, median_life, journal);
+            scored.record(scene, median_life, journal);
             progress.advance(info.count as u64);
             Ok((scored, info.count))
         })
@@ -197,7 +200,7 @@ fn first_of_largest(counts: &[u32]) -> usize {
     counts.iter().position(|&count| count == largest).unwrap_or(0)
 }
 
-fn inside(corners: &[f64; 6], position: [f32; 3]) -> bool {
+fn is_inside(corners: &[f64; 6], position: [f32; 3]) -> bool {
     (0..3).all(|axis| (corners[axis]..=corners[axis + 3]).contains(&f64::from(position[axis])))
 }
 
@@ -218,7 +221,7 @@ fn refuse_non_finite(scene: &Scene, rows: &Rows) -> Result<()> {
         .hint("--non-finite drop removes them, --non-finite keep leaves them as they are"))
 }
 
-/// Counts of odd Gaussians.
+/// Counts Gaussians with unusual values.
 fn flags(rows: &Rows) -> FlagSummary {
     let count = |flag| rows.flags.iter().filter(|flags| flags.contains(flag)).count();
     FlagSummary {
@@ -231,13 +234,13 @@ fn flags(rows: &Rows) -> FlagSummary {
     }
 }
 
-/// Cameras of another scene see nothing of this one.
+/// Fails if no Gaussian is in any view, which happens with the cameras of another scene.
 fn check_views(scene: &Scene, rows: &Rows) -> Result<()> {
     let alive = rows.life.iter().filter(|&&life| life > 0).count();
     let seen = rows.vis.iter().filter(|&&vis| vis > 0.0).count();
     if alive > 0 && seen == 0 {
         return Err(Error::usage(format!(
-            "{}: none of the {alive} living Gaussians of {} is in any of its {} pictures\n  \
+            "{}: none of the {alive} living Gaussians of {} is in any of its {} views\n  \
              give the cameras of this scene",
             scene.rig.origin,
             scene.path.shown(),
@@ -248,10 +251,11 @@ fn check_views(scene: &Scene, rows: &Rows) -> Result<()> {
 }
 
 impl Scored {
-    /// The same within `limits`: statistics wait in a scratch file in `folder`, if they are to.
+    /// Returns the same result within `limits`: the statistics are moved to a scratch file in `folder` if the limits
+    /// require it.
     ///
     /// # Errors
-    /// A scratch file that cannot be written.
+    /// Fails if the scratch file cannot be written.
     pub(crate) fn within(self, limits: &Limits, folder: &Path) -> Result<Scored> {
         Ok(match self.statistics {
             StatisticsRows::Memory(rows) if limits.rows_aside => {
@@ -261,7 +265,7 @@ impl Scored {
         })
     }
 
-    /// Whether Gaussian `id` is to stay as it is.
+    /// Returns whether Gaussian `id` is kept unchanged.
     pub fn is_protected(&self, id: u32) -> bool {
         self.protected.binary_search(&id).is_ok()
     }
@@ -271,42 +275,42 @@ impl Scored {
         (0..self.count() as u32).filter(|id| self.absent.binary_search(id).is_err()).collect()
     }
 
-    /// Statistics of every Gaussian.
+    /// Returns the statistics of every Gaussian.
     ///
     /// # Errors
-    /// They were set aside and cannot be read back.
+    /// Fails if the statistics are in a scratch file that cannot be read back.
     pub fn rows(&self) -> Result<Cow<'_, Rows>> {
         self.statistics.rows()
     }
 
-    /// C and Vis of every Gaussian.
+    /// Returns C and Vis of every Gaussian.
     ///
     /// # Errors
-    /// They were set aside and cannot be read back.
+    /// Fails if the statistics are in a scratch file that cannot be read back.
     pub fn importance(&self) -> Result<[Cow<'_, [f64]>; 2]> {
         self.statistics.importance()
     }
 
-    /// The selection's own order.
+    /// Returns the ranking of the selection.
     pub fn ranked(&self) -> Ranking {
         self.selection.ranking.clone()
     }
 
-    /// N.
+    /// Returns N, the number of all Gaussians.
     pub fn count(&self) -> usize {
         self.statistics.len()
     }
 
-    /// The scores that were selected by, computed anew.
+    /// Recomputes the scores that the selection is based on.
     ///
     /// # Errors
-    /// Those of [`Scored::rows`].
+    /// Fails if the statistics cannot be read back, as [`Scored::rows`].
     pub fn scores(&self, recipe: &recipe::ScoreParams) -> Result<Scores> {
         let rows = self.rows()?;
         Ok(score(&rows, self.frames, recipe))
     }
 
-    /// Percentiles of every term.
+    /// Returns the percentiles of every term.
     pub fn term_summaries(&self) -> Vec<TermSummary> {
         let summarize = |term: &Term| TermSummary {
             name: term.of.name().to_owned(),
@@ -317,13 +321,14 @@ impl Scored {
         self.terms.iter().map(summarize).collect()
     }
 
-    /// Writes down what the scene did not need in scan and score, how many Gaussians are odd, and what may be done about short
-    /// lives.
-    fn write_down(&self, scene: &Scene, median_life: u32, journal: &mut Journal) {
+    /// Writes to the journal which work of scan and score the scene did not need, how many Gaussians have unusual
+    /// values, and what can be done about short life spans.
+    fn record(&self, scene: &Scene, median_life: u32, journal: &mut Journal) {
         let info = scene.source().info();
         if scene.input.may_be_linked() && (1..=info.times.len() / SHORT_LIFE).contains(&(median_life as usize)) {
             journal.notes.push(format!(
-                "Gaussians live {median_life} of {} frames in the median: --link always makes one of lives that are one",
+                "Gaussians are alive in {median_life} of {} frames (median): --link always joins Gaussians that \
+                 continue one another",
                 info.times.len()
             ));
         }
@@ -335,11 +340,11 @@ impl Scored {
                 let why = format!("{} is the same in every frame", column.name());
                 let again = (info.times.len() - 1) as u64 * info.count as u64;
                 let bytes = again * state_bytes(info.sh_degree, column);
-                journal.spare(constant(column), why, Saved::Values { bytes });
+                journal.spare(saved_reads(column), why, Saved::Values { bytes });
             }
         }
         if info.sh_degree == 0 {
-            journal.leave_out("higher bands of colour", "SH degree 0");
+            journal.leave_out("SH coefficients above degree 0", "SH degree 0");
         }
         for term in self.terms.iter().filter(|term| !term.norm.is_active()) {
             let why = format!("1st and 99th percentile are both {}", term.norm.p1);
@@ -359,19 +364,19 @@ impl Scored {
     }
 }
 
-/// Frames that Gaussians live, in the median of those that do; 0 where none does.
+/// Returns the median number of frames in which Gaussians are alive, over those that ever are; 0 if none is.
 fn median_life(life: &[u32]) -> u32 {
     let mut lives: Vec<u32> = life.iter().copied().filter(|&frames| frames > 0).collect();
     let middle = lives.len() / 2;
     if lives.is_empty() { 0 } else { *lives.select_nth_unstable(middle).1 }
 }
 
-fn constant(column: Columns) -> &'static str {
+fn saved_reads(column: Columns) -> &'static str {
     match column {
         Columns::POSITION => "re-reading positions per frame",
         Columns::ROTATION => "re-reading rotations per frame",
         Columns::LOG_SCALE => "re-reading scales per frame",
         Columns::OPACITY => "re-reading opacities per frame",
-        _ => "re-reading colours per frame",
+        _ => "re-reading colors per frame",
     }
 }

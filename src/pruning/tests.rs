@@ -1,4 +1,4 @@
-//! Claims about the selection, against its definition written out.
+//! Tests of the selection against its literal definition.
 
 use proptest::prelude::*;
 
@@ -6,7 +6,7 @@ use super::*;
 use crate::model::hash_id;
 use crate::recipe::Recipe;
 
-/// Scores in which S is the sum of the normalized parts.
+/// Returns scores in which S is the sum of the normalized parts.
 fn scores(parts: &[(f64, f64)]) -> Scores {
     let (static_norm, dynamic_norm): (Vec<f64>, Vec<f64>) = parts.iter().copied().unzip();
     let score = parts.iter().map(|(s, d)| s + d).collect();
@@ -25,11 +25,11 @@ fn rule(low_priority: LowPriority, keep_fraction: f64, tau_static: f64, tau_dyna
     Select { keep_fraction, tau_static, tau_dynamic, low_priority, ..paper }
 }
 
-fn free(scores: &Scores, recipe: &Select) -> Selection {
+fn without_overrides(scores: &Scores, recipe: &Select) -> Selection {
     select(scores, recipe, &Overrides::default()).unwrap()
 }
 
-/// The kept set by the definition: full sort, then the OR rule, unless all norms are 0.
+/// Computes the kept set by the definition: full sort, then the OR rule, unless all norms are 0.
 fn kept_by_definition(scores: &Scores, recipe: &Select) -> Vec<bool> {
     let n = scores.score.len();
     let mut order: Vec<usize> = (0..n).collect();
@@ -47,20 +47,20 @@ fn kept_by_definition(scores: &Scores, recipe: &Select) -> Vec<bool> {
         .collect()
 }
 
-/// Coarse values, so that ties are frequent; −0 and unclipped values included.
-fn any_part() -> impl Strategy<Value = f64> {
+/// Generates coarse values, so that ties are frequent; includes −0 and unclipped values.
+fn any_norm() -> impl Strategy<Value = f64> {
     prop_oneof![(-2i32..12).prop_map(|x| f64::from(x) / 8.0), Just(-0.0), Just(0.05), Just(0.05f64.next_down())]
 }
 
-/// By the rule too, of what no stage keeps.
+// The claim also holds for the order by rule, and for Gaussians that no stage keeps.
 #[test]
-fn the_sign_of_a_zero_changes_no_ranking() {
+fn sign_of_zero_changes_no_ranking() {
     let parts = |zero: f64| -> Vec<(f64, f64)> {
         (0..60).map(|i| if i % 3 == 0 { (zero, zero) } else { ([0.0, 0.5][i % 2], 0.0) }).collect()
     };
     for low_priority in [LowPriority::Drop, LowPriority::Rescue] {
         let recipe = rule(low_priority, 0.8, 0.05, 0.05);
-        let [plus, minus] = [0.0, -0.0].map(|zero| free(&scores(&parts(zero)), &recipe));
+        let [plus, minus] = [0.0, -0.0].map(|zero| without_overrides(&scores(&parts(zero)), &recipe));
         assert_eq!((plus.keep, plus.ranking.order()), (minus.keep, minus.ranking.order()));
     }
 }
@@ -75,15 +75,15 @@ fn any_rule() -> impl Strategy<Value = Select> {
 
 proptest! {
     #[test]
-    fn kept_set_is_that_of_the_definition_and_a_prefix_of_the_ranking(
-        parts in prop::collection::vec((any_part(), any_part()), 0..80),
-        // S of its own: weights may put first what fails the OR rule.
-        own in prop::collection::vec(any_part(), 80),
+    fn kept_set_meets_the_definition_and_leads_the_ranking(
+        parts in prop::collection::vec((any_norm(), any_norm()), 0..80),
+        // Independent scores S: weights may rank a Gaussian first that fails the OR rule.
+        independent_scores in prop::collection::vec(any_norm(), 80),
         recipe in any_rule(),
     ) {
         let mut scores = scores(&parts);
-        scores.score = own[..parts.len()].to_vec();
-        let selection = free(&scores, &recipe);
+        scores.score = independent_scores[..parts.len()].to_vec();
+        let selection = without_overrides(&scores, &recipe);
         prop_assert_eq!(&selection.keep, &kept_by_definition(&scores, &recipe));
         let kept: Vec<u32> = (0..parts.len() as u32).filter(|&i| selection.keep[i as usize]).collect();
         prop_assert_eq!(selection.ranking.take(selection.counts.kept), kept);
@@ -94,17 +94,17 @@ proptest! {
     }
 
     #[test]
-    fn overrides_lead_the_ranking_or_leave_it(
-        parts in prop::collection::vec((any_part(), any_part()), 1..60),
-        fates in prop::collection::vec(0u8..6, 60),
+    fn kept_ids_lead_the_ranking_and_dropped_ids_leave_it(
+        parts in prop::collection::vec((any_norm(), any_norm()), 1..60),
+        decisions in prop::collection::vec(0u8..6, 60),
         recipe in any_rule(),
     ) {
         let scores = scores(&parts);
-        let with = |fate| (0..parts.len() as u32).filter(|&i| fates[i as usize] == fate).collect::<Vec<u32>>();
+        let with = |fate| (0..parts.len() as u32).filter(|&i| decisions[i as usize] == fate).collect::<Vec<u32>>();
         let overrides = Overrides { keep_ids: with(0), drop_ids: with(1) };
         let selection = select(&scores, &recipe, &overrides).unwrap();
-        for (i, &natural) in free(&scores, &recipe).keep.iter().enumerate() {
-            let expected = match fates[i] { 0 => true, 1 => false, _ => natural };
+        for (i, &natural) in without_overrides(&scores, &recipe).keep.iter().enumerate() {
+            let expected = match decisions[i] { 0 => true, 1 => false, _ => natural };
             prop_assert_eq!(selection.keep[i], expected, "Gaussian {}", i);
         }
         prop_assert_eq!(selection.ranking.take(overrides.keep_ids.len()), overrides.keep_ids.clone());
@@ -115,19 +115,19 @@ proptest! {
 }
 
 #[test]
-fn few_candidates_of_which_the_best_fail_are_still_a_prefix() {
+fn kept_set_leads_the_ranking_if_the_best_fail_stage_2() {
     let parts: Vec<(f64, f64)> = (0..100).map(|i| (if i == 0 { 0.0 } else { 1.0 }, 0.0)).collect();
     let mut scores = scores(&parts);
     scores.score = (0..100).map(|i| -f64::from(i)).collect();
-    let selection = free(&scores, &rule(LowPriority::Drop, 0.02, 0.5, 0.5));
+    let selection = without_overrides(&scores, &rule(LowPriority::Drop, 0.02, 0.5, 0.5));
     assert_eq!((selection.counts.kept, selection.ranking.take(1)), (1, vec![1]));
 }
 
 #[test]
-fn a_lone_gaussian_is_kept() {
+fn a_single_gaussian_is_kept() {
     for preset in ["paper", "default"] {
         let recipe = Recipe::preset(preset).unwrap().select;
-        assert_eq!(free(&scores(&[(0.0, -0.0)]), &recipe).keep, [true], "{preset}");
+        assert_eq!(without_overrides(&scores(&[(0.0, -0.0)]), &recipe).keep, [true], "{preset}");
     }
 }
 
@@ -135,35 +135,35 @@ fn a_lone_gaussian_is_kept() {
 fn presets_follow_their_low_priority() {
     let parts: Vec<(f64, f64)> = (0..1000).map(|i| (f64::from(i) / 1000.0, 0.0)).collect();
     let scores = scores(&parts);
-    let paper = free(&scores, &Recipe::preset("paper").unwrap().select);
+    let paper = without_overrides(&scores, &Recipe::preset("paper").unwrap().select);
     assert_eq!((paper.counts.candidates, paper.counts.rescued, paper.counts.kept), (800, 0, 800));
-    // norm ≥ 0.05 is all but the last fifty; stage 1 had left out 150 of them.
-    let default = free(&scores, &Recipe::preset("default").unwrap().select);
+    // All but the last fifty have norm ≥ 0.05; stage 1 had excluded 150 of them.
+    let default = without_overrides(&scores, &Recipe::preset("default").unwrap().select);
     assert_eq!((default.counts.candidates, default.counts.rescued, default.counts.kept), (800, 150, 950));
 }
 
 #[test]
-fn identical_gaussians_are_cut_to_the_exact_count_by_hashed_id() {
+fn identical_gaussians_are_pruned_by_hashed_id() {
     let scores = scores(&vec![(0.5, 0.5); 1001]);
-    let selection = free(&scores, &rule(LowPriority::Drop, 0.3, 0.05, 0.05));
+    let selection = without_overrides(&scores, &rule(LowPriority::Drop, 0.3, 0.05, 0.05));
     assert_eq!(selection.counts.kept, 300);
     let mut by_hash: Vec<u32> = (0..1001).collect();
     by_hash.sort_by_key(|&id| hash_id(id.into()));
     assert_eq!(selection.ranking.order(), by_hash);
     let first_half = selection.keep[..500].iter().filter(|&&keep| keep).count();
-    assert!((110..190).contains(&first_half), "ties must not favour a place in the file: {first_half} of 300");
+    assert!((110..190).contains(&first_half), "ties must not favor a position in the file: {first_half} of 300");
 }
 
 #[test]
-fn nothing_stays_without_candidates_but_targets_are_still_met_in_order_of_score() {
+fn without_candidates_the_ranking_still_follows_the_score() {
     let parts: Vec<(f64, f64)> = (0..50).map(|i| (f64::from(i), 0.0)).collect();
-    let selection = free(&scores(&parts), &rule(LowPriority::Drop, 0.0, 0.05, 0.05));
+    let selection = without_overrides(&scores(&parts), &rule(LowPriority::Drop, 0.0, 0.05, 0.05));
     assert_eq!(selection.counts.kept, 0);
     assert_eq!(selection.ranking.take(3), [47, 48, 49]);
 }
 
 #[test]
-fn conflicting_and_unknown_ids_are_refused_by_name() {
+fn errors_name_conflicting_and_unknown_ids() {
     let scores = scores(&[(0.0, 0.0); 4]);
     let recipe = rule(LowPriority::Rescue, 0.5, 0.05, 0.05);
     for (overrides, id) in [
@@ -177,7 +177,7 @@ fn conflicting_and_unknown_ids_are_refused_by_name() {
 
 #[test]
 fn no_gaussians_give_an_empty_selection() {
-    let selection = free(&scores(&[]), &Recipe::preset("default").unwrap().select);
+    let selection = without_overrides(&scores(&[]), &Recipe::preset("default").unwrap().select);
     assert!(selection.keep.is_empty() && selection.ranking.order().is_empty());
 }
 
@@ -189,7 +189,7 @@ fn selection_ignores_thread_count() {
     let recipe = rule(LowPriority::Drop, 0.6, 0.3, 0.5);
     let on = |threads| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        pool.install(|| free(&scores, &recipe))
+        pool.install(|| without_overrides(&scores, &recipe))
     };
     let one = on(1);
     assert!(one == on(2) && one == on(7));

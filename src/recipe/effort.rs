@@ -1,33 +1,33 @@
-//! How much time a run may take for how small an error: places on the curves that `splatsieve precision` draws.
+//! Effort of a run, one knob for time against quality: points on the curves that `splatsieve precision` draws.
 
 use super::{MOST_STEPS, Recipe};
 
-/// A place on the curves of error against run time.
+/// Point on the curve of quality against run time.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Effort {
-    /// A third of the steps of refinement, and a coarser look and rounds.
+    /// A third of the optimization steps, and fewer views and larger pruning rounds.
     Fast,
-    /// As the recipe has it.
+    /// Settings of the recipe.
     Default,
-    /// Three times the steps, and a finer look and rounds.
+    /// Three times the optimization steps, and more views and smaller pruning rounds.
     Best,
 }
 
-/// What a place comes to.
-struct Knobs {
+/// Settings of an effort.
+struct EffortSettings {
     look_pictures: usize,
     round_pictures: usize,
     round_turns: usize,
     round_fraction: f64,
-    /// Times the recipe's own.
+    /// Factor on the optimization steps of the recipe.
     steps: f64,
 }
 
 impl Effort {
-    /// Every one, the fastest first.
+    /// Efforts in order, the fastest first.
     pub const ALL: [Effort; 3] = [Effort::Fast, Effort::Default, Effort::Best];
 
-    /// As the command line names it.
+    /// Returns the name on the command line.
     pub fn name(self) -> &'static str {
         match self {
             Effort::Fast => "fast",
@@ -36,9 +36,9 @@ impl Effort {
         }
     }
 
-    fn knobs(self) -> Option<Knobs> {
+    fn settings(self) -> Option<EffortSettings> {
         match self {
-            Effort::Fast => Some(Knobs {
+            Effort::Fast => Some(EffortSettings {
                 look_pictures: 50,
                 round_pictures: 24,
                 round_turns: 3,
@@ -46,32 +46,37 @@ impl Effort {
                 steps: 1.0 / 3.0,
             }),
             Effort::Default => None,
-            Effort::Best => {
-                Some(Knobs { look_pictures: 400, round_pictures: 96, round_turns: 3, round_fraction: 0.95, steps: 3.0 })
-            }
+            Effort::Best => Some(EffortSettings {
+                look_pictures: 400,
+                round_pictures: 96,
+                round_turns: 3,
+                round_fraction: 0.95,
+                steps: 3.0,
+            }),
         }
     }
 }
 
 impl Recipe {
-    /// The same at `effort`: the first look, the rounds and the steps of refinement, as far as the recipe has them, with more
-    /// or fewer of them. What a recipe looks at whole stays so.
+    /// Returns this recipe at `effort`: with more or fewer scored views, rounds and optimization steps. Parts that the
+    /// recipe does not use stay unused. A recipe that scores all views keeps scoring all.
     pub fn at_effort(&self, effort: Effort) -> Recipe {
-        let Some(knobs) = effort.knobs() else { return self.clone() };
-        let steps = knobs.steps * f64::from(self.refine.refine_steps);
+        let Some(settings) = effort.settings() else { return self.clone() };
+        let steps = settings.steps * f64::from(self.refine.refine_steps);
         let mut recipe = self.refining_by((steps.ceil() as u32).min(MOST_STEPS));
-        // Never past what the recipe has by itself.
-        let less = knobs.steps < 1.0;
-        let moved = |own: usize, to: usize| if less { own.min(to) } else { own.max(to) };
+        // Never cross the recipe's own value in the wrong direction.
+        let less = settings.steps < 1.0;
+        let limited = |own: usize, to: usize| if less { own.min(to) } else { own.max(to) };
         if recipe.scan.look_pictures > 0 {
-            recipe.scan.look_pictures = moved(recipe.scan.look_pictures, knobs.look_pictures);
+            recipe.scan.look_pictures = limited(recipe.scan.look_pictures, settings.look_pictures);
         }
         if recipe.select.round_fraction < 1.0 {
             let select = &mut recipe.select;
-            select.round_pictures = moved(select.round_pictures, knobs.round_pictures);
-            select.round_turns = select.round_turns.min(knobs.round_turns);
+            select.round_pictures = limited(select.round_pictures, settings.round_pictures);
+            select.round_turns = select.round_turns.min(settings.round_turns);
             let own = select.round_fraction;
-            select.round_fraction = if less { own.min(knobs.round_fraction) } else { own.max(knobs.round_fraction) };
+            select.round_fraction =
+                if less { own.min(settings.round_fraction) } else { own.max(settings.round_fraction) };
         }
         recipe
     }
@@ -82,11 +87,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn more_effort_looks_at_more_and_what_a_recipe_does_not_do_stays_undone() {
+    fn effort_increases_work_and_adds_no_unused_parts() {
         let default = Recipe::preset("default").unwrap();
         let at = Effort::ALL.map(|effort| default.at_effort(effort));
         assert_eq!(at[1], default);
-        let rising = |of: fn(&Recipe) -> f64| at.iter().map(of).is_sorted_by(|a, b| a < b);
+        let rising = |value: fn(&Recipe) -> f64| at.iter().map(value).is_sorted_by(|a, b| a < b);
         assert!(rising(|recipe| recipe.scan.look_pictures as f64));
         assert!(rising(|recipe| recipe.select.round_pictures as f64));
         assert!(rising(|recipe| recipe.select.round_fraction));

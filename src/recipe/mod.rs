@@ -1,25 +1,29 @@
-//! Every hyper-parameter of a run: presets, recipe files over them, flags over those.
+//! Parameters of the method: presets, recipe files that override presets, and flags that override files.
 //!
-//! What a parameter means is written beside its value in `paper.toml`; the types here only give
-//! each its range.
+//! The meaning of each parameter is documented beside its value in `paper.toml`; the types in `sections` only define
+//! the possible values.
 
 mod effort;
 mod parameters;
-
-use std::num::NonZeroU32;
+mod sections;
 
 use serde::{Deserialize, Serialize};
 
 use crate::error::{Error, Result, quoted};
-use crate::model::{Columns, HIGHEST_DEGREE};
+use crate::model::Columns;
 
 pub use effort::Effort;
 pub use parameters::{Parameter, parameters};
+pub use sections::{
+    Anisotropy, AttributeGroups, Coverage, FieldParams, LengthUnit, LowPriority, MergeParams, MergePass, MotionParams,
+    NonFinite, Placement, Precision, ProxyOpacity, RefineParams, ScanParams, ScoreParams, Select, ShDegreeParams,
+    ShHigh, StaticTerm, Trajectory, WhichBands,
+};
 
 /// Text of preset `paper`, with a comment on every parameter.
 const PAPER: &str = include_str!("paper.toml");
 
-/// Every preset: its name and its text. Those that start from another name it by `preset`.
+/// Name and text of every preset. A preset may start from another one, which it names by the key `preset`.
 pub const PRESETS: [(&str, &str); 4] = [
     ("default", include_str!("default.toml")),
     ("paper", PAPER),
@@ -27,368 +31,47 @@ pub const PRESETS: [(&str, &str); 4] = [
     ("strong", include_str!("strong.toml")),
 ];
 
-/// Largest fraction of the Gaussians that a round may leave: with it 10 million Gaussians take 1300 rounds down to a few.
+/// Maximum fraction of the Gaussians that a pruning round may leave. With it, 10 million Gaussians take 1300 rounds
+/// down to a few.
 pub const MOST_LEFT_BY_ROUND: f64 = 0.99;
-/// Most steps of refinement: a run of a day.
+/// Maximum number of optimization steps of refinement; a run of one day.
 const MOST_STEPS: u32 = 1_000_000;
-/// Most merge passes. Every pass reads all frames.
+/// Maximum number of merge passes. Every pass reads all frames.
 const MOST_PASSES: usize = 16;
 
-/// All hyper-parameters; see `paper.toml` for the meaning of each.
+/// Parameters of the method; `paper.toml` documents each of them.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Recipe {
-    /// The pass over all frames.
+    /// Parameters of the scan over all frames.
     pub scan: ScanParams,
-    /// Normalization and weights.
+    /// Parameters of the scores: normalization and weights.
     pub score: ScoreParams,
-    /// Stages 1 and 2.
+    /// Parameters of selection (stages 1 and 2 of the paper).
     pub select: Select,
-    /// Stage 3.
+    /// Parameters of merging (stage 3 of the paper).
     pub merge: MergeParams,
-    /// Everything that is stored of what is left.
+    /// Parameters of refinement, which fits the stored values of the survivors.
     pub refine: RefineParams,
-    /// What deforms it.
+    /// Parameters of the deformation field of the result.
     pub field: FieldParams,
-    /// How its colors change with direction.
+    /// Parameters of the SH degree of the result.
     pub bands: ShDegreeParams,
 }
 
-/// Parameters of the pass over all frames.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-#[expect(missing_docs, reason = "paper.toml documents each parameter beside its value")]
-pub struct ScanParams {
-    pub alpha_min: f64,
-    pub motion: MotionParams,
-    pub snap_noise: bool,
-    pub coverage: Coverage,
-    pub pixel_stride: NonZeroU32,
-    pub view_stride: NonZeroU32,
-    pub frame_stride: NonZeroU32,
-    pub look_pictures: usize,
-    pub non_finite: NonFinite,
-}
-
-/// Which steps count as motion and what they are divided by.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum MotionParams {
-    /// The paper's divisors; steps across gaps of the life span count.
-    Literal,
-    /// Only steps inside one run of life frames, divided by their number.
-    Runs,
-}
-
-/// What C measures.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Coverage {
-    /// [`Coverage::Visible`] through cameras of the scene's own, else [`Coverage::Projected`]: a virtual
-    /// rig may stand behind walls that no real picture shows.
-    Auto,
-    /// Σ alpha · transmittance over pixels.
-    Visible,
-    /// Area of the projected 3σ ellipse inside the image × opacity.
-    Projected,
-}
-
-/// What to do with a Gaussian that holds NaN or infinity.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum NonFinite {
-    /// Stop and name the Gaussians.
-    Error,
-    /// Prune it.
-    Drop,
-    /// Keep it as it is.
-    Keep,
-}
-
-/// Parameters of the scores.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-#[expect(missing_docs, reason = "paper.toml documents each parameter beside its value")]
-pub struct ScoreParams {
-    pub static_term: StaticTerm,
-    pub w_static: f64,
-    pub w_dynamic: f64,
-    pub lambda: f64,
-    pub anisotropy: Anisotropy,
-    pub mu: f64,
-    pub eta: f64,
-    pub xi: f64,
-    pub weigh_motion_by_life: bool,
-    pub norm_epsilon: f64,
-    pub clip_norm: bool,
-}
-
-/// What S_static starts from.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum StaticTerm {
-    /// C.
-    Mean,
-    /// W.
-    Peak,
-    /// √(C·W).
-    Geometric,
-}
-
-/// What E measures.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Anisotropy {
-    /// s_max / s_min.
-    Ratio,
-    /// ln(s_max / s_mid).
-    Log,
-}
-
-/// Parameters of stages 1 and 2.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-#[expect(missing_docs, reason = "paper.toml documents each parameter beside its value")]
-pub struct Select {
-    pub keep_fraction: f64,
-    pub tau_static: f64,
-    pub tau_dynamic: f64,
-    pub low_priority: LowPriority,
-    pub round_fraction: f64,
-    pub round_pictures: usize,
-    pub round_turns: usize,
-    pub contrast_floor: f64,
-    pub choose_by_views: bool,
-}
-
-/// What becomes of Gaussians outside stage 1.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum LowPriority {
-    /// Pruned.
-    Drop,
-    /// Judged by stage 2 like the candidates.
-    Rescue,
-}
-
-/// Parameters of stage 3.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-#[expect(missing_docs, reason = "paper.toml documents each parameter beside its value")]
-pub struct MergeParams {
-    pub length_unit: LengthUnit,
-    pub max_neighbors: usize,
-    pub max_scale_ratio: f64,
-    pub max_color_difference: f64,
-    pub trajectory: Trajectory,
-    pub motion_noise: f64,
-    pub max_drift: f64,
-    pub max_dead_time: f64,
-    pub placement: Placement,
-    pub opacity: ProxyOpacity,
-    pub sh_high: ShHigh,
-    pub passes: Vec<MergePass>,
-}
-
-/// Parameters of everything that is stored of what is left.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-#[expect(missing_docs, reason = "paper.toml documents each parameter beside its value")]
-pub struct RefineParams {
-    pub refine: AttributeGroups,
-    pub refine_steps: u32,
-    pub refine_cut_steps: u32,
-    pub refine_pictures: usize,
-    pub refine_ssim: f64,
-    pub refine_knots: usize,
-}
-
-/// Parameters of the deformation field that is written.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-#[expect(missing_docs, reason = "paper.toml documents each parameter beside its value")]
-pub struct FieldParams {
-    pub field: Precision,
-    pub field_margin: f64,
-}
-
-/// Parameters of the bands of spherical harmonics that are written.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-#[expect(missing_docs, reason = "paper.toml documents each parameter beside its value")]
-pub struct ShDegreeParams {
-    pub bands: WhichBands,
-    pub bands_margin: f64,
-}
-
-/// Which bands of spherical harmonics are written.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(try_from = "String", into = "String")]
-pub enum WhichBands {
-    /// Those that there are.
-    All,
-    /// No more than pictures need.
-    Needed,
-    /// Up to this degree, which refining makes the best of.
-    UpTo(usize),
-}
-
-impl TryFrom<String> for WhichBands {
-    type Error = String;
-
-    fn try_from(text: String) -> std::result::Result<WhichBands, String> {
-        match text.as_str() {
-            "all" => Ok(WhichBands::All),
-            "needed" => Ok(WhichBands::Needed),
-            degree => match degree.parse() {
-                Ok(degree) if degree <= HIGHEST_DEGREE => Ok(WhichBands::UpTo(degree)),
-                _ => Err(format!("{}: expected all, needed, or a degree from 0 to {HIGHEST_DEGREE}", quoted(degree))),
-            },
-        }
-    }
-}
-
-impl From<WhichBands> for String {
-    fn from(bands: WhichBands) -> String {
-        match bands {
-            WhichBands::All => "all".to_owned(),
-            WhichBands::Needed => "needed".to_owned(),
-            WhichBands::UpTo(degree) => degree.to_string(),
-        }
-    }
-}
-
-/// How a deformation field is written.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Precision {
-    /// As it was, byte for byte.
-    #[default]
-    Exact,
-    /// In IEEE 754 binary16.
-    Half,
-}
-
-/// Groups of stored values, by names that a person gives them: `color,opacity,scale,rotation,position`, any of them, or
-/// `none`.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(try_from = "String", into = "String")]
-pub struct AttributeGroups(pub Columns);
-
-/// Every group and its column.
-const GROUPS: [(&str, Columns); 5] = [
-    ("color", Columns::SH),
-    ("opacity", Columns::OPACITY),
-    ("scale", Columns::LOG_SCALE),
-    ("rotation", Columns::ROTATION),
-    ("position", Columns::POSITION),
-];
-
-impl TryFrom<String> for AttributeGroups {
-    type Error = String;
-
-    fn try_from(text: String) -> std::result::Result<AttributeGroups, String> {
-        let mut columns = Columns::empty();
-        for name in text.split([',', ' ']).filter(|&name| text != "none" && !name.is_empty()) {
-            let group = GROUPS.iter().find(|group| group.0 == name).ok_or_else(|| {
-                let names = GROUPS.map(|group| group.0).join(",");
-                format!("{}: expected some of {names}, or none", quoted(name))
-            })?;
-            columns |= group.1;
-        }
-        Ok(AttributeGroups(columns))
-    }
-}
-
-impl From<AttributeGroups> for String {
-    fn from(groups: AttributeGroups) -> String {
-        let names: Vec<&str> = GROUPS.iter().filter(|group| groups.0.contains(group.1)).map(|group| group.0).collect();
-        if names.is_empty() { "none".to_owned() } else { names.join(",") }
-    }
-}
-
-/// Thresholds of one merge pass.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-#[expect(missing_docs, reason = "paper.toml documents each parameter beside its value")]
-pub struct MergePass {
-    pub epsilon: f64,
-    pub d0: f64,
-    pub rho: f64,
-    pub tau_m: f64,
-}
-
-/// Unit of the merge lengths.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum LengthUnit {
-    /// Scene units.
-    Scene,
-    /// The scene extent.
-    Extent,
-}
-
-impl LengthUnit {
-    /// Length of one unit in a scene of that extent.
-    pub fn in_scene_units(self, extent: f64) -> f64 {
-        match self {
-            LengthUnit::Scene => 1.0,
-            LengthUnit::Extent => extent,
-        }
-    }
-}
-
-/// How trajectories are compared.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Trajectory {
-    /// The paper's mean cosine of velocities.
-    Cosine,
-    /// (2Σ a·b + 2nσ²) / (Σ‖a‖² + Σ‖b‖² + 2nσ²).
-    Alignment,
-}
-
-/// Where a proxy is placed.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Placement {
-    /// At the weighted mean.
-    Mean,
-    /// At the leader, with second moments about it.
-    Leader,
-}
-
-/// How the opacity of a proxy follows from its members'.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum ProxyOpacity {
-    /// Clamped sum.
-    Sum,
-    /// 1 − Π(1 − α).
-    Union,
-    /// Σ α·area / area of the proxy, clamped.
-    Area,
-}
-
-/// Where the higher bands of a proxy come from.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum ShHigh {
-    /// Weighted average.
-    Average,
-    /// The heaviest member.
-    Heaviest,
-}
-
 impl Recipe {
-    /// The preset of that name.
+    /// Returns the preset `name`.
+    ///
+    /// # Errors
+    /// Fails if there is no preset of that name.
     pub fn preset(name: &str) -> Result<Recipe> {
         preset_text(name)?;
         Ok(Recipe::from_toml("", name).expect("presets parse: tested"))
     }
 
-    /// A recipe file's text: any subset of the parameters, over the preset named by its first key
-    /// `preset` (or `fallback`). The tables `[provenance]` and `[run]`, as written beside results, are not looked at.
+    /// Parses the text of a recipe file: any subset of the parameters. The others come from the preset that its key
+    /// `preset` names, or from the preset `fallback`. Ignores the tables `[provenance]` and `[run]` that files beside
+    /// results have.
     pub fn from_toml(text: &str, fallback: &str) -> std::result::Result<Recipe, String> {
         let over: toml::Table = toml::from_str(text).map_err(|e| e.to_string())?;
         let recipe: Recipe =
@@ -397,7 +80,7 @@ impl Recipe {
         Ok(recipe)
     }
 
-    /// This recipe with one parameter set from its text: a TOML value, or a bare word for a name.
+    /// Returns this recipe with one parameter set from text: a TOML value, or a bare word for a name.
     pub fn with(&self, section: &str, key: &str, value: &str) -> std::result::Result<Recipe, String> {
         let number = value.parse::<f64>().map(toml::Value::Float);
         let whole = value.parse::<i64>().map(toml::Value::Integer);
@@ -414,14 +97,14 @@ impl Recipe {
         table.try_into().map_err(|e: toml::de::Error| e.to_string())
     }
 
-    /// The same, but that what stays keeps its values.
+    /// Returns this recipe without refinement.
     pub fn unrefined(&self) -> Recipe {
         let mut recipe = self.clone();
         recipe.refine.refine = AttributeGroups(Columns::empty());
         recipe
     }
 
-    /// The same with so many steps of refinement, and before each cut as many in proportion.
+    /// Returns this recipe with `steps` optimization steps, and proportionally as many before each prune step.
     pub fn refining_by(&self, steps: u32) -> Recipe {
         let mut recipe = self.clone();
         let refine = &mut recipe.refine;
@@ -432,17 +115,17 @@ impl Recipe {
         recipe
     }
 
-    /// The parameters as TOML.
+    /// Returns the parameters as TOML.
     pub fn to_toml(&self) -> String {
         toml::to_string(self).expect("a recipe is plain data")
     }
 
-    /// Checks every range; the message names the parameter.
+    /// Checks the ranges of all parameters. The error message names the parameter.
     pub fn validate(&self) -> std::result::Result<(), String> {
         let in_unit = |x: f64| (0.0..=1.0).contains(&x);
         let nonnegative = |x: f64| x >= 0.0;
         let finite = |x: f64| x.is_finite() && x >= 0.0;
-        // Sums of weighted norms stay finite, and 0 times a weight is 0.
+        // The limit keeps sums of weighted norms finite, and 0 times a weight is 0.
         let weight = |x: f64| (0.0..=1e6).contains(&x);
         let MergeParams { max_scale_ratio, max_color_difference, motion_noise, max_drift, max_dead_time, .. } =
             self.merge;
@@ -527,7 +210,7 @@ impl Recipe {
     }
 }
 
-/// Text of the preset of that name.
+/// Returns the text of the preset `name`.
 pub fn preset_text(name: &str) -> Result<&'static str> {
     match PRESETS.iter().find(|(known, _)| *known == name) {
         Some((_, text)) => Ok(text),
@@ -539,8 +222,8 @@ pub fn preset_text(name: &str) -> Result<&'static str> {
     }
 }
 
-/// All parameters: those of `over`, the others from the preset it names or from `fallback`. Presets
-/// themselves may name one more.
+/// Returns all parameters: those of `over`, and the others from the preset that it names or from `fallback`. A preset
+/// may name one more preset.
 fn over_preset(mut over: toml::Table, fallback: Option<&str>) -> std::result::Result<toml::Table, String> {
     over.remove("provenance");
     over.remove("run");
@@ -557,8 +240,7 @@ fn over_preset(mut over: toml::Table, fallback: Option<&str>) -> std::result::Re
     Ok(table)
 }
 
-/// Replaces the leaves of `base` by those of `over`; keys that `base` lacks are added, to be
-/// refused by the typed parse.
+/// Replaces the values in `base` by those of `over`. Adds keys that `base` lacks; the typed parser refuses them later.
 fn overlay(base: &mut toml::Table, over: toml::Table) {
     for (key, value) in over {
         match (base.get_mut(&key), value) {
@@ -575,7 +257,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn presets_parse_and_are_in_range() {
+    fn presets_parse_and_are_within_their_ranges() {
         for (name, _) in PRESETS {
             Recipe::preset(name).unwrap().validate().unwrap();
         }
@@ -584,7 +266,7 @@ mod tests {
     }
 
     #[test]
-    fn effective_recipe_reads_back_as_itself() {
+    fn written_recipe_reads_back_unchanged() {
         let recipe = Recipe::preset("paper").unwrap();
         assert_eq!(Recipe::from_toml(&recipe.to_toml(), "default").unwrap(), recipe);
     }

@@ -1,17 +1,18 @@
-//! The list of all parameters, read from the documented preset: what flags and help are made of.
+//! List of all parameters with their documentation, parsed from the preset `paper`. Flags and help texts are made from
+//! it.
 
-/// One hyper-parameter of the recipe.
+/// Parameter of the recipe.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Parameter {
-    /// Table it stands in: `scan`, `score`, `select`, `merge`, `refine`.
+    /// Table of the parameter: `scan`, `score`, `select`, `merge`, `refine`, `field` or `bands`.
     pub section: String,
-    /// Its key, unique over all sections.
+    /// Key of the parameter, unique over all tables.
     pub key: String,
-    /// The comment above it in `paper.toml`, on one line.
+    /// Documentation: the comment above the parameter in `paper.toml`, joined to one line.
     pub doc: String,
 }
 
-/// Every parameter of `paper.toml` in file order, merge passes excepted.
+/// Returns every parameter of `paper.toml` in file order, except merge passes.
 pub fn parameters() -> Vec<Parameter> {
     let (mut section, mut doc, mut found) = (String::new(), Vec::new(), Vec::new());
     for line in super::PAPER.lines() {
@@ -33,7 +34,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_parameter_is_documented_and_has_a_key_of_its_own() {
+    fn every_parameter_is_documented_and_has_a_unique_key() {
         let all = parameters();
         let table: toml::Table = toml::from_str(super::super::PAPER).unwrap();
         let leaves: usize =

@@ -1,8 +1,8 @@
-//! Descending a gradient: how far what is stored of Gaussians moves, given how a number changes with it.
+//! Gradient descent on the stored parameters of Gaussians.
 //!
-//! In: derivatives of one picture's loss after another ([`Gradients`]). Out: a [`ParamDelta`] of what is stored. Adam
-//! (Kingma and Ba, "Adam: A Method for Stochastic Optimization", 2015) with a rate for each group of values and no
-//! correction but its own. Memory: [`bytes_per_gaussian`].
+//! Input: derivatives of the loss of one view after another ([`Gradients`]). Output: a [`ParamDelta`] of the stored
+//! parameters. The method is Adam (Kingma and Ba, "Adam: A Method for Stochastic Optimization", 2015) with a learning
+//! rate for each group of values, and no correction but Adam's own bias correction. Memory: [`bytes_per_gaussian`].
 
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -10,16 +10,17 @@ use serde::{Deserialize, Serialize};
 use crate::compressed_model::ParamDelta;
 use crate::model::{Column, Columns, Gaussians, Gradients, sh_coefficients};
 
-/// Decay of the means of a derivative and of its square, and what keeps a division from 0.
+/// Decay rates of the running means of the derivative and of its square.
 const BETAS: [f32; 2] = [0.9, 0.999];
-/// See [`BETAS`].
+/// Term that keeps Adam's division finite.
 const EPSILON: f32 = 1e-15;
-/// Steps over which rates grow to their full size: the first means say little.
+/// Number of steps over which learning rates grow to their full size, because the first means are unreliable.
 const WARM_UP: usize = 10;
-/// Root mean square error of pictures from which rates are full: what is nearly right must not be shaken.
+/// Root mean square error of the views from which learning rates have full size; nearly correct parameters get smaller
+/// steps.
 const FULL_ERROR: f64 = 0.045;
 
-/// How rates change from step to step.
+/// Learning rates by optimization step.
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]
 pub struct RateSchedule {
     steps: usize,
@@ -28,43 +29,46 @@ pub struct RateSchedule {
 }
 
 impl RateSchedule {
-    /// Of `steps` steps, down to `last` of the first's rates. `error` is the root mean square error of the pictures at
-    /// the start.
+    /// Creates the schedule of `steps` steps; the last step has a fraction `last` of the first step's rates. `error` is
+    /// the root mean square error of the views at the start.
     pub fn new(steps: usize, last: f32, error: f64) -> RateSchedule {
         RateSchedule { steps, last, factor: (error / FULL_ERROR).min(1.0) as f32 }
     }
 
-    /// With rates that are `part` of these.
+    /// Returns the schedule with all rates multiplied by `part`.
     pub fn times(self, part: f32) -> RateSchedule {
         RateSchedule { factor: part * self.factor, ..self }
     }
 
-    /// What rates are multiplied by in step `done`.
+    /// Returns the factor on the rates after `done` steps.
     fn at(&self, done: usize) -> f32 {
         let [warm, late] = [(done + 1) as f32 / WARM_UP as f32, done as f32 / self.steps.max(1) as f32];
         self.factor * warm.min(1.0) * self.last.powf(late)
     }
 }
 
-/// What is stored of Gaussians on its way down.
+/// Adam optimizer of the stored parameters of Gaussians.
 #[derive(Debug)]
 pub struct Descent {
     change: ParamDelta,
-    /// Means of the derivatives, and of their squares.
+    /// Running means of the derivatives, and of their squares.
     means: [Gaussians; 2],
-    /// `[N]`, by what rates are multiplied: 1, and of positions four hundredths of the mean extent; 0 of what stays.
+    /// `[N]`, factors on the learning rate: for positions 0.04 times the geometric mean of the scales, for
+    /// other attributes 1; 0 for fixed Gaussians.
     reach: [Vec<f32>; 2],
     columns: Columns,
     done: usize,
 }
 
-/// Memory of a [`Descent`] and of the derivatives that it follows, for `columns` with harmonics up to `sh_degree`.
+/// Returns the memory of a [`Descent`] and of the derivatives it uses, in bytes per Gaussian, for the attributes
+/// `columns` with SH coefficients up to `sh_degree`.
 pub fn bytes_per_gaussian(columns: Columns, sh_degree: usize) -> usize {
     4 * 4 * columns.width(sh_degree) + 2 * size_of::<f32>()
 }
 
 impl Descent {
-    /// From `start`, of which the columns `columns` may move, harmonics up to `sh_degree`, but for the Gaussians `fixed`.
+    /// Creates the optimizer at `start`. The attributes `columns` are optimized, SH coefficients up to `sh_degree`,
+    /// except for the Gaussians `fixed`.
     pub fn new(start: &Gaussians, columns: Columns, sh_degree: usize, fixed: &[bool]) -> Descent {
         let mut change = Gaussians::default();
         for column in columns.iter() {
@@ -72,29 +76,29 @@ impl Descent {
         }
         let extent = |i: usize| start.log_scale.row::<3>(i).iter().sum::<f32>() / 3.0;
         let free: Vec<f32> = fixed.iter().map(|&fixed| if fixed { 0.0 } else { 1.0 }).collect();
-        let of_positions = |(i, free): (usize, &f32)| free * 0.04 * extent(i).clamp(-80.0, 80.0).exp();
-        let reach = [free.iter().enumerate().map(of_positions).collect(), free];
+        let position_reach = |(i, free): (usize, &f32)| free * 0.04 * extent(i).clamp(-80.0, 80.0).exp();
+        let reach = [free.iter().enumerate().map(position_reach).collect(), free];
         Descent { means: [change.clone(), change.clone()], change: ParamDelta(change), reach, columns, done: 0 }
     }
 
-    /// What is to be added to the start.
+    /// Returns the delta to be added to the start.
     pub fn change(&self) -> &ParamDelta {
         &self.change
     }
 
-    /// Whether anything moved.
+    /// Returns whether the delta is not 0.
     pub fn has_moved(&self) -> bool {
         self.columns.iter().any(|column| self.change.0.column(column).planes().iter().any(|&x| x != 0.0))
     }
 
-    /// What is to be added to the start, which from now on counts as the start's own.
+    /// Returns the delta to be added to the start and resets it to 0; the caller adds it to the start.
     pub fn take(&mut self) -> ParamDelta {
         let moved = self.change.clone();
         self.change.0.columns_mut(self.columns).for_each(|column| column.planes_mut().fill(0.0));
         moved
     }
 
-    /// Begins anew with `change` already added to the start; columns that it does not have are where they began.
+    /// Restarts with `change` as the delta; attributes that `change` does not have get a delta of 0.
     pub fn restart(&mut self, change: &ParamDelta) {
         self.take();
         for column in (self.columns & change.columns()).iter() {
@@ -106,41 +110,41 @@ impl Descent {
         self.done = 0;
     }
 
-    /// How far it is: the change, the means, and the steps done, from which [`Descent::go_on`] goes on.
-    pub fn standing(&self) -> (&ParamDelta, &[Gaussians; 2], usize) {
+    /// Returns the contents of a checkpoint: delta, means, and number of steps. [`Descent::resume`] resumes from it.
+    pub fn checkpoint(&self) -> (&ParamDelta, &[Gaussians; 2], usize) {
         (&self.change, &self.means, self.done)
     }
 
-    /// Goes on from where another descent of the same start was.
-    pub fn go_on(&mut self, (change, means, done): (ParamDelta, [Gaussians; 2], usize)) {
+    /// Resumes from the checkpoint of another optimizer with the same start.
+    pub fn resume(&mut self, (change, means, done): (ParamDelta, [Gaussians; 2], usize)) {
         (self.change, self.means, self.done) = (change, means, done);
     }
 
-    /// One step against `weight` times `gradients`, at rates of `schedule`.
+    /// Makes one step against `weight` times `gradients`, with the learning rates of `schedule`.
     ///
     /// # Panics
-    /// If they are of other Gaussians or fewer columns.
+    /// Panics if `gradients` has other Gaussians or fewer attributes.
     pub fn step(&mut self, gradients: &Gradients, weight: f32, schedule: &RateSchedule) {
         let factor = schedule.at(self.done);
         self.done += 1;
-        // Of means that began at 0.
+        // Corrects the bias of means that started at 0.
         let unbiased = BETAS.map(|beta| 1.0 / (1.0 - beta.powi(self.done as i32)));
-        let [of_positions, of_others] = &self.reach;
-        let count = of_others.len().max(1);
+        let [position_reach, other_reach] = &self.reach;
+        let count = other_reach.len().max(1);
         let [means, squares] = &mut self.means;
         let moved = means.columns_mut(self.columns).zip(squares.columns_mut(self.columns));
         let moved = self.columns.iter().zip(moved.zip(self.change.0.columns_mut(self.columns)));
         let mut planes = Vec::new();
         for (column, ((means, squares), values)) in moved {
-            let reach = if column == Columns::POSITION { of_positions } else { of_others };
-            let of = gradients.column(column).planes().chunks_exact(count);
-            let own = means.planes_mut().chunks_exact_mut(count).zip(squares.planes_mut().chunks_exact_mut(count));
-            let own = own.zip(values.planes_mut().chunks_exact_mut(count)).zip(of).enumerate();
-            planes.extend(own.map(|(c, own)| (factor * rate(column, c), reach, own)));
+            let reach = if column == Columns::POSITION { position_reach } else { other_reach };
+            let slopes_of_column = gradients.column(column).planes().chunks_exact(count);
+            let state = means.planes_mut().chunks_exact_mut(count).zip(squares.planes_mut().chunks_exact_mut(count));
+            let state = state.zip(values.planes_mut().chunks_exact_mut(count)).zip(slopes_of_column).enumerate();
+            planes.extend(state.map(|(c, state)| (factor * rate(column, c), reach, state)));
         }
         planes.into_par_iter().for_each(|(rate, reach, (((mean, square), value), slope))| {
-            let own = mean.iter_mut().zip(square).zip(value).zip(slope).zip(reach);
-            for ((((mean, square), value), &slope), &reach) in own {
+            let state = mean.iter_mut().zip(square).zip(value).zip(slope).zip(reach);
+            for ((((mean, square), value), &slope), &reach) in state {
                 let slope = weight * slope;
                 *mean += (1.0 - BETAS[0]) * (slope - *mean);
                 *square += (1.0 - BETAS[1]) * (slope * slope - *square);
@@ -152,14 +156,14 @@ impl Descent {
     }
 }
 
-/// How far component `c` of `column` moves in a step at first; positions in units of their reach.
+/// Returns the learning rate of component `c` of `column`; positions are in units of their `reach`.
 fn rate(column: Columns, c: usize) -> f32 {
     match column {
         Columns::POSITION => 1.0,
         Columns::ROTATION => 0.006,
         Columns::SH if c < 3 * sh_coefficients(0) => 0.015,
         Columns::SH => 0.001_25,
-        // Log scale and logit.
+        // Log scale and opacity logit.
         _ => 0.05,
     }
 }
@@ -168,7 +172,7 @@ fn rate(column: Columns, c: usize) -> f32 {
 mod tests {
     use super::*;
 
-    /// Slopes of Σ (value − aim)² / 2 in every column.
+    /// Returns the derivatives of Σ (value − aim)² / 2 in every attribute.
     fn slopes(state: &Gaussians, aim: f32) -> Gradients {
         let mut gradients = Gradients::new(state.len(), Columns::all(), 0);
         for column in Columns::all().iter() {
@@ -179,7 +183,7 @@ mod tests {
     }
 
     #[test]
-    fn values_come_to_rest_where_the_slope_is_zero_and_fixed_ones_do_not_move() {
+    fn values_converge_to_zero_slope_and_fixed_ones_stay() {
         let start = Gaussians::zeros(3, 0);
         let mut descent = Descent::new(&start, Columns::all(), 0, &[false, true, false]);
         for _ in 0..2000 {
@@ -199,7 +203,7 @@ mod tests {
     }
 
     #[test]
-    fn a_step_is_that_of_adam_written_out_in_f64() {
+    fn steps_equal_adam_in_f64() {
         let start = Gaussians::zeros(1, 0);
         let (steps, error) = (50, 0.009);
         let mut descent = Descent::new(&start, Columns::OPACITY, 0, &[false]);
@@ -221,7 +225,7 @@ mod tests {
     }
 
     #[test]
-    fn slopes_of_any_size_leave_every_value_finite() {
+    fn extreme_slopes_leave_values_finite() {
         let mut descent = Descent::new(&Gaussians::zeros(4, 0), Columns::all(), 0, &[false; 4]);
         for slope in [f32::MAX, 1e-38, -f32::MAX, 0.0, 3e20] {
             let mut gradients = Gradients::new(4, Columns::all(), 0);

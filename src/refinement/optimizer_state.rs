@@ -1,9 +1,9 @@
-//! What is left, on the move: the states that its pictures show.
+//! State of the optimization: the states of the survivors at the frames of the target views.
 
 use rayon::prelude::*;
 use serde::Serialize;
 
-use super::local::{Keeping, Local, Locals};
+use super::local::{LinearizedFrames, LinearizedFramesWriter, LinearizedState};
 use super::loss::{Loss, RenderQuality};
 use super::targets::Targets;
 use crate::compressed_model::{ParamDelta, TrajectoryDelta};
@@ -15,82 +15,84 @@ use crate::render::{RemovalError, Renderer};
 use crate::scene::Scene;
 use crate::source::{Deformation, FrameSource, ReadPlan};
 
-/// How what is left moves.
+/// Attributes and loss of the optimization.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct StepParams {
-    /// What moves.
+    /// Attributes that are optimized.
     pub(super) columns: Columns,
-    /// Up to which harmonics.
+    /// Maximum SH degree that is optimized.
     pub(super) sh_degree: usize,
-    /// What is made small.
+    /// Loss to be minimized.
     pub(super) loss: Loss,
 }
 
-/// A knot of a [`TrajectoryDelta`] for every so many frames, at most.
-const FRAMES_PER_KNOT: usize = 4;
+/// Minimum number of frames per keyframe of a [`TrajectoryDelta`].
+const FRAMES_PER_KEYFRAME: usize = 4;
 
-/// How many knots the course of a sequence of `frames` frames has, of at most `most`; none where there would be one.
-pub(super) fn knots(most: usize, frames: usize) -> usize {
-    let knots = most.min(frames / FRAMES_PER_KNOT);
-    if knots > 1 { knots } else { 0 }
+/// Returns the number of keyframes of the time-varying delta of a sequence of `frames` frames, at most `most`; 0
+/// instead of 1.
+pub(super) fn keyframe_count(max_keyframes: usize, frames: usize) -> usize {
+    let keyframe_count = max_keyframes.min(frames / FRAMES_PER_KEYFRAME);
+    if keyframe_count > 1 { keyframe_count } else { 0 }
 }
 
-/// Steps after which states are found anew, where they follow from what is stored by more than a sum.
-pub(super) const FOUND_EVERY: usize = 200;
+/// Number of steps after which states are reevaluated, if they depend on the stored parameters by more than a sum.
+pub(super) const REEVALUATE_EVERY: usize = 200;
 
-/// What is left, its states at the frames that are shown, and how far it moved.
+/// The survivors, their states at the frames of the target views, and the delta so far.
 ///
-/// Where states follow from what is stored by more than a sum they are found every [`FOUND_EVERY`] steps, and move along
-/// their Jacobians in between: a field and its derivative at every step take a third of the time and gain nothing
-/// (method.md, section 6.2).
+/// States that depend on the stored parameters by more than a sum, as with a deformation field, are reevaluated every
+/// [`REEVALUATE_EVERY`] steps and extrapolated along their Jacobians in between. Evaluating a field and its derivative
+/// at every step would take three times as long and gain nothing (method.md, section 6.2).
 ///
-/// Memory: six states, [`Descent`], and a differentiated picture; on a scratch file a state for every frame shown, of those
-/// that are there if they are few.
+/// Memory: six states, [`Descent`], and a view with its gradient; in a scratch file one state per frame, of the
+/// Gaussians present if they are few.
 pub(super) struct OptimizerState<'a> {
     scene: &'a Scene,
     targets: &'a Targets,
     deformation: Option<&'a dyn Deformation>,
-    /// Increasing.
+    /// Frames of the target views, increasing.
     frames: Vec<usize>,
     varying: Columns,
-    /// What is at each of them, before `descent` moved anything.
-    locals: Locals,
-    /// What is stored, before `descent` moved anything, where states follow from it by more than a sum.
+    /// State of each of these frames before `descent` changed anything.
+    linearized: LinearizedFrames,
+    /// Stored parameters before `descent` changed anything, if states depend on them by more than a sum.
     stored: Raw,
-    /// What was added to what is stored before that.
+    /// Delta that was added to the stored parameters before that.
     before: ParamDelta,
     fixed: Vec<bool>,
-    /// Of what the states have.
-    manner: StepParams,
+    /// Attributes and loss, limited to what the states have.
+    step_params: StepParams,
     descent: Descent,
-    /// The knots of the course along time, if there is one.
+    /// One optimizer per keyframe of the time-varying delta; empty if there is none.
     course: Vec<Descent>,
-    /// Columns of each Gaussian that are not the same at all frames, where they do not follow from anything.
+    /// Attributes of each Gaussian that vary between frames; empty with a deformation field.
     changing: Vec<Columns>,
     gradients: Gradients,
-    /// What the picture in the making shows.
-    now: Local,
+    /// Buffer for the state of the view being rendered.
+    now: LinearizedState,
     renderer: Renderer,
-    /// Steps since states were found.
+    /// Number of steps since states were evaluated.
     steps: usize,
-    /// Whether that was since some were let go of last, or since the beginning.
-    found: bool,
+    /// Whether states were reevaluated since the last prune step, or since the beginning.
+    reevaluated: bool,
 }
 
-/// What states follow from: what was stored when they were found last and what had been added by then, none as long as
-/// that is what a leg began with; what the descent added, with its means and steps; the steps since states were found; and
-/// what each knot of the course added.
+/// Contents of a checkpoint: the stored parameters at the last reevaluation with the delta added by then (`None` if
+/// there was no reevaluation since the phase began); the optimizer's delta, means and steps; the number of steps since
+/// states were evaluated; and the same three values of the optimizer of each keyframe.
 type OptimizerCheckpoint<Stored, Added, Means> =
     (Option<(Stored, Added)>, (Added, Means, usize), usize, Vec<(Added, Means, usize)>);
 
-/// A [`OptimizerCheckpoint`] that was kept.
+/// An [`OptimizerCheckpoint`] read back from the cache.
 pub(super) type KeptCheckpoint = OptimizerCheckpoint<Raw, ParamDelta, [Gaussians; 2]>;
 
 impl<'a> OptimizerState<'a> {
-    /// What `result` shows of `targets`, to move in that manner but for those `fixed`.
+    /// Creates the state for the survivors in `result`, to be optimized with these parameters except for the Gaussians
+    /// `fixed`.
     ///
     /// # Errors
-    /// Frames that cannot be read; a scratch file that cannot be written.
+    /// Fails if a frame cannot be read or a scratch file cannot be written.
     pub(super) fn new(
         scene: &'a Scene,
         result: &'a dyn FrameSource,
@@ -101,154 +103,157 @@ impl<'a> OptimizerState<'a> {
         let mut frames: Vec<usize> = targets.pictures.iter().map(|picture| picture.frame).collect();
         frames.dedup();
         let deformation = result.deformation();
-        let SequenceInfo { varying, sh_degree: of_state, .. } = *result.info();
-        let sh_degree = sh_degree.min(of_state);
+        let SequenceInfo { varying, sh_degree: state_degree, .. } = *result.info();
+        let sh_degree = sh_degree.min(state_degree);
         let columns = columns & deformation.map_or(Columns::all(), Deformation::movable);
-        let nothing = Gaussians::zeros(0, of_state);
-        let mut moving = OptimizerState {
+        let empty = Gaussians::zeros(0, state_degree);
+        let mut optimizer = OptimizerState {
             scene,
             targets,
             deformation,
-            locals: Keeping::new(&scene.scratch, varying)?.finish()?,
-            stored: deformation.map_or_else(|| nothing.clone().into(), |deformation| deformation.stored().clone()),
+            linearized: LinearizedFramesWriter::new(&scene.scratch, varying)?.finish()?,
+            stored: deformation.map_or_else(|| empty.clone().into(), |deformation| deformation.stored().clone()),
             before: ParamDelta::default(),
-            descent: Descent::new(&nothing, columns, sh_degree, &[]),
+            descent: Descent::new(&empty, columns, sh_degree, &[]),
             course: Vec::new(),
             changing: vec![Columns::empty(); fixed.len()],
             gradients: Gradients::new(0, columns, sh_degree),
-            now: Local::none(of_state),
+            now: LinearizedState::none(state_degree),
             renderer: Renderer::on_all_threads(),
             steps: 0,
-            found: false,
+            reevaluated: false,
             frames,
             varying,
             fixed,
-            manner: StepParams { columns, sh_degree, loss },
+            step_params: StepParams { columns, sh_degree, loss },
         };
         if deformation.is_some() {
-            moving.reevaluate_states()?;
+            optimizer.reevaluate_states()?;
         } else {
-            let wanted = ReadPlan::new(moving.frames.clone()).holding(scene.limits.frames_held);
+            let wanted = ReadPlan::new(optimizer.frames.clone()).holding(scene.limits.frames_held);
             let mut states = States::open(result, &wanted)?;
-            let mut locals = Keeping::new(&scene.scratch, varying)?;
-            for &frame in &moving.frames {
+            let mut linearized = LinearizedFramesWriter::new(&scene.scratch, varying)?;
+            for &frame in &optimizer.frames {
                 let state = states.at(frame)?.clone();
-                if let Some(Local { state: first, .. }) = locals.first() {
+                if let Some(LinearizedState { state: first, .. }) = linearized.first() {
                     for column in varying.iter() {
                         let (first, now) = (first.column(column), state.column(column));
                         for c in 0..now.width() {
                             let values = first.plane(c).iter().zip(now.plane(c));
-                            for (changing, (first, now)) in moving.changing.iter_mut().zip(values) {
+                            for (changing, (first, now)) in optimizer.changing.iter_mut().zip(values) {
                                 changing.set(column, changing.contains(column) || first != now);
                             }
                         }
                     }
                 }
-                locals.push(&mut Local { state, ..Local::default() })?;
+                linearized.push(&mut LinearizedState { state, ..LinearizedState::default() })?;
             }
-            moving.locals = locals.finish()?;
+            optimizer.linearized = linearized.finish()?;
         }
-        moving.begin();
-        Ok(moving)
+        optimizer.start_optimizer();
+        Ok(optimizer)
     }
 
-    /// Begins to descend from here.
-    fn begin(&mut self) {
-        self.found = false;
-        let Some(Local { state, .. }) = self.locals.first() else { return };
-        let StepParams { columns, sh_degree, .. } = self.manner;
+    /// Starts the optimizer anew at the current states.
+    fn start_optimizer(&mut self) {
+        self.reevaluated = false;
+        let Some(LinearizedState { state, .. }) = self.linearized.first() else { return };
+        let StepParams { columns, sh_degree, .. } = self.step_params;
         self.descent = Descent::new(state, columns, sh_degree, &self.fixed);
         self.gradients = Gradients::new(state.len(), columns, sh_degree);
     }
 
-    /// Begins to move along time too, from nothing, at so many knots: each Gaussian in columns that change with time anyway, as
-    /// others are stored once, and of harmonics the first. Gives whether anything can.
-    pub(super) fn enable_keyframes(&mut self, knots: usize) -> bool {
-        let columns = self.manner.columns & self.changing.iter().copied().collect();
-        let Some(Local { state, .. }) = self.locals.first().filter(|_| !columns.is_empty()) else { return false };
-        self.course = (0..knots).map(|_| Descent::new(state, columns, 0, &self.fixed)).collect();
+    /// Starts optimizing a time-varying delta of 0 with `keyframe_count` keyframes. A Gaussian's delta varies only in
+    /// attributes that vary in the input (others are stored once), and only in SH coefficients of degree 0. Returns
+    /// whether there is anything to optimize.
+    pub(super) fn enable_keyframes(&mut self, keyframe_count: usize) -> bool {
+        let columns = self.step_params.columns & self.changing.iter().copied().collect();
+        let Some(LinearizedState { state, .. }) = self.linearized.first().filter(|_| !columns.is_empty()) else {
+            return false;
+        };
+        self.course = (0..keyframe_count).map(|_| Descent::new(state, columns, 0, &self.fixed)).collect();
         true
     }
 
-    /// What is to be added along time.
+    /// Returns the time-varying delta.
     pub(super) fn course(&self) -> TrajectoryDelta {
         TrajectoryDelta(self.course.iter().map(|knot| knot.change().clone()).collect())
     }
 
-    /// The knots that tell of the frame in place `k`, with their weights.
-    fn around(&self, k: usize) -> [(usize, f32); 2] {
+    /// Returns the keyframes around frame index `k`, with their weights.
+    fn keyframes_around(&self, k: usize) -> [(usize, f32); 2] {
         TrajectoryDelta::weights(self.course.len(), self.frames[k], self.scene.source().info().times.len())
     }
 
-    /// Which Gaussians stay as they are.
+    /// Returns which Gaussians are not optimized.
     pub(super) fn fixed(&self) -> &[bool] {
         &self.fixed
     }
 
-    /// What is to be added to what is stored.
+    /// Returns the delta of the stored parameters that is constant in time.
     pub(super) fn change(&self) -> ParamDelta {
         let before = self.before.clone();
         if self.descent.has_moved() { before.and(self.descent.change().clone()) } else { before }
     }
 
-    /// Finds states anew, where they follow from what is stored by more than a sum.
+    /// Reevaluates the states if they depend on the stored parameters by more than a sum.
     ///
     /// # Errors
-    /// A scratch file that cannot be written.
+    /// Fails if a scratch file cannot be written.
     pub(super) fn reevaluate_states(&mut self) -> Result<()> {
         let Some(deformation) = self.deformation else { return Ok(()) };
         self.bake_delta();
-        let mut locals = Keeping::new(&self.scene.scratch, self.varying)?;
+        let mut linearized = LinearizedFramesWriter::new(&self.scene.scratch, self.varying)?;
         for &frame in &self.frames {
-            let want = if locals.is_empty() { Columns::all() } else { self.varying };
-            self.now.there = None;
+            let want = if linearized.is_empty() { Columns::all() } else { self.varying };
+            self.now.present = None;
             deformation.state(frame, &self.stored, want, &mut self.now.state)?;
-            self.now.jacobian = deformation.jacobian(frame, &self.stored, self.manner.columns)?;
-            locals.push(&mut self.now)?;
+            self.now.jacobian = deformation.jacobian(frame, &self.stored, self.step_params.columns)?;
+            linearized.push(&mut self.now)?;
         }
-        self.locals = locals.finish()?;
-        (self.steps, self.found) = (0, true);
+        self.linearized = linearized.finish()?;
+        (self.steps, self.reevaluated) = (0, true);
         Ok(())
     }
 
-    /// Returns the state that a checkpoint stores and [`OptimizerState::go_on`] resumes from.
-    pub(super) fn standing(&self) -> impl Serialize + '_ {
-        let found = self.found.then_some((&self.stored, &self.before));
-        let course = self.course.iter().map(Descent::standing).collect();
-        let standing: OptimizerCheckpoint<&Raw, &ParamDelta, &[Gaussians; 2]> =
-            (found, self.descent.standing(), self.steps, course);
-        standing
+    /// Returns the state that a checkpoint stores and [`OptimizerState::resume`] resumes from.
+    pub(super) fn checkpoint(&self) -> impl Serialize + '_ {
+        let reevaluated = self.reevaluated.then_some((&self.stored, &self.before));
+        let course = self.course.iter().map(Descent::checkpoint).collect();
+        let checkpoint: OptimizerCheckpoint<&Raw, &ParamDelta, &[Gaussians; 2]> =
+            (reevaluated, self.descent.checkpoint(), self.steps, course);
+        checkpoint
     }
 
-    /// Goes on from where another was that had begun as this one did, and had let go of the same.
+    /// Resumes from the checkpoint of another optimization that started equally and removed the same Gaussians.
     ///
     /// # Errors
-    /// A scratch file that cannot be written.
-    pub(super) fn go_on(&mut self, (found, descent, steps, course): KeptCheckpoint) -> Result<()> {
-        if let Some((stored, before)) = found {
+    /// Fails if a scratch file cannot be written.
+    pub(super) fn resume(&mut self, (reevaluated, descent, steps, course): KeptCheckpoint) -> Result<()> {
+        if let Some((stored, before)) = reevaluated {
             self.descent.take();
             (self.stored, self.before) = (stored, before);
             self.reevaluate_states()?;
         }
-        self.descent.go_on(descent);
+        self.descent.resume(descent);
         self.steps = steps;
         if !course.is_empty() {
             self.enable_keyframes(course.len());
-            self.course.iter_mut().zip(course).for_each(|(knot, standing)| knot.go_on(standing));
+            self.course.iter_mut().zip(course).for_each(|(knot, checkpoint)| knot.resume(checkpoint));
         }
         Ok(())
     }
 
-    /// Begins anew from where `change` led, a [`OptimizerState::change`] since the last cut.
+    /// Restarts the optimizer from `change`, a [`OptimizerState::change`] since the last prune step.
     ///
     /// # Errors
-    /// A scratch file that cannot be written.
-    pub(super) fn turn_back(&mut self, change: &ParamDelta) -> Result<()> {
+    /// Fails if a scratch file cannot be written.
+    pub(super) fn restart_from(&mut self, change: &ParamDelta) -> Result<()> {
         self.descent.restart(&change.since(&self.before));
         self.reevaluate_states()
     }
 
-    /// What was descended so far counts as what is stored.
+    /// Adds the optimizer's delta to the stored parameters, and resets it to 0.
     fn bake_delta(&mut self) {
         if !self.descent.has_moved() {
             return;
@@ -260,60 +265,60 @@ impl<'a> OptimizerState<'a> {
         self.before = std::mem::take(&mut self.before).and(moved);
     }
 
-    /// Goes on with those at `places` alone, from where they are.
+    /// Keeps only the Gaussians at `places`, with their current states.
     ///
     /// # Errors
-    /// A scratch file that cannot be read or written.
+    /// Fails if a scratch file cannot be read or written.
     pub(super) fn pick(&mut self, places: &[u32]) -> Result<()> {
-        let mut locals = Keeping::new(&self.scene.scratch, self.varying)?;
+        let mut linearized = LinearizedFramesWriter::new(&self.scene.scratch, self.varying)?;
         let mut now = std::mem::take(&mut self.now);
         for k in 0..self.frames.len() {
             self.show(k, &mut now)?;
-            locals.push(&mut now.pick(places))?;
+            linearized.push(&mut now.pick(places))?;
         }
-        (self.locals, self.now) = (locals.finish()?, now);
+        (self.linearized, self.now) = (linearized.finish()?, now);
         self.bake_delta();
         if self.deformation.is_some() {
             self.stored = self.stored.pick(places);
         }
         self.before = self.before.pick(places);
-        self.changing = places.iter().map(|&place| self.changing[place as usize]).collect();
-        self.fixed = places.iter().map(|&place| self.fixed[place as usize]).collect();
-        self.begin();
+        self.changing = places.iter().map(|&frame_index| self.changing[frame_index as usize]).collect();
+        self.fixed = places.iter().map(|&frame_index| self.fixed[frame_index as usize]).collect();
+        self.start_optimizer();
         Ok(())
     }
 
-    /// Makes `now` what is at the frame in place `k` by now.
-    fn show(&self, k: usize, now: &mut Local) -> Result<()> {
-        self.locals.read(k, now)?;
+    /// Computes the current state at frame index `k` into `now`.
+    fn show(&self, k: usize, now: &mut LinearizedState) -> Result<()> {
+        self.linearized.read(k, now)?;
         let change = self.descent.change();
-        match &now.there {
+        match &now.present {
             None => now.jacobian.add_to(&change.0, &mut now.state),
-            Some(there) => now.jacobian.add_to(&change.pick(there).0, &mut now.state),
+            Some(present) => now.jacobian.add_to(&change.pick(present).0, &mut now.state),
         }
         if !self.course.is_empty() {
-            let knots = self.around(k).map(|(knot, weight)| {
+            let deltas = self.keyframes_around(k).map(|(knot, weight)| {
                 let change = self.course[knot].change();
-                let mut change = now.there.as_ref().map_or_else(|| change.clone(), |there| change.pick(there));
+                let mut change = now.present.as_ref().map_or_else(|| change.clone(), |present| change.pick(present));
                 change.scale(weight);
                 change
             });
-            knots.iter().for_each(|change| change.add_to(&mut now.state, Columns::all()));
+            deltas.iter().for_each(|change| change.add_to(&mut now.state, Columns::all()));
         }
         Ok(())
     }
 
-    /// The place of the frame of picture `k`.
-    fn place(&self, k: usize) -> usize {
+    /// Returns the frame index of view `k`.
+    fn frame_index(&self, k: usize) -> usize {
         self.frames.binary_search(&self.targets.pictures[k].frame).unwrap_or_default()
     }
 
-    /// One step along picture `k`, at rates `schedule`.
+    /// Makes one optimization step on view `k`, with the learning rates of `schedule`.
     ///
     /// # Errors
-    /// A scratch file that cannot be read or written.
+    /// Fails if a scratch file cannot be read or written.
     pub(super) fn step(&mut self, k: usize, schedule: &RateSchedule) -> Result<()> {
-        if self.steps == FOUND_EVERY {
+        if self.steps == REEVALUATE_EVERY {
             self.reevaluate_states()?;
         }
         self.steps += 1;
@@ -322,14 +327,14 @@ impl<'a> OptimizerState<'a> {
         Ok(())
     }
 
-    /// One step of the course along picture `k`, at rates `schedule`.
+    /// Makes one optimization step of the time-varying delta on view `k`, with the learning rates of `schedule`.
     ///
     /// # Errors
-    /// A scratch file that cannot be read.
+    /// Fails if a scratch file cannot be read.
     pub(super) fn step_along(&mut self, k: usize, schedule: &RateSchedule) -> Result<()> {
         self.differentiate(k)?;
-        // What does not change with time goes nowhere.
-        for column in self.manner.columns.iter() {
+        // Attributes that do not vary in the input get no delta.
+        for column in self.step_params.columns.iter() {
             let slopes = self.gradients.column_mut(column);
             for c in 0..slopes.width() {
                 for (slope, changing) in slopes.plane_mut(c).iter_mut().zip(&self.changing) {
@@ -337,72 +342,73 @@ impl<'a> OptimizerState<'a> {
                 }
             }
         }
-        for (knot, weight) in self.around(self.place(k)) {
+        for (knot, weight) in self.keyframes_around(self.frame_index(k)) {
             self.course[knot].step(&self.gradients, weight, schedule);
         }
         Ok(())
     }
 
-    /// Makes the gradients those of picture `k`.
+    /// Computes the gradients of view `k`.
     fn differentiate(&mut self, k: usize) -> Result<()> {
         let target = self.targets.values(k)?;
         let mut now = std::mem::take(&mut self.now);
-        self.show(self.place(k), &mut now)?;
+        self.show(self.frame_index(k), &mut now)?;
         self.gradients.clear();
-        let StepParams { columns, sh_degree, loss } = self.manner;
-        let mut of_those = now.there.as_ref().map(|there| Gradients::new(there.len(), columns, sh_degree));
-        let gradients = of_those.as_mut().unwrap_or(&mut self.gradients);
+        let StepParams { columns, sh_degree, loss } = self.step_params;
+        let mut sparse = now.present.as_ref().map(|present| Gradients::new(present.len(), columns, sh_degree));
+        let gradients = sparse.as_mut().unwrap_or(&mut self.gradients);
         let pull = |picture: &_| (0.0, loss.slope(picture, &target));
         self.renderer.gradient(&now.state, self.targets.camera(k), self.scene.background, pull, gradients);
         now.jacobian.pull_back(gradients);
-        if let Some((there, gradients)) = now.there.as_ref().zip(of_those) {
-            self.gradients.set_rows(there, &gradients);
+        if let Some((present, gradients)) = now.present.as_ref().zip(sparse) {
+            self.gradients.set_rows(present, &gradients);
         }
         self.now = now;
         Ok(())
     }
 
-    /// How close the pictures numbered `of` are.
+    /// Returns the quality of the views `views` against their targets.
     ///
     /// # Errors
-    /// A scratch file that cannot be read.
-    pub(super) fn closeness(&self, of: &[usize]) -> Result<RenderQuality> {
-        let lost = |(renderer, now): &mut (Renderer, Local), &k: &usize| {
-            self.show(self.place(k), now)?;
+    /// Fails if a scratch file cannot be read.
+    pub(super) fn quality(&self, views: &[usize]) -> Result<RenderQuality> {
+        let errors = |(renderer, now): &mut (Renderer, LinearizedState), &k: &usize| {
+            self.show(self.frame_index(k), now)?;
             let picture = renderer.render(&now.state, self.targets.camera(k), self.scene.background);
-            Ok(self.manner.loss.errors(&picture, &self.targets.values(k)?))
+            Ok(self.step_params.loss.errors(&picture, &self.targets.values(k)?))
         };
-        let losses: Vec<[f64; 2]> = of.par_iter().map_init(|| self.worker(), lost).collect::<Result<_>>()?;
+        let losses: Vec<[f64; 2]> = views.par_iter().map_init(|| self.new_worker(), errors).collect::<Result<_>>()?;
         Ok(RenderQuality::from_errors(&losses))
     }
 
-    /// What the pictures numbered `of` would lose with each.
+    /// Returns the removal error of each Gaussian, summed over the views `views`.
     ///
     /// # Errors
-    /// A scratch file that cannot be read.
-    pub(super) fn removal_error(&self, of: &[usize], contrast_floor: f32) -> Result<RemovalError> {
-        let none = || (self.worker(), RemovalError::new(self.fixed.len(), contrast_floor));
-        let of_picture = |((mut renderer, mut now), mut errors): ((Renderer, Local), RemovalError), &k: &usize| {
-            self.show(self.place(k), &mut now)?;
-            let mut of_those = now.there.as_ref().map(|there| RemovalError::new(there.len(), contrast_floor));
-            let found = of_those.as_mut().unwrap_or(&mut errors);
+    /// Fails if a scratch file cannot be read.
+    pub(super) fn removal_error(&self, views: &[usize], contrast_floor: f32) -> Result<RemovalError> {
+        let zero = || (self.new_worker(), RemovalError::new(self.fixed.len(), contrast_floor));
+        let add_view = |((mut renderer, mut now), mut errors): ((Renderer, LinearizedState), RemovalError),
+                        &k: &usize| {
+            self.show(self.frame_index(k), &mut now)?;
+            let mut sparse = now.present.as_ref().map(|present| RemovalError::new(present.len(), contrast_floor));
+            let found = sparse.as_mut().unwrap_or(&mut errors);
             renderer.removal_error(&now.state, self.targets.camera(k), self.scene.background, found);
-            if let Some((there, found)) = now.there.as_ref().zip(of_those) {
-                errors.merge_rows(there, &found);
+            if let Some((present, found)) = now.present.as_ref().zip(sparse) {
+                errors.merge_rows(present, &found);
             }
             Ok::<_, Error>(((renderer, now), errors))
         };
-        // Sums of integers: the order does not show.
-        let sums = of.par_iter().try_fold(none, of_picture).map(|found| Ok(found?.1));
+        // The sums are integers, so the order of addition does not matter.
+        let sums = views.par_iter().try_fold(zero, add_view).map(|found| Ok(found?.1));
         sums.try_reduce_with(|mut sum, other| {
             sum.merge(&other);
             Ok(sum)
         })
-        .unwrap_or_else(|| Ok(none().1))
+        .unwrap_or_else(|| Ok(zero().1))
     }
 
-    /// What one thread makes its pictures with.
-    fn worker(&self) -> (Renderer, Local) {
-        (Renderer::new(), Local::default())
+    /// Creates the renderer and state buffer of one thread.
+    fn new_worker(&self) -> (Renderer, LinearizedState) {
+        (Renderer::new(), LinearizedState::default())
     }
 }

@@ -1,14 +1,15 @@
-//! The way of a search for a size: models that prune steps left, from which smaller sizes go on.
+//! Models of a search for a size: prune steps leave models from which smaller sizes are made.
 
-use super::{CUT, RefineRun};
+use super::{MIN_PRUNE_FRACTION, RefineRun};
 use crate::compressed_model::CompressedModel;
 use crate::error::Result;
 use crate::journal::Journal;
 
-/// Models that a search has pruned and refined so far. A smaller size starts from the smallest of them that is large enough.
+/// Models that a search has pruned and refined so far. A smaller size starts from the smallest one that is large
+/// enough.
 pub struct PruneSteps<'a> {
     refinement: RefineRun<'a>,
-    /// From large to small.
+    /// Models so far, from large to small.
     models: Vec<CompressedModel>,
 }
 
@@ -18,11 +19,11 @@ impl<'a> PruneSteps<'a> {
         PruneSteps { refinement, models: Vec::new() }
     }
 
-    /// Returns the best model of `size` Gaussians. Starts from the smallest model so far that has as many or more, else from
-    /// `start`, the Gaussians that ranking alone leaves for that size.
+    /// Returns the best model of `size` Gaussians. Starts from the smallest model so far that has at least `size`
+    /// Gaussians, else from `start`, the Gaussians that ranking alone leaves for that size.
     ///
     /// # Errors
-    /// Frames that cannot be read; a scratch file that cannot be written.
+    /// Fails if a frame cannot be read or a scratch file cannot be written.
     pub(crate) fn refined(
         &mut self,
         start: CompressedModel,
@@ -39,14 +40,14 @@ impl<'a> PruneSteps<'a> {
                 self.models.push(model.clone());
             }
         }
-        self.refinement.best_of(model, journal)
+        self.refinement.refine_best(model, journal)
     }
 }
 
-/// Returns how many of `count` Gaussians the next prune step leaves on the way to `wanted`, of which there are fewer: a part
-/// [`CUT`], and always at least one Gaussian less than before.
+/// Returns the number of Gaussians that the next prune step leaves of `count` on the way to a smaller number `wanted`:
+/// a fraction [`MIN_PRUNE_FRACTION`], and always at least one Gaussian less than before.
 fn next_size(count: usize, wanted: usize) -> usize {
-    ((CUT * count as f64).ceil() as usize).min(count - 1).max(wanted)
+    ((MIN_PRUNE_FRACTION * count as f64).ceil() as usize).min(count - 1).max(wanted)
 }
 
 #[cfg(test)]

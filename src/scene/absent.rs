@@ -1,8 +1,8 @@
-//! Gaussians that were dropped because some of their values are NaN or infinite: absent from every state that is read.
+//! Gaussians that are dropped because some of their values are NaN or infinite: they are absent from every state read.
 //!
-//! Ids stay what they are: an absent Gaussian keeps its
-//! row, with a state that shows nothing ([`clear_row`]), so renders, contributions, removal errors, statistics and bounds
-//! are those of the others. Memory: 4 bytes per absent Gaussian, and as many in every reader.
+//! Ids do not change. An absent Gaussian keeps its row, with a state that is invisible ([`clear_row`]), so renders,
+//! contributions, removal errors, statistics and bounds are those of the other Gaussians. Memory: 4 bytes per absent
+//! Gaussian, and as many in every reader.
 
 use std::sync::{Arc, PoisonError, RwLock};
 
@@ -20,7 +20,7 @@ impl Absent {
         self.0.read().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
-    /// Replaces the ids, which are in increasing order.
+    /// Replaces the ids by `ids`, which must be in increasing order.
     pub(super) fn set(&self, ids: &[u32]) {
         debug_assert!(ids.is_sorted(), "absent ids are sorted");
         *self.0.write().unwrap_or_else(PoisonError::into_inner) = ids.into();
@@ -31,7 +31,8 @@ impl Absent {
         self.ids().is_empty()
     }
 
-    /// Returns `reader` of the Gaussians `ids` without the absent ones.
+    /// Wraps `reader`, which reads the Gaussians `ids`, so that absent Gaussians are invisible. Returns it unchanged if
+    /// none of them is absent.
     pub(super) fn hiding<'a>(&self, reader: Box<dyn BlockReader + 'a>, ids: &Ids<'_>) -> Box<dyn BlockReader + 'a> {
         let absent = self.ids();
         let rows = ids.iter().enumerate().filter(|(_, id)| absent.binary_search(&(*id as u32)).is_ok());
@@ -40,7 +41,7 @@ impl Absent {
     }
 }
 
-/// Reader of a block some of whose rows are absent.
+/// Reader of a block in which some Gaussians are absent.
 struct HidingReader<'a> {
     reader: Box<dyn BlockReader + 'a>,
     /// Rows of the absent Gaussians in the block.
@@ -63,8 +64,8 @@ impl BlockReader for HidingReader<'_> {
     }
 }
 
-/// Gives row `row` the state of an absent Gaussian in the columns `want`: a position of NaN, which is in no box and not
-/// drawn, an opacity of 0, and the identity, size 1 and no color.
+/// Sets the columns `want` of row `row` to the state of an absent Gaussian: a position of NaN (which is in no box and
+/// is not rendered), an opacity of 0, the identity rotation, size 1 and no color.
 fn clear_row(state: &mut Gaussians, want: Columns, row: usize) {
     for column in want.iter() {
         let value = match column {

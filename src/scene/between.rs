@@ -1,59 +1,63 @@
-//! Cameras in between those of a scene: an unpruned model can be rendered from anywhere, so that what is fitted to its
-//! pictures need not be fitted to the views of its cameras alone.
+//! Cameras between those of a scene. An unpruned model can be rendered from any camera, so refinement can fit renders
+//! of more views than those of the scene's cameras.
 
 use glam::{DMat3, DQuat, DVec3};
 
 use crate::model::Camera;
 
-/// Part of the way from one camera to the other: from this, and as far before the end.
-const NEAR_END: f64 = 0.15;
-/// Cosine of the angle between two cameras, as seen from where the optical axes meet, up to which there is a way from one
-/// to the other: a third of a turn and a bit. Halfway between opposite ones a camera could look anywhere.
-const WIDEST: f64 = -0.6;
+/// Least distance of a new camera from either of its two cameras, as a fraction of the path between them.
+const MIN_FRACTION: f64 = 0.15;
+/// Least cosine of the angle between two cameras, seen from the point where the optical axes meet, between which a new
+/// camera is placed: about 127°. Halfway between opposite cameras, the viewing direction would be undefined.
+const MIN_COSINE: f64 = -0.6;
 
-/// `count` cameras, each on the way from one of `cameras` to another that stands no more than a third of a turn away, as
-/// seen from where the optical axes meet, or else to the nearest one: turned evenly, that point at its place in the
-/// pictures, and as far from it as its way along says. Ways between neighbors alone leave the middle of a rig empty. None
-/// where all cameras stand at one place. The same for the same cameras.
+/// Returns `count` cameras, each on the path between two of `cameras`; see [`interpolated_camera`] for its pose. The
+/// first is chosen at random, the second at random among those less than about 127° away as seen from the point where
+/// the optical axes meet, or else the nearest one at another position. (Paths between neighbors only would leave the
+/// middle of a rig empty.) Returns no camera if all cameras are at one position. The result depends on the arguments
+/// only.
 pub fn between(cameras: &[Camera], count: usize) -> Vec<Camera> {
     let focus = meeting_point(cameras);
-    let mut dice = SplitMix64(0);
+    let mut random = SplitMix64(0);
     let mut found = Vec::with_capacity(count);
     for _ in 0..count {
-        let Some(from) = cameras.get(dice.below(cameras.len())) else { break };
-        let away = |other: &&Camera| other.center().distance_squared(from.center());
-        let elsewhere = || cameras.iter().filter(|other| away(other) > 0.0);
+        let Some(from) = cameras.get(random.below(cameras.len())) else { break };
+        let squared_distance = |other: &&Camera| other.center().distance_squared(from.center());
+        let elsewhere = || cameras.iter().filter(|other| squared_distance(other) > 0.0);
         let direction = |camera: &Camera| (camera.center() - focus).normalize_or_zero();
-        let is_near = |other: &&Camera| direction(other).dot(direction(from)) > WIDEST;
+        let is_near = |other: &&Camera| direction(other).dot(direction(from)) > MIN_COSINE;
         let near: Vec<&Camera> = elsewhere().filter(is_near).collect();
-        let nearest = || elsewhere().min_by(|a, b| away(a).total_cmp(&away(b)));
-        let Some(to) = near.get(dice.below(near.len())).copied().or_else(nearest) else { continue };
-        let way = NEAR_END + (1.0 - 2.0 * NEAR_END) * dice.unit();
-        found.push(on_the_way(from, to, way, focus));
+        let nearest = || elsewhere().min_by(|a, b| squared_distance(a).total_cmp(&squared_distance(b)));
+        let Some(to) = near.get(random.below(near.len())).copied().or_else(nearest) else { continue };
+        let fraction = MIN_FRACTION + (1.0 - 2.0 * MIN_FRACTION) * random.unit();
+        found.push(interpolated_camera(from, to, fraction, focus));
     }
     found
 }
 
-/// The camera at a part `way` of the way from one to another, see [`between`]; `focus`: where the optical axes meet.
-pub(super) fn on_the_way(from: &Camera, to: &Camera, way: f64, focus: DVec3) -> Camera {
+/// Returns the camera at the fraction `fraction` of the path from one camera to another. Its rotation is interpolated
+/// evenly, and so is its distance from `focus`, the point where the optical axes meet. It keeps `focus` at the
+/// interpolated direction in the image.
+pub(super) fn interpolated_camera(from: &Camera, to: &Camera, fraction: f64, focus: DVec3) -> Camera {
     let [a, b] = [from, to].map(|camera| DQuat::from_mat3(&camera.rotation));
-    let turned = DMat3::from_quat(a.slerp(b, way));
+    let rotated = DMat3::from_quat(a.slerp(b, fraction));
     let [start, end] = [from, to].map(|camera| camera.center() - focus);
-    let straight = start.lerp(end, way);
-    let distance = start.length() * (1.0 - way) + end.length() * way;
-    // Where the way leads through that point it stays straight.
-    let center = focus + straight.try_normalize().map_or(straight, |direction| direction * distance);
-    // On a wide way turning evenly loses sight of that point: it stays at its place in the pictures.
+    let linear = start.lerp(end, fraction);
+    let distance = start.length() * (1.0 - fraction) + end.length() * fraction;
+    // If the path passes through the focus, the center is interpolated linearly.
+    let center = focus + linear.try_normalize().map_or(linear, |direction| direction * distance);
+    // On a wide path, even rotation alone would lose sight of the focus, so the camera is turned back toward it.
     let seen = |camera: &Camera| (camera.rotation * (focus - camera.center())).normalize_or_zero();
-    let wanted = seen(from).lerp(seen(to), way).normalize_or_zero();
-    let found = (turned * (focus - center)).normalize_or_zero();
-    let is_known = wanted.is_normalized() && found.is_normalized();
-    let back = if is_known { DQuat::from_rotation_arc(found, wanted) } else { DQuat::IDENTITY };
-    let rotation = DMat3::from_quat(back) * turned;
+    let wanted = seen(from).lerp(seen(to), fraction).normalize_or_zero();
+    let direction = (rotated * (focus - center)).normalize_or_zero();
+    let is_known = wanted.is_normalized() && direction.is_normalized();
+    let correction = if is_known { DQuat::from_rotation_arc(direction, wanted) } else { DQuat::IDENTITY };
+    let rotation = DMat3::from_quat(correction) * rotated;
     Camera { rotation, translation: -(rotation * center), ..from.clone() }
 }
 
-/// The point nearest to all optical axes in the sense of least squares; of parallel ones the middle of the cameras.
+/// Returns the point nearest to all optical axes in the least-squares sense; for parallel axes, the mean of the camera
+/// positions.
 pub(super) fn meeting_point(cameras: &[Camera]) -> DVec3 {
     let (mut matrix, mut right, mut middle) = (DMat3::ZERO, DVec3::ZERO, DVec3::ZERO);
     for camera in cameras {
@@ -68,12 +72,12 @@ pub(super) fn meeting_point(cameras: &[Camera]) -> DVec3 {
     if matrix.determinant().abs() > 1e-6 * count.powi(3) && point.is_finite() { point } else { middle / count }
 }
 
-/// Numbers that look random and are always the same: SplitMix64 (Steele, Lea and Flood, 2014).
+/// Pseudo-random number generator SplitMix64 (Steele, Lea and Flood, 2014). The numbers depend on the seed only.
 #[derive(Debug, Clone)]
 pub struct SplitMix64(pub u64);
 
 impl SplitMix64 {
-    /// The next 64 bits.
+    /// Returns the next 64 random bits.
     pub fn bits(&mut self) -> u64 {
         self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
         let mut bits = self.0;
@@ -82,17 +86,17 @@ impl SplitMix64 {
         bits ^ (bits >> 31)
     }
 
-    /// In [0, 1).
+    /// Returns a uniform number in [0, 1).
     pub fn unit(&mut self) -> f64 {
         (self.bits() >> 11) as f64 / (1u64 << 53) as f64
     }
 
-    /// Below `end`; 0 of 0.
+    /// Returns a uniform integer below `end`; 0 if `end` is 0.
     pub fn below(&mut self, end: usize) -> usize {
         ((u128::from(self.bits()) * end as u128) >> 64) as usize
     }
 
-    /// `values` in another order.
+    /// Shuffles `values`.
     pub fn shuffle<T>(&mut self, values: &mut [T]) {
         for k in (1..values.len()).rev() {
             values.swap(k, self.below(k + 1));
@@ -113,14 +117,14 @@ mod tests {
     }
 
     #[test]
-    fn cameras_in_between_see_what_the_others_see_from_as_far_away() {
+    fn new_cameras_see_the_focus_from_the_same_distance() {
         let cameras = ring(9);
         let focus = DVec3::new(0.1, 0.2, 0.3);
         assert!(meeting_point(&cameras).distance(focus) < 1e-9);
         let found = between(&cameras, 50);
         assert_eq!((found.len(), &found), (50, &between(&cameras, 50)));
         let distances: Vec<f64> = cameras.iter().map(|camera| camera.center().distance(focus)).collect();
-        let [least, most] = [f64::min, f64::max].map(|of| distances.iter().copied().reduce(of).unwrap());
+        let [least, most] = [f64::min, f64::max].map(|pick| distances.iter().copied().reduce(pick).unwrap());
         for camera in &found {
             let rotation = camera.rotation * camera.rotation.transpose();
             assert!((rotation - DMat3::IDENTITY).to_cols_array().iter().all(|x| x.abs() < 1e-9));
@@ -133,25 +137,25 @@ mod tests {
     }
 
     #[test]
-    fn no_camera_one_camera_and_cameras_at_one_place_have_none_in_between() {
+    fn too_few_distinct_cameras_have_none_between() {
         let one = ring(1);
         assert!(between(&[], 5).is_empty() && between(&one, 5).is_empty());
         assert!(between(&[one[0].clone(), one[0].clone()], 5).is_empty());
-        // Parallel axes meet nowhere.
+        // Parallel axes do not meet.
         let aside =
             |x: f64| Camera { translation: DVec3::new(x, 0.0, 0.0), rotation: DMat3::IDENTITY, ..one[0].clone() };
         assert!(between(&[aside(0.0), aside(1.0)], 5).iter().all(|camera| camera.center().is_finite()));
     }
 
     #[test]
-    fn a_shuffle_loses_nothing_and_numbers_stay_below_their_end() {
-        let mut dice = SplitMix64(7);
+    fn shuffle_permutes_and_numbers_stay_in_range() {
+        let mut random = SplitMix64(7);
         let mut values: Vec<usize> = (0..100).collect();
-        dice.shuffle(&mut values);
+        random.shuffle(&mut values);
         assert!(!values.is_sorted());
         values.sort_unstable();
         assert!(values.iter().copied().eq(0..100));
-        assert!((0..1000).all(|_| dice.below(3) < 3 && (0.0..1.0).contains(&dice.unit())));
-        assert_eq!(dice.below(0), 0);
+        assert!((0..1000).all(|_| random.below(3) < 3 && (0.0..1.0).contains(&random.unit())));
+        assert_eq!(random.below(0), 0);
     }
 }

@@ -1,4 +1,4 @@
-//! A scene as a source of frames: those of its input without the absent Gaussians.
+//! Scene as a source of frames: the frames of its input without the absent Gaussians.
 
 use super::Scene;
 use crate::error::Result;
@@ -6,8 +6,8 @@ use crate::model::SequenceInfo;
 use crate::source::{BlockReader, Deformation, FeatureDecoder, FrameSource, Ids, Prefetch, ReadPlan, Reads};
 
 impl Scene {
-    /// Hides the Gaussians `ids`, in increasing order, from everything that reads the scene's frames from now on, and shows
-    /// those hidden before. Keys of results in the work folder follow from the ids.
+    /// Hides the Gaussians `ids` (in increasing order) from all later reads of the scene's frames, and shows those
+    /// hidden before. Cache keys of stage results depend on the ids.
     pub fn set_absent(&self, ids: &[u32]) {
         self.work.set_absent(ids);
         self.absent.set(ids);
@@ -60,7 +60,7 @@ mod tests {
     use crate::render::render;
 
     #[test]
-    fn renders_and_boxes_are_those_of_the_others() {
+    fn absent_gaussians_change_neither_renders_nor_boxes() {
         let folder = tempfile::tempdir().unwrap();
         let scene = scene(folder.path());
         let absent = [3, 4, 700, 1499];
@@ -79,7 +79,7 @@ mod tests {
     }
 
     #[test]
-    fn lists_of_ids_hide_the_same_gaussians() {
+    fn readers_of_id_lists_hide_absent_gaussians() {
         let folder = tempfile::tempdir().unwrap();
         let scene = scene(folder.path());
         scene.set_absent(&[7]);

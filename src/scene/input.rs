@@ -1,4 +1,4 @@
-//! What to read and from where to look, before anything is opened.
+//! Options for opening an input with its cameras.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -13,49 +13,49 @@ use crate::models;
 use crate::models::{Conventions, InputModel, Link, OpenOptions};
 use crate::progress::Events;
 
-/// What to read and from where to look.
+/// Options for opening an input with its cameras.
 #[derive(Debug, Clone, Default)]
 pub struct InputOptions {
-    /// Model folder, folder of PLY files, .ply or .gseq; `-`: a frame stream on standard input.
+    /// Model folder, folder of PLY files, .ply or .gseq file; `-`: a frame stream on standard input.
     pub path: PathBuf,
-    /// Training iteration of a model folder; none: the largest.
+    /// Training iteration of a model folder; `None`: the largest one found.
     pub iteration: Option<u32>,
-    /// What the files of a model do not say.
+    /// Conventions that the files of a model do not state.
     pub conventions: Conventions,
-    /// Whether frames may be missing from a folder of them.
+    /// Whether a folder of frames may have missing frames.
     pub allow_gaps: bool,
-    /// Whether frames of a folder are linked.
+    /// Whether the Gaussians of frames in a folder are linked into tracks.
     pub link: Link,
-    /// Frames of a model that is continuous in time; none: the cameras' times.
+    /// Number of frames of a model that is continuous in time; `None`: the cameras' times.
     pub frames: Option<usize>,
-    /// Camera file or folder; none: searched for.
+    /// Camera file or folder; `None`: searched for.
     pub cameras: Option<PathBuf>,
-    /// Picture size where the cameras name none.
+    /// Image width and height for cameras that do not state them.
     pub size: Option<(u32, u32)>,
-    /// Where the times of pictures come from whose cameras have none.
+    /// Source of the times of views whose cameras state none.
     pub times: Times,
-    /// Which pictures to score with; none: all.
+    /// Split whose views are used; `None`: all views.
     pub split: Option<Split>,
-    /// Folder for scratch files while the run lasts: the packed frames of a stream, what does not fit into
-    /// `memory`; none: the system's for such files.
+    /// Folder for scratch files during the run: the packed frames of a stream, and data that does not fit into
+    /// `memory`; `None`: the system's folder for temporary files.
     pub scratch: Option<PathBuf>,
     /// Whether the user named `scratch`, as opposed to a folder derived from the output.
     pub is_scratch_named: bool,
     /// Memory that the run may take.
     pub memory: Budget,
-    /// Where what stages find is kept; none: nowhere.
+    /// Cache of stage results; `None`: results are not cached.
     pub work: Option<cache::CacheRequest>,
-    /// Where the events of the run go.
+    /// Receiver of the events of the run.
     pub events: Events,
 }
 
 impl InputOptions {
-    /// Whether the input is the stream on standard input.
+    /// Returns whether the input is the stream on standard input.
     pub fn is_stream(&self) -> bool {
         self.path == Path::new("-")
     }
 
-    /// What is said of the input beside its path.
+    /// Returns the options for opening the input itself.
     pub fn opening(&self) -> OpenOptions {
         OpenOptions {
             iteration: self.iteration,
@@ -68,8 +68,8 @@ impl InputOptions {
         }
     }
 
-    /// Confirms that neither the work folder nor the folder for scratch files is the input or lies inside it: files that
-    /// appear in an input change what it is.
+    /// Checks that neither the cache folder (`--cache`) nor the scratch folder is the input or lies inside it. Files
+    /// that appear in an input folder would change the input.
     ///
     /// # Errors
     /// Such a folder, as [`Error::Usage`].
@@ -79,11 +79,12 @@ impl InputOptions {
             return Ok(());
         }
         let work = self.work.as_ref().map(|asked| asked.folder.as_path());
-        // The folder of an output inside the input is refused with the output.
+        // A scratch folder derived from the output is not checked here: an output inside the input is refused on its
+        // own.
         let scratch = self.scratch.as_deref().filter(|_| self.is_scratch_named);
-        for (option, folder) in [("--work", work), ("--scratch-dir", scratch)] {
+        for (option, folder) in [("--cache", work), ("--scratch-dir", scratch)] {
             let Some(folder) = folder else { continue };
-            // A work folder may have to be created.
+            // The folder may not exist yet, so its parent is checked instead.
             let parent = folder.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."));
             let real = fs::canonicalize(folder).or_else(|_| fs::canonicalize(parent));
             if real.is_ok_and(|real| real.starts_with(&input)) {
@@ -97,28 +98,29 @@ impl InputOptions {
         Ok(())
     }
 
-    /// Where scratch files go.
+    /// Returns the folder for scratch files.
     pub fn scratch_folder(&self) -> PathBuf {
         self.scratch.clone().unwrap_or_else(std::env::temp_dir)
     }
 }
 
-/// An input with its frames, and the cameras if there are any.
+/// Opened input, with its cameras if there are any.
 pub struct Opened {
     /// The input.
     pub input: Box<dyn InputModel>,
-    /// Cameras given or found.
+    /// Cameras given by the user or found with the input.
     pub rig: Option<Rig>,
-    /// Things a person should know.
+    /// Notes for the user.
     pub notes: Vec<String>,
 }
 
-/// The cameras of a file, if there is one, with times as `times` and `clock` say; where the file does not count the frames,
-/// there are as many as `input` was trained on, else as many as `options` say. Behind them is what the file says; of an input
-/// that is states alone, which do not say it, else what the model was trained with in whose folder they are.
+/// Loads the cameras from `path`, with times from `times` and `clock`; returns `None` without a path. If the file does
+/// not give the number of frames, it is the number that `input` was trained on, else that of `options`. The background
+/// is that of the file. If the file has none and the input consists of frame states, which do not state it, it is the
+/// training background of the model in whose folder the cameras are.
 ///
 /// # Errors
-/// A file that is not there, or holds no cameras.
+/// A file that does not exist, or that holds no cameras.
 pub fn load_cameras(
     options: &InputOptions,
     path: Option<&Path>,
@@ -132,7 +134,7 @@ pub fn load_cameras(
         path,
         &CameraOptions { size: options.size, frames, times, clock, memory: options.memory.read_limit() },
     )?;
-    let is_states = input.is_none_or(InputModel::has_explicit_frames);
-    let beside = || is_states.then(|| models::trained_background(path)).flatten();
-    Ok(Some(Rig { background: rig.background.or_else(beside), ..rig }))
+    let has_frame_states = input.is_none_or(InputModel::has_explicit_frames);
+    let trained_background = || has_frame_states.then(|| models::trained_background(path)).flatten();
+    Ok(Some(Rig { background: rig.background.or_else(trained_background), ..rig }))
 }

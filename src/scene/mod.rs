@@ -1,4 +1,4 @@
-//! An input with the cameras that look at it: what every verb starts from.
+//! Scene: an input with its cameras. Every command that reads frames starts by opening one.
 
 mod absent;
 pub mod between;
@@ -31,47 +31,47 @@ pub use stream::{FrameQuota, is_linked, link_stream, open_stream, receiving, roo
 pub use work::kept_work;
 pub(crate) use work::stamps;
 
-/// An input with the cameras that look at it.
+/// Input with its cameras.
 pub struct Scene {
     /// Path as given.
     pub path: PathBuf,
     /// The input.
     pub input: Box<dyn InputModel>,
-    /// All cameras.
+    /// Cameras of all splits.
     pub rig: Rig,
-    /// The cameras of the chosen split, frame by frame.
+    /// Cameras of the chosen split, for each frame.
     pub schedule: Schedule,
-    /// Whether the cameras were given or found, or surround a still scene: what they see is then the scene. Else they are a
-    /// virtual rig, which may see only what is in front of it.
+    /// Whether the views show the whole scene: the cameras were given or found, or they surround a still scene.
+    /// Otherwise the cameras are a virtual rig, which may see only what is in front of it.
     pub has_cameras: bool,
-    /// Color behind the scene, red, green, blue in [0, 1]: the cameras' own, else the one that the input was trained
-    /// with, else the model in whose folder the cameras are, else black.
+    /// Background color: red, green, blue in [0, 1]. Taken from the cameras, else from the input's training parameters,
+    /// else from the model in whose folder the cameras are, else black.
     pub background: [f32; 3],
-    /// What passes over it keep in memory at a time.
+    /// Amounts that passes over the scene keep in memory at a time.
     pub limits: Limits,
-    /// Full reads of the input at most, of the plan that the limits are from.
+    /// Maximum number of full reads of the input in the plan that set the limits; `None` before a plan is made.
     pub planned_reads: Option<f64>,
-    /// How fast it is looked at here.
+    /// Measured speed of this machine for this scene.
     pub pace: Throughput,
-    /// Folder for scratch files while the run lasts.
+    /// Folder for scratch files during the run.
     pub scratch: PathBuf,
-    /// Where what stages find is kept, if anywhere.
+    /// Cache of stage results; may keep nothing.
     pub work: Cache,
-    /// Digest of the input, where it is known already.
+    /// Digest of the input, if it is known already.
     digest: Option<String>,
-    /// Things a person should know.
+    /// Notes for the user.
     pub notes: Vec<String>,
-    /// Where the events of the run go.
+    /// Receiver of the events of the run.
     pub events: Events,
-    /// Gaussians that its frames are read without.
+    /// Gaussians that are hidden from reads of frames.
     absent: Absent,
 }
 
 impl Scene {
-    /// `input` as the cameras of `rig` in `split` see it, without limits.
+    /// Creates the scene of `input` seen by the cameras of `rig` in `split` (`None`: all splits), without limits.
     ///
     /// # Errors
-    /// Cameras at times that are no frame's.
+    /// A camera at a time that is not the time of any frame.
     pub fn new(path: PathBuf, input: Box<dyn InputModel>, rig: Rig, split: Option<Split>) -> Result<Scene> {
         let schedule = rig.schedule(&input.source().info().times, split)?;
         let background = rig.background.or(input.background()).unwrap_or([0.0; 3]);
@@ -94,16 +94,16 @@ impl Scene {
         })
     }
 
-    /// What the need for memory depends on.
+    /// Returns the properties of the scene from which memory and time are estimated.
     pub fn workload(&self) -> Workload {
         let work = Workload::new(self.source().info(), self.input.residence()).seen(&self.rig, &self.schedule);
         Workload { pace: self.pace, ..work }
     }
 
-    /// Plans what is to be done, stages that need what `needs` says, and takes the limits of that plan.
+    /// Makes the memory plan for the stages that `needs` describes, and takes its limits.
     ///
     /// # Errors
-    /// A budget that cannot work.
+    /// A budget that is too small for any limits.
     pub fn keep_to(
         &mut self,
         budget: Budget,
@@ -115,7 +115,7 @@ impl Scene {
         Ok(())
     }
 
-    /// Takes the limits of a plan.
+    /// Takes the limits of a memory plan.
     pub fn follow(&mut self, plan: &Plan) {
         self.limits = plan.limits;
         self.planned_reads = Some(plan.reads());
@@ -124,10 +124,10 @@ impl Scene {
         }
     }
 
-    /// What reading every frame once reads.
+    /// Returns the amounts that one full read of the input takes.
     ///
     /// # Errors
-    /// A file that is not there any more.
+    /// A file that does not exist any more.
     pub fn whole(&self) -> Result<Reads> {
         let info = self.source().info();
         let states = info.count as u64 * info.times.len() as u64;

@@ -1,4 +1,4 @@
-//! Opening whatever the user names, with the cameras that look at it.
+//! Opening of inputs of every kind, with their cameras.
 
 use std::path::{Path, PathBuf};
 
@@ -7,7 +7,7 @@ use glam::DVec3;
 use super::Scene;
 use super::input::{InputOptions, Opened, load_cameras};
 use super::pictures::no_picture;
-use super::stream::open_arriving;
+use super::stream::open_packed_stream;
 use crate::error::{Error, Result, ShowPath};
 use crate::files::cameras;
 use crate::files::cameras::{Clock, Times};
@@ -19,25 +19,25 @@ use crate::passes::gather_all;
 use crate::progress::Message;
 use crate::source::FrameSource;
 
-/// Opens an input; cameras only say which frames it has.
+/// Opens an input. Its cameras are only used to find the times of its frames.
 ///
 /// # Errors
-/// Whatever is wrong with input or cameras; cameras of other frames; options that the input does not take.
+/// Invalid input or cameras; cameras of a sequence with different frames; options that do not apply to the input.
 pub fn open_input(options: &InputOptions) -> Result<Opened> {
     options.check_folders()?;
     if options.is_stream() {
-        return check_frames(open_arriving(options)?, &options.path);
+        return check_frames(open_packed_stream(options)?, &options.path);
     }
     let path = &options.path;
     let mut notes = Vec::new();
     let input = models::open(path, &options.opening())?;
-    let rig = cameras_of(options, &*input)?;
+    let rig = load_input_cameras(options, &*input)?;
     let times = rig.as_ref().map(Rig::times).unwrap_or_default();
     let input = match input.timing() {
         Timing::Continuous => {
             let times = match options.frames {
                 None if !times.is_empty() => times,
-                // As many as there are: these.
+                // The given number equals the number of camera times, so these times are used.
                 Some(frames) if frames == times.len() => times,
                 given => evenly_spaced(given, input.span(), &mut notes)?,
             };
@@ -60,16 +60,17 @@ pub fn open_input(options: &InputOptions) -> Result<Opened> {
         }
         Timing::Numbered | Timing::Stamped => input,
     };
-    // Some depend on the times.
+    // Some notes depend on the times.
     let notes = [input.notes(), notes].concat();
     check_frames(Opened { input, rig, notes }, path)
 }
 
-/// The cameras that `options` name or `input` leads to. Frames that carry their times may have those of a model that counts
-/// time as its cameras' file does: where divided times are no frame's, the file's own are tried.
-fn cameras_of(options: &InputOptions, input: &dyn InputModel) -> Result<Option<Rig>> {
+/// Loads the cameras that `options` give or that are found with `input`. Frames with time stamps may have cameras of a
+/// model whose camera file counts time differently: if the normalized times match no frames, the file's own times are
+/// tried.
+fn load_input_cameras(options: &InputOptions, input: &dyn InputModel) -> Result<Option<Rig>> {
     let path = camera_path(options, input);
-    // Numbers in the names of a still scene's pictures are no times.
+    // Numbers in the image names of a still scene are not times.
     let is_still = input.timing() != Timing::Continuous && input.source().info().times.len() == 1;
     let by_name = path.as_deref().is_some_and(cameras::are_timed_by_name);
     let times = match options.times {
@@ -85,14 +86,20 @@ fn cameras_of(options: &InputOptions, input: &dyn InputModel) -> Result<Option<R
     }
 }
 
-/// Times of the frames of a model for which no camera names any, in `span`.
+/// Returns evenly spaced frame times in `span` for a model whose frames no camera names. Adds a note if the user gave
+/// no number.
+///
+/// # Errors
+/// A number of frames out of range.
 fn evenly_spaced(given: Option<usize>, span: f64, notes: &mut Vec<String>) -> Result<Vec<f64>> {
     let frames = given.unwrap_or(DEFAULT_FRAMES);
     if !(1..=MAX_FRAMES).contains(&frames) {
         return Err(Error::usage(format!("--frames: expected 1 to {MAX_FRAMES}, found {frames}")));
     }
     if given.is_none() {
-        notes.push(format!("nothing names the model's frames: {frames} evenly spaced ones (--frames)"));
+        notes.push(format!(
+            "neither the cameras nor --frames give the model's frames; using {frames} evenly spaced ones"
+        ));
     }
     Ok((0..frames).map(|i| span * i as f64 / frames as f64).collect())
 }
@@ -100,27 +107,28 @@ fn evenly_spaced(given: Option<usize>, span: f64, notes: &mut Vec<String>) -> Re
 fn check_frames(opened: Opened, path: &Path) -> Result<Opened> {
     let info = opened.input.source().info();
     if info.times.is_empty() && info.count > 0 {
-        let found = format!("none of {} Gaussians", info.count);
+        let found = format!("no frame, but {} Gaussians", info.count);
         return Err(Error::input(path, "", "at least one frame", found));
     }
     Ok(opened)
 }
 
-/// Opens an input and the cameras that look at it.
+/// Opens an input with its cameras.
 ///
 /// # Errors
-/// Those of [`open_input`]; a split without pictures.
+/// Errors of [`open_input`]; a split without views.
 pub fn open_scene(options: &InputOptions) -> Result<Scene> {
     scene_of(open_input(options)?, options)
 }
 
-/// An open input as the cameras of the split that `options` name see it.
+/// Creates the scene of an opened input, seen by the cameras of the split in `options`. Without cameras, a rig is placed
+/// around the Gaussians of the first frame.
 ///
 /// # Errors
-/// Cameras of another scene; a split without pictures.
+/// Cameras of another scene; a split without views.
 pub fn scene_of(opened: Opened, options: &InputOptions) -> Result<Scene> {
     let Opened { input, rig, mut notes } = check_frames(opened, &options.path)?;
-    // What a stream has is not known when its run is planned.
+    // The content of a stream is unknown when its run is planned, so it never counts as still.
     let is_still = !options.is_stream() && input.source().info().times.len() == 1;
     let has_cameras = rig.is_some() || is_still;
     let rig = match rig {
@@ -144,7 +152,7 @@ pub fn scene_of(opened: Opened, options: &InputOptions) -> Result<Scene> {
     }
     let mut scene =
         Scene { has_cameras, scratch: options.scratch_folder(), notes, events: options.events.clone(), ..scene };
-    scene.keep_work(options)?;
+    scene.open_cache(options)?;
     Ok(scene)
 }
 
@@ -152,39 +160,36 @@ pub fn scene_of(opened: Opened, options: &InputOptions) -> Result<Scene> {
 const NO_CAMERAS: &str = "no cameras were given or found. Gaussians are ranked and refined for invented views, which costs \
                           most of the quality; give the training cameras with --cameras";
 
-/// Frames of a model for which neither cameras nor the user name any.
+/// Default number of frames of a model for which neither the cameras nor the user give any.
 const DEFAULT_FRAMES: usize = 60;
-/// Most frames a model is evaluated at; each costs 8 bytes before any work.
+/// Maximum number of frames at which a model is evaluated; each costs 8 bytes before any work.
 const MAX_FRAMES: usize = 1_000_000;
 
 fn camera_path(options: &InputOptions, input: &dyn InputModel) -> Option<PathBuf> {
     options.cameras.clone().or_else(|| cameras::find(input.data_folder()?, &options.path))
 }
 
-/// A rig around the surface of the only frame. Memory: 64 bytes a Gaussian.
+/// Returns a rig around the surface of the only frame. Memory: 64 bytes per Gaussian.
 fn surrounding_rig(source: &dyn FrameSource) -> Result<Rig> {
     let state = gather_all(source, 0, Columns::POSITION | Columns::LOG_SCALE | Columns::OPACITY)?;
-    let places: Vec<DVec3> =
+    let positions: Vec<DVec3> =
         (0..state.len()).map(|i| DVec3::from_array(state.position.row::<3>(i).map(f64::from))).collect();
-    let covered = |i: usize| {
+    let visible_area = |i: usize| {
         let mut scales = state.log_scale.row::<3>(i).map(f64::from);
         scales.sort_by(f64::total_cmp);
         opacity(state.opacity_logit.row::<1>(i)[0]) * (scales[1] + scales[2]).exp()
     };
-    let weights: Vec<f64> = (0..state.len()).map(covered).collect();
-    Ok(cameras::surrounding_rig(&places, &weights))
+    let weights: Vec<f64> = (0..state.len()).map(visible_area).collect();
+    Ok(cameras::surrounding_rig(&positions, &weights))
 }
 
-/// A rig around the robust middle of the first frame.
+/// Returns a virtual rig around the center of the first frame's robust box.
 fn virtual_rig(source: &dyn FrameSource) -> Result<Rig> {
     let (middle, extent) = first_box(source)?.map_or((DVec3::ZERO, 1.0), |found| (found.middle, found.extent()));
     Ok(cameras::virtual_rig(middle, extent))
 }
 
-/// The robust box of the first frame; none without frames. Memory: 16 bytes a Gaussian.
-///
-/// # Errors
-/// A frame that cannot be read.
+/// Returns the robust box of the first frame; `None` without frames. Memory: 16 bytes per Gaussian.
 pub fn first_box(source: &dyn FrameSource) -> Result<Option<RobustBox>> {
     if source.info().times.is_empty() {
         return Ok(None);
@@ -192,8 +197,8 @@ pub fn first_box(source: &dyn FrameSource) -> Result<Option<RobustBox>> {
     Ok(Some(RobustBox::from_positions(&gather_all(source, 0, Columns::POSITION)?.position)))
 }
 
-/// Folder for scratch files of a run that writes `output`: where the result goes there is room for its input. `None` for a
-/// device or FIFO.
+/// Returns the folder for scratch files of a run that writes `output`: the folder of the output, since a disk with
+/// space for the result has space for its input. Returns `None` for a device or FIFO.
 pub fn scratch_beside(output: &Path) -> Option<PathBuf> {
     if std::fs::metadata(output).is_ok_and(|found| !found.is_file() && !found.is_dir()) {
         return None;

@@ -1,20 +1,20 @@
-//! A way through cameras.
+//! Camera path through given cameras.
 
-use super::between::{meeting_point, on_the_way};
+use super::between::{interpolated_camera, meeting_point};
 use crate::model::Camera;
 
-/// `count` cameras on the way through all of `stops`, in order, from the first to the last: each is turned evenly from stop to
-/// stop and as far from where their optical axes meet as its way along says; angle of view and principal point change evenly,
-/// too. Steps are of one length, where stops stand apart. Pictures are of the first stop's size.
+/// Returns `count` cameras on the path through all of `stops`, in order, from the first to the last. Between two stops,
+/// rotation, distance from the point where the optical axes meet, focal length and principal point are interpolated
+/// evenly. Steps have equal length if the stops are at different positions. Images have the size of the first stop's.
 pub fn along(stops: &[Camera], count: usize) -> Vec<Camera> {
     let (Some(first), Some(last)) = (stops.first(), stops.last()) else { return Vec::new() };
     let focus = meeting_point(stops);
-    let mut legs: Vec<f64> = stops.windows(2).map(|pair| pair[0].center().distance(pair[1].center())).collect();
-    // Cameras that only turn.
-    if legs.iter().sum::<f64>() <= 0.0 {
-        legs.fill(1.0);
+    let mut lengths: Vec<f64> = stops.windows(2).map(|pair| pair[0].center().distance(pair[1].center())).collect();
+    // If all stops are at one position, each section of the path gets the same number of steps.
+    if lengths.iter().sum::<f64>() <= 0.0 {
+        lengths.fill(1.0);
     }
-    let whole: f64 = legs.iter().sum();
+    let total: f64 = lengths.iter().sum();
     let at = |k: usize| {
         if k == 0 {
             return first.clone();
@@ -22,28 +22,28 @@ pub fn along(stops: &[Camera], count: usize) -> Vec<Camera> {
         if k + 1 == count {
             return Camera { width: first.width, height: first.height, ..last.clone() };
         }
-        let mut left = whole * k as f64 / (count - 1) as f64;
-        for (pair, &leg) in stops.windows(2).zip(&legs) {
-            if left <= leg && leg > 0.0 {
-                return between(&pair[0], &pair[1], left / leg, focus, first);
+        let mut left = total * k as f64 / (count - 1) as f64;
+        for (pair, &length) in stops.windows(2).zip(&lengths) {
+            if left <= length && length > 0.0 {
+                return interpolated(&pair[0], &pair[1], left / length, focus, first);
             }
-            left -= leg;
+            left -= length;
         }
         last.clone()
     };
     (0..count).map(at).collect()
 }
 
-fn between(from: &Camera, to: &Camera, way: f64, focus: glam::DVec3, first: &Camera) -> Camera {
-    let even = |of: fn(&Camera) -> f64| of(from) * (1.0 - way) + of(to) * way;
+fn interpolated(from: &Camera, to: &Camera, fraction: f64, focus: glam::DVec3, first: &Camera) -> Camera {
+    let interpolate = |value: fn(&Camera) -> f64| value(from) * (1.0 - fraction) + value(to) * fraction;
     Camera {
-        fx: even(|camera| camera.fx),
-        fy: even(|camera| camera.fy),
-        cx: even(|camera| camera.cx),
-        cy: even(|camera| camera.cy),
+        fx: interpolate(|camera| camera.fx),
+        fy: interpolate(|camera| camera.fy),
+        cx: interpolate(|camera| camera.cx),
+        cy: interpolate(|camera| camera.cy),
         width: first.width,
         height: first.height,
-        ..on_the_way(from, to, way, focus)
+        ..interpolated_camera(from, to, fraction, focus)
     }
 }
 
@@ -53,7 +53,8 @@ mod tests {
 
     use super::*;
 
-    /// Cameras on a circle of radius 3, a sixth of a turn apart, that look at its middle with growing angles of view.
+    /// Returns cameras on a circle of radius 3, a sixth of a turn apart, that look at its center with growing angles of
+    /// view.
     fn arc() -> Vec<Camera> {
         let at = |k: u32| {
             let angle = f64::from(k) * std::f64::consts::TAU / 6.0;
@@ -64,13 +65,13 @@ mod tests {
     }
 
     #[test]
-    fn a_way_begins_and_ends_at_cameras_and_keeps_to_the_circle_they_stand_on() {
+    fn path_through_an_arc_stays_on_its_circle() {
         let stops = arc();
-        let way = along(&stops, 21);
-        assert_eq!((way.len(), &way[0], &way[20]), (21, &stops[0], &stops[2]));
-        assert!(way[10].center().distance(stops[1].center()) < 1e-9, "half of the way is the middle camera");
+        let path = along(&stops, 21);
+        assert_eq!((path.len(), &path[0], &path[20]), (21, &stops[0], &stops[2]));
+        assert!(path[10].center().distance(stops[1].center()) < 1e-9, "the middle of the path is the middle camera");
         let mut before = -1e-9;
-        for camera in &way {
+        for camera in &path {
             let center = camera.center();
             assert!((center.length() - 3.0).abs() < 1e-9, "{center} is off the circle");
             let angle = center.y.atan2(center.x);
@@ -79,17 +80,17 @@ mod tests {
             let ahead = camera.rotation * DVec3::ZERO + camera.translation;
             assert!(ahead.x.abs() < 1e-9 && ahead.y.abs() < 1e-9, "the middle is off the picture's: {ahead}");
         }
-        assert!((way[5].fx - 0.5 * (stops[0].fx + stops[1].fx)).abs() < 1e-9);
+        assert!((path[5].fx - 0.5 * (stops[0].fx + stops[1].fx)).abs() < 1e-9);
     }
 
     #[test]
-    fn one_camera_cameras_at_one_place_and_none_have_ways_too() {
+    fn zero_one_and_coinciding_stops_have_a_path() {
         let stops = arc();
         assert!(along(&[], 3).is_empty());
         assert!(along(&stops[..1], 3).iter().all(|camera| *camera == stops[0]));
         let turned = Camera::look_at(stops[0].center(), DVec3::new(0.0, 1.0, 0.0), 0.6, (64, 48));
-        let way = along(&[stops[0].clone(), turned], 5);
-        assert!(way.iter().all(|camera| camera.center().distance(stops[0].center()) < 1e-9));
+        let path = along(&[stops[0].clone(), turned], 5);
+        assert!(path.iter().all(|camera| camera.center().distance(stops[0].center()) < 1e-9));
         assert_eq!(along(&stops, 1), stops[..1]);
     }
 }

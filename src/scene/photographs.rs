@@ -1,4 +1,4 @@
-//! Photographs that pictures are compared with.
+//! Photographs (ground-truth images) of views, in a folder.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -11,23 +11,27 @@ use crate::files::image::read_png;
 use crate::model::{Camera, Picture, Rig};
 use crate::render::Image;
 
-/// Where the photographs of some pictures are.
+/// Files of the photographs of some views.
 pub struct Photographs {
-    /// By frame and view.
+    /// File of each photograph, by frame and view number.
     files: HashMap<(usize, u32), PathBuf>,
 }
 
 impl Photographs {
-    /// Of pictures with the file of each, inside `folder`.
-    fn at(folder: &Path, found: impl Iterator<Item = Result<(Picture, PathBuf)>>) -> Result<Photographs> {
+    /// Creates the list from views with the file of each, inside `folder`.
+    ///
+    /// # Errors
+    /// Two views with the same file.
+    fn from_files(folder: &Path, found: impl Iterator<Item = Result<(Picture, PathBuf)>>) -> Result<Photographs> {
         let mut files = HashMap::new();
-        let mut takers: HashMap<PathBuf, Picture> = HashMap::new();
+        let mut view_of_file: HashMap<PathBuf, Picture> = HashMap::new();
         for found in found {
             let (picture, file) = found?;
-            // The names that a time-stamped rig gives its files are shared by all of its cameras.
-            if let Some(other) = takers.insert(file.clone(), picture) {
-                let found = format!("{}, as for frame {}, view {}", file.shown(), other.frame, other.view);
-                return Err(Error::input(folder, place(picture), "a picture of its own", found)
+            // Cameras of a time-stamped rig may give all their views the same file names.
+            if let Some(other) = view_of_file.insert(file.clone(), picture) {
+                let found =
+                    format!("{}, which also belongs to frame {}, view {}", file.shown(), other.frame, other.view);
+                return Err(Error::input(folder, view_name(picture), "a photograph of its own", found)
                     .hint("give the folder that the cameras' file paths start from"));
             }
             files.insert((picture.frame, picture.view), file);
@@ -42,7 +46,7 @@ impl Photographs {
     /// `camNN/images/FFFF.png` as in DyNeRF (position of the view among the folders `cam…`, frame).
     ///
     /// # Errors
-    /// A folder that cannot be read; no photograph of any; a picture that shares its photograph with another.
+    /// A folder that cannot be read; no photograph of any view; two views with the same photograph.
     pub fn of_some(
         folder: &Path,
         rig: &Rig,
@@ -50,33 +54,38 @@ impl Photographs {
         pictures: Vec<Picture>,
     ) -> Result<(Vec<Picture>, Photographs)> {
         check_folder(folder)?;
-        let rigs = camera_folders(folder)?;
+        let cameras = camera_folders(folder)?;
         let named = |picture: Picture| Some((picture, inside(folder, rig.image(picture, times)?)?));
         let mut found: Vec<(Picture, PathBuf)> = pictures.iter().copied().filter_map(named).collect();
         if found.is_empty() {
-            let numbered = |picture: Picture| Some((picture, numbered_file(folder, picture, &rigs)?));
+            let numbered = |picture: Picture| Some((picture, numbered_file(folder, picture, &cameras)?));
             found = pictures.iter().copied().filter_map(numbered).collect();
         }
         if let (true, Some(&picture)) = (found.is_empty(), pictures.first()) {
             let named = rig.image(picture, times).and_then(Path::file_name);
             let named = named.map_or_else(String::new, |name| format!(", {}", name.shown()));
             let expected = format!("{}.png{named} or {}", picture.name(), in_rig(Path::new("camNN"), picture).shown());
-            return Err(Error::input(folder, place(picture), expected, "no such file, nor one of another picture"));
+            return Err(Error::input(
+                folder,
+                view_name(picture),
+                expected,
+                "no such file, and no photograph of any other view",
+            ));
         }
         let pictures = found.iter().map(|(picture, _)| *picture).collect();
-        Ok((pictures, Photographs::at(folder, found.into_iter().map(Ok))?))
+        Ok((pictures, Photographs::from_files(folder, found.into_iter().map(Ok))?))
     }
 
-    /// Whether there is one of `picture`.
+    /// Returns whether there is a photograph of `picture`.
     pub fn has(&self, picture: Picture) -> bool {
         self.files.contains_key(&(picture.frame, picture.view))
     }
 
-    /// What says, without reading them, that the photographs of `pictures` are those that they were: of each its name,
-    /// length, and when it was last changed, ns.
+    /// Returns name, length and time of the last change (ns) of the photographs of `pictures`. They show without
+    /// reading the files whether the photographs have changed.
     ///
     /// # Errors
-    /// A file that is not there any more.
+    /// A file that does not exist any more.
     pub fn stamps(&self, pictures: &[Picture]) -> Result<Vec<(String, u64, u128)>> {
         let mut files = Vec::with_capacity(pictures.len());
         for picture in pictures {
@@ -87,21 +96,23 @@ impl Photographs {
         Ok(files)
     }
 
-    /// The photograph of `picture`, which `camera` takes, before `background` where it has transparency.
+    /// Reads the photograph of `picture`, taken by `camera`. Transparent pixels are blended with `background`.
     ///
     /// # Errors
-    /// A picture that none was found for; a file that is no picture of the camera's size.
+    /// A view without a photograph; a file that is not an image of the camera's size.
     pub fn read(&self, picture: Picture, camera: &Camera, background: [f32; 3]) -> Result<Image> {
         let file = self.files.get(&(picture.frame, picture.view));
-        let file = file.ok_or_else(|| Error::usage(format!("no photograph is known of {}", picture.name())))?;
+        let file = file.ok_or_else(|| Error::usage(format!("no photograph was found for {}", picture.name())))?;
         read_png(file, (camera.width, camera.height), background)
     }
 }
 
-fn place(picture: Picture) -> String {
+/// Returns the name of a view in messages.
+fn view_name(picture: Picture) -> String {
     format!("frame {}, view {}", picture.frame, picture.view)
 }
 
+/// Checks that `folder` is a folder.
 fn check_folder(folder: &Path) -> Result<()> {
     if !fs::metadata(folder).map_err(Error::io("open", folder))?.is_dir() {
         return Err(Error::usage(format!("{}: --ground-truth expects a folder of pictures", folder.shown())));
@@ -109,14 +120,14 @@ fn check_folder(folder: &Path) -> Result<()> {
     Ok(())
 }
 
-/// Returns the photograph of `picture` by its frame and view: `tNNN_vNN.png`, or in the folder of its camera among `rigs`.
-fn numbered_file(folder: &Path, picture: Picture, rigs: &[PathBuf]) -> Option<PathBuf> {
-    let in_camera = rigs.get(picture.view as usize).map(|camera| in_rig(camera, picture));
+/// Returns the photograph of `picture` by its frame and view: `tNNN_vNN.png`, or in the folder of its camera among `cameras`.
+fn numbered_file(folder: &Path, picture: Picture, cameras: &[PathBuf]) -> Option<PathBuf> {
+    let in_camera = cameras.get(picture.view as usize).map(|camera| in_rig(camera, picture));
     let files = [Some(folder.join(format!("{}.png", picture.name()))), in_camera];
     files.into_iter().flatten().find(|file| file.is_file())
 }
 
-/// The folders of `folder` that are called `cam` and a number, by that: view after view.
+/// Returns the subfolders of `folder` named `cam` and a number that contain `images`, in the order of their numbers.
 fn camera_folders(folder: &Path) -> Result<Vec<PathBuf>> {
     let entries = fs::read_dir(folder).and_then(|entries| entries.collect::<std::io::Result<Vec<_>>>());
     let mut found: Vec<(u32, PathBuf)> = Vec::new();
@@ -129,12 +140,12 @@ fn camera_folders(folder: &Path) -> Result<Vec<PathBuf>> {
     Ok(found.into_iter().map(|(_, path)| path).collect())
 }
 
-/// Where a rig's camera has the photograph of `picture`.
+/// Returns the path of the photograph of `picture` in the folder of a DyNeRF camera.
 fn in_rig(camera: &Path, picture: Picture) -> PathBuf {
     camera.join("images").join(format!("{:04}.png", picture.frame))
 }
 
-/// The file inside `folder` that ends as `image` does, by the longest such end.
+/// Returns the existing file inside `folder` whose path is the longest end of `image`.
 fn inside(folder: &Path, image: &Path) -> Option<PathBuf> {
     let parts: Vec<_> = image.components().collect();
     let ends = (0..parts.len()).map(|start| parts[start..].iter().collect::<PathBuf>());

@@ -1,4 +1,4 @@
-//! Which pictures of a rig to make: at which frame, by which camera, over what background.
+//! Selection of the views of a rig to render: frame, camera and background; and the memory that rendering takes.
 
 use super::Scene;
 use crate::error::{Error, Result};
@@ -7,29 +7,29 @@ use crate::memory_plan::{PICTURE_ON_ALL_THREADS, RENDER, ResourceEstimate, Workl
 use crate::model::{Columns, Picture, Rig, Split};
 use crate::render;
 
-/// The part of a rig's pictures that is asked for.
+/// Part of a rig's views.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum PictureSet {
-    /// The held-out pictures; of cameras that hold none out, every one.
+    /// Held-out views (test, else validation); all views if the cameras hold none out.
     #[default]
     HeldOut,
     /// One split, which must not be empty.
     Split(Split),
-    /// Every picture.
+    /// All views.
     All,
 }
 
-/// The pictures of `part`, by frame, then view.
+/// Returns the views of `part`, in the order of frame, then view number.
 ///
 /// # Errors
-/// A picture at no frame's time; a split without pictures; two cameras that share frame and view, which
-/// only splits of one numbering can.
+/// A view at a time that is not the time of any frame; a split without views; two cameras with the same frame and view
+/// number, which happens only if each split numbers its views on its own.
 pub fn pictures(rig: &Rig, frame_times: &[f64], part: PictureSet) -> Result<Vec<Picture>> {
     let mut found = Vec::new();
     for (frame, views) in rig.schedule(frame_times, part.split(rig))?.iter().enumerate() {
         let mut views = views.to_vec();
         views.sort_by_key(|&(view, _)| view);
-        // Train and test files may both list a picture.
+        // Train and test files may list the same view.
         views.dedup();
         found.extend(views.into_iter().map(|(view, camera)| Picture { frame, view, camera }));
     }
@@ -45,23 +45,23 @@ pub fn pictures(rig: &Rig, frame_times: &[f64], part: PictureSet) -> Result<Vec<
     Ok(found)
 }
 
-/// That the cameras have no picture of the split that is asked for.
+/// Returns the error for a split without views.
 pub fn no_picture(rig: &Rig) -> Error {
     let has = |split: &Split| rig.shots.iter().any(|shot| shot.split == *split);
     let named = [(Split::Train, "train"), (Split::Val, "val"), (Split::Test, "test")];
-    let there: Vec<&str> = named.iter().filter(|(split, _)| has(split)).map(|(_, name)| *name).collect();
+    let available: Vec<&str> = named.iter().filter(|(split, _)| has(split)).map(|(_, name)| *name).collect();
     Error::usage(format!(
-        "{}: no picture in this split\n  it has pictures of {}: --split {}, or --split all",
+        "{}: the cameras have no views in this split\n  they have views of {}; use --split {} or --split all",
         rig.origin,
-        there.join(" and "),
-        there.first().unwrap_or(&"all")
+        available.join(" and "),
+        available.first().unwrap_or(&"all")
     ))
 }
 
-/// The picture of `view` at `frame`.
+/// Returns view number `view` at `frame`.
 ///
 /// # Errors
-/// As [`pictures`]; a frame that the sequence does not have, a view that does not see it.
+/// Errors of [`pictures`]; a frame that the sequence does not have; a view number that the frame does not have.
 pub fn picture(rig: &Rig, frame_times: &[f64], part: PictureSet, frame: usize, view: u32) -> Result<Picture> {
     if frame >= frame_times.len() {
         let last = frame_times.len().saturating_sub(1);
@@ -76,8 +76,9 @@ pub fn picture(rig: &Rig, frame_times: &[f64], part: PictureSet, frame: usize, v
     })
 }
 
-/// At most `count` (at least one) of the frames that `pictures` show, evenly from first to last: of K frames those
-/// numbered round(i·(K − 1)/(count − 1)), halves to even, as numpy's `round(linspace(0, K - 1, count))`.
+/// Returns the views of at most `count` (at least one) of the frames in `pictures`, evenly spaced from first to last.
+/// Of K frames it keeps those with index round(i·(K − 1)/(count − 1)), halves to even, as numpy's `round(linspace(0, K
+/// - 1, count))` does.
 pub fn thin(pictures: Vec<Picture>, count: usize) -> Vec<Picture> {
     let count = count.max(1);
     let mut frames: Vec<usize> = pictures.iter().map(|picture| picture.frame).collect();
@@ -86,7 +87,7 @@ pub fn thin(pictures: Vec<Picture>, count: usize) -> Vec<Picture> {
         return pictures;
     }
     let step = (frames.len() - 1) as f64 / (count - 1).max(1) as f64;
-    // Fewer than there are frames: steps above 1 never take one twice.
+    // As `count` is less than the number of frames, steps exceed 1 and no frame is taken twice.
     let kept: Vec<usize> = (0..count).map(|i| frames[(i as f64 * step).round_ties_even() as usize]).collect();
     pictures.into_iter().filter(|picture| kept.binary_search(&picture.frame).is_ok()).collect()
 }
@@ -116,10 +117,10 @@ pub fn spread_views(pictures: Vec<Picture>, most: usize) -> Vec<Picture> {
 /// The golden ratio, whose multiples are spread evenly modulo 1.
 const GOLDEN_RATIO: f64 = 1.618_033_988_749_895;
 
-/// Color behind a scene: the one asked for, else the scene's own.
+/// Returns the background color: the color that the user gave, else that of the scene.
 ///
 /// # Errors
-/// A color that is not from 0 to 1.
+/// A color with a component outside 0 to 1.
 pub fn background(asked: Option<[f32; 3]>, scene: &Scene) -> Result<[f32; 3]> {
     match asked {
         Some(rgb) if rgb.iter().any(|c| !(0.0..=1.0).contains(c)) => {
@@ -129,7 +130,7 @@ pub fn background(asked: Option<[f32; 3]>, scene: &Scene) -> Result<[f32; 3]> {
     }
 }
 
-/// Pictures of `models` models, each picture with `pixel` bytes per pixel.
+/// Estimates the resources of rendering all views of `models` models, with `pixel` bytes per pixel of each render.
 pub fn need(work: &Workload, limits: &Limits, stage: &'static str, models: u64, pixel: u64) -> ResourceEstimate {
     let pictures = work.threads.min(limits.pictures_together as u64);
     ResourceEstimate {
@@ -153,7 +154,7 @@ pub fn need(work: &Workload, limits: &Limits, stage: &'static str, models: u64, 
 }
 
 impl PictureSet {
-    /// The split it comes to with these cameras; none: every picture.
+    /// Returns the split to use with the cameras of `rig`; `None`: all views.
     pub fn split(self, rig: &Rig) -> Option<Split> {
         match self {
             PictureSet::HeldOut => rig.held_out(),
@@ -170,7 +171,7 @@ mod tests {
     use super::*;
     use crate::model::{Camera, Shot};
 
-    /// Shots of (view, camera, time, split).
+    /// Returns a rig with the given shots of (view, camera, time, split).
     fn rig(shots: &[(u32, u32, Option<f64>, Split)]) -> Rig {
         let camera = |k: u32| Camera::look_at(DVec3::new(f64::from(k), -5.0, 1.0), DVec3::ZERO, 1.0, (8, 8));
         let shot = |&(view, camera, time, split)| Shot { view, camera, time, split, image: None };
@@ -204,7 +205,7 @@ mod tests {
     }
 
     #[test]
-    fn pictures_come_by_frame_then_view_whatever_the_file_says() {
+    fn views_are_in_the_order_of_frame_then_view_number() {
         let rig = rig(&[
             (2, 0, Some(1.0), Split::Test),
             (7, 1, None, Split::Test),
@@ -222,7 +223,7 @@ mod tests {
     }
 
     #[test]
-    fn cameras_that_hold_nothing_out_are_all_looked_at_unless_asked_not_to() {
+    fn all_views_are_used_if_none_are_held_out() {
         let rig = rig(&[(0, 0, None, Split::Train)]);
         assert_eq!(pairs(&pictures(&rig, &[0.0, 1.0], PictureSet::HeldOut).unwrap()), [(0, 0), (1, 0)]);
         let message = pictures(&rig, &[0.0], PictureSet::Split(Split::Test)).unwrap_err().to_string();
@@ -230,7 +231,7 @@ mod tests {
     }
 
     #[test]
-    fn one_picture_in_two_files_is_one_and_two_of_one_name_are_refused() {
+    fn equal_views_are_merged_and_conflicting_ones_refused() {
         let same = rig(&[(3, 1, Some(0.0), Split::Train), (3, 1, Some(0.0), Split::Test)]);
         assert_eq!(pairs(&pictures(&same, &[0.0], PictureSet::All).unwrap()), [(0, 3)]);
         let two = rig(&[(3, 1, Some(0.0), Split::Train), (3, 2, Some(0.0), Split::Test)]);
@@ -239,12 +240,12 @@ mod tests {
     }
 
     #[test]
-    fn thinned_frames_are_those_of_numpys_linspace() {
+    fn thinned_frames_equal_numpy_linspace() {
         let every = |frames: usize| -> Vec<Picture> {
             (0..frames).map(|frame| Picture { frame: 3 * frame, view: 0, camera: 0 }).collect()
         };
         let kept = |frames, count| pairs(&thin(every(frames), count)).iter().map(|p| p.0 / 3).collect::<Vec<_>>();
-        // np.round(np.linspace(0, 59, 15)), np.round(np.linspace(0, 9, 3)) with 4.5 going to 4.
+        // Values of np.round(np.linspace(0, 59, 15)) and np.round(np.linspace(0, 9, 3)), where 4.5 rounds to 4.
         assert_eq!(kept(60, 15), [0, 4, 8, 13, 17, 21, 25, 30, 34, 38, 42, 46, 51, 55, 59]);
         assert_eq!(kept(10, 3), [0, 4, 9]);
         assert_eq!(kept(10, 1), [0]);

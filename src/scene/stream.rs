@@ -1,4 +1,4 @@
-//! Standard input as a scene: what arrives is packed first, then read like any container.
+//! Standard input as an input: a stream is packed into a scratch container, which is then read like any container.
 
 use std::io::{IsTerminal, Stdin};
 use std::path::Path;
@@ -16,18 +16,19 @@ use crate::models::{InputModel, LinkedFrames};
 use crate::passes::BLOCK;
 use crate::statistics;
 
-/// What messages call standard input.
+/// Name of standard input in messages.
 const STANDARD_INPUT: &str = "standard input";
 
-/// Opens standard input as a stream.
+/// Opens standard input as a frame stream.
 ///
 /// # Errors
-/// A terminal; what is no stream; options that only models have, or inputs that can be read again.
+/// A terminal; data that is not a frame stream; options that apply to models only, or that need an input which can be
+/// read again.
 pub fn open_stream(options: &InputOptions) -> Result<FrameStream<Stdin>> {
     if options.work.is_some() {
         return Err(Error::usage(
-            "--work: expected an input that can be read again, found a stream on standard input\n  \
-             write it to a container first: splatsieve pack - -o NAME.gseq",
+            "--cache: expected an input that can be read again, found a stream on standard input\n  \
+             write it to a container first: splatsieve convert - NAME.gseq",
         ));
     }
     if options.frames.is_some() || options.iteration.is_some() {
@@ -40,39 +41,43 @@ pub fn open_stream(options: &InputOptions) -> Result<FrameStream<Stdin>> {
     FrameStream::open(stdin, Path::new(STANDARD_INPUT), options.memory.read_limit())
 }
 
-/// Packs a stream into a scratch container and opens that with its cameras.
+/// Packs a stream into a scratch container and opens it with its cameras.
 ///
 /// # Errors
-/// What is wrong with the stream; a budget that does not hold the frames that are packed together.
-pub(super) fn open_arriving(options: &InputOptions) -> Result<Opened> {
+/// An invalid stream; a budget that is too small for the frames that are packed together.
+pub(super) fn open_packed_stream(options: &InputOptions) -> Result<Opened> {
     let rig = load_cameras(options, options.cameras.as_deref(), options.times.clone(), Clock::Normalized, None)?;
     let stream = open_stream(options)?;
     if is_linked(stream.header(), options) {
         return link_stream(stream, options, rig);
     }
-    Ok(Opened { input: Box::new(pack_arriving(stream, options)?), rig, notes: Vec::new() })
+    Ok(Opened { input: Box::new(pack_stream(stream, options)?), rig, notes: Vec::new() })
 }
 
-fn pack_arriving(stream: FrameStream<Stdin>, options: &InputOptions) -> Result<Streamed> {
-    let mut room = room_to_pack(options, stream.header())?;
-    Streamed::receive(stream, &options.scratch_folder(), &options.events, |held| room.admit(held.len()))
+/// Packs a stream into a scratch container.
+///
+/// # Errors
+/// As [`link_stream`].
+fn pack_stream(stream: FrameStream<Stdin>, options: &InputOptions) -> Result<Streamed> {
+    let mut quota = room_to_pack(options, stream.header())?;
+    Streamed::receive(stream, &options.scratch_folder(), &options.events, |held| quota.admit(held.len()))
 }
 
-/// Whether a stream is linked: one of frames that do not know one another, or any where that is asked for.
+/// Returns whether the frames of a stream are linked: if they share no Gaussian ids, or if the user asks for it.
 pub fn is_linked(header: &StreamHeader, options: &InputOptions) -> bool {
     header.is_unlinked || options.link.is_asked()
 }
 
-/// Receives a stream that [is linked](is_linked).
+/// Receives a stream whose frames [are linked](is_linked).
 ///
 /// # Errors
-/// What is wrong with the stream; a budget that does not hold the frames that are packed together.
+/// An invalid stream; a budget that is too small for the frames that are packed together.
 pub fn link_stream(stream: FrameStream<Stdin>, options: &InputOptions, rig: Option<Rig>) -> Result<Opened> {
     let joins = options.link.joins();
     let input = match stream.header().is_unlinked {
         true => LinkedFrames::receive(stream, Path::new(STANDARD_INPUT), joins, &options.opening().ply())?,
         false => LinkedFrames::relink(
-            &pack_arriving(stream, options)?,
+            &pack_stream(stream, options)?,
             "linked frame stream",
             joins,
             &options.opening().ply(),
@@ -82,15 +87,15 @@ pub fn link_stream(stream: FrameStream<Stdin>, options: &InputOptions, rig: Opti
     Ok(Opened { input: Box::new(input), rig, notes })
 }
 
-/// The memory there is to pack a stream.
+/// Returns the number of frames of a stream that can be packed within the memory budget.
 ///
 /// # Errors
-/// A budget that does not hold the frames that are packed together.
+/// A budget that is too small for the frames that are packed together.
 pub fn room_to_pack(options: &InputOptions, header: &StreamHeader) -> Result<FrameQuota> {
     let block = frame_block(header);
     let held = (block + AHEAD) as u64;
-    let nobody = Rig { cameras: Vec::new(), shots: Vec::new(), background: None, origin: String::new() };
-    let work = |frames| Workload::of_stream(header, block, &nobody, frames);
+    let no_cameras = Rig { cameras: Vec::new(), shots: Vec::new(), background: None, origin: String::new() };
+    let work = |frames| Workload::of_stream(header, block, &no_cameras, frames);
     let receive = |frames| move |work: &Workload, limits: &Limits| vec![receiving(work, limits, held, None, frames)];
     Plan::fit(work(0), options.memory, &options.events, receive(0))?;
     Ok(FrameQuota::new(options.memory, |budget, frames| {
@@ -99,59 +104,61 @@ pub fn room_to_pack(options: &InputOptions, header: &StreamHeader) -> Result<Fra
     }))
 }
 
-/// The frames of a stream that there is memory for: how many will come nobody knows when it begins.
+/// Maximum number of frames of a stream within the memory budget. How many frames will arrive is unknown at the
+/// beginning.
 #[derive(Debug)]
 pub struct FrameQuota {
-    /// Frames that have come.
+    /// Number of frames that have arrived.
     arrived: u64,
-    /// Frames that there is memory for.
+    /// Maximum number of frames within the memory budget.
     pub most: u64,
-    /// What to do about it if more come.
+    /// Hint to the user for the case that more frames arrive.
     hint: String,
     budget: Budget,
 }
 
 impl FrameQuota {
-    /// What `budget` has room for; `peak` says how much memory a run within a budget takes for so many frames.
+    /// Finds the maximum number of frames for `budget`. `peak` returns the memory in bytes that a run takes, given its
+    /// budget in bytes and a number of frames.
     pub fn new(budget: Budget, peak: impl Fn(u64, u64) -> u64) -> FrameQuota {
         let bytes = budget.limit();
-        // A stream has fewer than 2^32 frames.
+        // Binary search over bits; a stream has fewer than 2^32 frames.
         let most = (0..32).rev().fold(0, |most, bit| {
             let more = most | 1 << bit;
             if peak(bytes, more) <= bytes { more } else { most }
         });
         let enough = (2 * most).max(1000);
         let least = peak(0, enough).div_ceil(1 << 20);
-        let hint = format!("give it --memory {least}MiB, which is enough for {enough}, or send fewer frames");
+        let hint = format!("use --memory {least}MiB, which is enough for {enough} frames, or send fewer frames");
         FrameQuota { arrived: 0, most, hint, budget }
     }
 
-    /// Lets `frames` more frames in.
+    /// Counts `frames` more frames.
     ///
     /// # Errors
-    /// More than there is memory for.
+    /// More frames than the maximum.
     pub fn admit(&mut self, frames: usize) -> Result<()> {
         self.arrived += frames as u64;
         if self.arrived <= self.most {
             return Ok(());
         }
-        let expected = format!("at most {} frames, for which there is memory ({})", self.most, self.budget.named());
-        let found = format!("{} frames, and the stream goes on", self.arrived);
+        let expected = format!("at most {} frames within the memory budget ({})", self.most, self.budget.named());
+        let found = format!("{} frames, and the stream continues", self.arrived);
         Err(Error::input(Path::new(STANDARD_INPUT), format!("frame {}", self.most), expected, found).hint(&self.hint))
     }
 
-    /// Frames that have come.
+    /// Returns the number of frames that have arrived.
     pub fn arrived(&self) -> u64 {
         self.arrived
     }
 }
 
-/// Resident per frame while a stream is packed: its time stamp and, if it is scanned, how many Gaussians live in it, in lists
-/// that grow by being copied to twice their length.
+/// Resident bytes per frame while a stream is packed: its time stamp and, if it is scanned, the number of Gaussians
+/// alive in it, in lists that grow by being copied to twice their length.
 const PER_FRAME: u64 = 2 * (8 + 4);
 
-/// What it takes to pack a stream of which `held` frames are in memory together and `frames` come in all, and to scan it on
-/// the way unless `measuring` is none; if it says so, to look at pictures too.
+/// Estimates the resources of packing a stream with `held` frames in memory together and `frames` frames in total.
+/// `measuring` states whether it is scanned on the way: `None`: not scanned; `Some(true)`: views are rendered too.
 pub fn receiving(
     work: &Workload,
     limits: &Limits,

@@ -1,4 +1,4 @@
-//! What everything that stages find in a scene follows from.
+//! Cache of a scene: the keys from which all cached stage results follow, and the digest of the input.
 
 use std::fs;
 use std::path::Path;
@@ -12,12 +12,12 @@ use crate::error::{Error, Result, ShowPath};
 use crate::models::InputModel;
 use crate::render;
 
-/// Under what the digest of an input is kept.
+/// Name of the cache entry with the digest of an input.
 const DIGEST: &str = "input";
 
 impl Scene {
-    /// Opens the work folder that `options` name.
-    pub(super) fn keep_work(&mut self, options: &InputOptions) -> Result<()> {
+    /// Opens the cache folder that `options` name.
+    pub(super) fn open_cache(&mut self, options: &InputOptions) -> Result<()> {
         (self.work, self.digest) = kept_work(options, &*self.input)?;
         if self.work.keeps() {
             self.work.follow_from(self.key());
@@ -25,39 +25,38 @@ impl Scene {
         Ok(())
     }
 
-    /// Digest of the input.
-    ///
-    /// # Errors
-    /// A file that cannot be read.
+    /// Returns the digest of the input.
     pub fn digest(&self) -> Result<String> {
         self.digest.clone().map_or_else(|| self.input.digest(), Ok)
     }
 
-    /// Digest of another input, opened as `options` say, which is kept, too.
+    /// Returns the digest of another input, opened with `options`. The digest is cached too.
     ///
     /// # Errors
-    /// A file that cannot be read, and those of the work folder.
+    /// A file that cannot be read; errors of the cache folder.
     pub fn digest_of(&self, options: &InputOptions, input: &dyn InputModel) -> Result<String> {
-        known_digest(&self.work, options, input)
+        cached_digest(&self.work, options, input)
     }
 
-    /// From where the input is looked at.
+    /// Returns the cache key of the cameras, their schedule and the background.
     fn key(&self) -> CacheKey {
-        let shots: Vec<_> = self.rig.shots.iter().map(|of| (of.view, of.camera, of.time, of.split)).collect();
+        let shots: Vec<_> = self.rig.shots.iter().map(|shot| (shot.view, shot.camera, shot.time, shot.split)).collect();
         CacheKey::new(&(&self.rig.cameras, shots, &self.schedule, self.background, self.has_cameras))
     }
 }
 
-/// The work folder that `options` name, and the digest of `input`, from which all in it follows; without a folder neither.
+/// Opens the cache folder that `options` name and returns it with the digest of `input`, which is part of the key of
+/// every entry. Returns an empty cache and no digest without a folder.
 ///
 /// # Errors
-/// A file that cannot be read, and those of the work folder.
+/// A file that cannot be read; errors of the cache folder.
 pub fn kept_work(options: &InputOptions, input: &dyn InputModel) -> Result<(Cache, Option<String>)> {
     let Some(asked) = &options.work else { return Ok((Cache::none(), None)) };
     let instructions = render::instructions();
     let mut work = Cache::open(asked, format!("{} ({TOOL}, {instructions})", options.path.shown()))?;
-    let digest = known_digest(&work, options, input)?;
-    // This program and this machine, the input's content as it was opened; not where it lies.
+    let digest = cached_digest(&work, options, input)?;
+    // The key consists of this program, the machine's instruction set, and the content of the input as it was opened;
+    // not of its path.
     let info = input.source().info();
     work.follow_from(CacheKey::new(&(TOOL, instructions, &digest)).and(&(
         info.count,
@@ -69,27 +68,27 @@ pub fn kept_work(options: &InputOptions, input: &dyn InputModel) -> Result<(Cach
     Ok((work, Some(digest)))
 }
 
-/// Digest of `input`, which is read for it only if it may have changed since.
-fn known_digest(work: &Cache, options: &InputOptions, input: &dyn InputModel) -> Result<String> {
+/// Returns the digest of `input`. The input is read only if it may have changed since the digest was cached.
+fn cached_digest(work: &Cache, options: &InputOptions, input: &dyn InputModel) -> Result<String> {
     match work.keeps() {
-        true => work.known(DIGEST, stamp(options)?, || input.digest()),
+        true => work.known(DIGEST, input_stamp(options)?, || input.digest()),
         false => input.digest(),
     }
 }
 
-/// What says, without reading it, that an input is the one that it was: its path, and of all of its files names, lengths
-/// and times of their last change.
-fn stamp(options: &InputOptions) -> Result<CacheKey> {
+/// Returns a key that shows, without reading the input, whether it may have changed: its path, and name, length and
+/// time of the last change of each of its files.
+fn input_stamp(options: &InputOptions) -> Result<CacheKey> {
     let path = fs::canonicalize(&options.path).map_err(Error::io("find", &options.path))?;
     let mut files = Vec::new();
     stamps(&path, &mut files)?;
     Ok(CacheKey::new(&(TOOL, path, options.iteration, options.conventions, options.link, files)))
 }
 
-/// Of every file at `path` and below, in order: name, length, and when it was last changed, ns.
+/// Appends name, length and time of the last change (ns) of every file at `path` and below it, in order.
 pub(crate) fn stamps(path: &Path, files: &mut Vec<(String, u64, u128)>) -> Result<()> {
     let name = path.to_string_lossy().into_owned();
-    // Links that lead nowhere are no part of an input either.
+    // Broken links are not part of an input, so only their name counts.
     let Ok(found) = fs::metadata(path) else {
         files.push((name, 0, 0));
         return Ok(());

@@ -1,7 +1,7 @@
-//! Statistics that nothing needs until later: in memory, or set aside in a scratch file.
+//! Rows of statistics, in memory or spilled to a scratch file while no stage needs them.
 //!
-//! The file: the values of one statistic after the other, then the flags; all as this machine has them. Memory: nothing,
-//! until something is asked for.
+//! Content of the scratch file: the values of one statistic for all Gaussians, then those of the next one, and the
+//! flags last, all in the byte order of this machine. Spilled rows take no memory until they are read.
 
 use std::borrow::Cow;
 use std::path::Path;
@@ -14,17 +14,17 @@ use crate::cache::{Spill, SpillWriter};
 use crate::error::Result;
 use crate::model::{Flags, Rows, Statistic, Values};
 
-/// The rows of N Gaussians.
+/// Rows of N Gaussians, one per Gaussian.
 pub(crate) enum StatisticsRows {
     Memory(Rows),
-    Aside(Aside),
+    Spilled(SpilledRows),
 }
 
-/// Rows in a nameless file that lasts as long as this.
-pub(crate) struct Aside {
+/// Rows in an unnamed scratch file, which is deleted when this value is dropped.
+pub(crate) struct SpilledRows {
     file: Spill,
     count: usize,
-    /// What is in it.
+    /// Statistics in the file, in their order. A statistic without values (such as an absent W) is not stored.
     columns: Vec<Statistic>,
 }
 
@@ -41,56 +41,59 @@ impl<'de> Deserialize<'de> for StatisticsRows {
 }
 
 impl StatisticsRows {
-    /// Writes `rows` to a file in `folder`.
+    /// Writes `rows` to an unnamed scratch file in `folder`.
+    ///
+    /// # Errors
+    /// A file that cannot be created or written.
     pub(crate) fn aside(rows: Rows, folder: &Path) -> Result<StatisticsRows> {
         let mut file = SpillWriter::new(folder)?;
-        let bytes = |of: &Statistic| -> &[u8] {
-            match of.values() {
-                Values::F64(of, _) => bytemuck::cast_slice(of(&rows)),
-                Values::U32(of, _) => bytemuck::cast_slice(of(&rows)),
+        let bytes = |statistic: &Statistic| -> &[u8] {
+            match statistic.values() {
+                Values::F64(values, _) => bytemuck::cast_slice(values(&rows)),
+                Values::U32(values, _) => bytemuck::cast_slice(values(&rows)),
             }
         };
-        let columns: Vec<_> = Statistic::ALL.into_iter().filter(|of| !bytes(of).is_empty()).collect();
-        columns.iter().try_for_each(|of| file.write(bytes(of)))?;
+        let columns: Vec<_> = Statistic::ALL.into_iter().filter(|statistic| !bytes(statistic).is_empty()).collect();
+        columns.iter().try_for_each(|statistic| file.write(bytes(statistic)))?;
         rows.flags.iter().try_for_each(|flags| file.write(&[flags.bits()]))?;
         let file = file.finish()?;
-        Ok(StatisticsRows::Aside(Aside { file, count: rows.len(), columns }))
+        Ok(StatisticsRows::Spilled(SpilledRows { file, count: rows.len(), columns }))
     }
 
-    /// All rows.
+    /// Returns all rows, read from the scratch file if they are spilled.
     pub(crate) fn rows(&self) -> Result<Cow<'_, Rows>> {
         match self {
             StatisticsRows::Memory(rows) => Ok(Cow::Borrowed(rows)),
-            StatisticsRows::Aside(aside) => aside.rows().map(Cow::Owned),
+            StatisticsRows::Spilled(spilled) => spilled.rows().map(Cow::Owned),
         }
     }
 
-    /// C and Vis of every Gaussian.
+    /// Returns the statistics C and Vis of every Gaussian.
     pub(crate) fn importance(&self) -> Result<[Cow<'_, [f64]>; 2]> {
         Ok(match self {
             StatisticsRows::Memory(rows) => [Cow::Borrowed(&rows.c), Cow::Borrowed(&rows.vis)],
-            StatisticsRows::Aside(aside) => {
-                [Cow::Owned(aside.column(Statistic::C)?), Cow::Owned(aside.column(Statistic::Vis)?)]
+            StatisticsRows::Spilled(spilled) => {
+                [Cow::Owned(spilled.column(Statistic::C)?), Cow::Owned(spilled.column(Statistic::Vis)?)]
             }
         })
     }
 
-    /// N.
+    /// Returns the number of rows, N.
     pub(crate) fn len(&self) -> usize {
         match self {
             StatisticsRows::Memory(rows) => rows.len(),
-            StatisticsRows::Aside(aside) => aside.count,
+            StatisticsRows::Spilled(spilled) => spilled.count,
         }
     }
 }
 
-impl Aside {
+impl SpilledRows {
     fn rows(&self) -> Result<Rows> {
         let mut rows = Rows::default();
         for &column in &self.columns {
             match column.values() {
-                Values::F64(_, of) => *of(&mut rows) = self.column(column)?,
-                Values::U32(_, of) => *of(&mut rows) = self.column(column)?,
+                Values::F64(_, values_mut) => *values_mut(&mut rows) = self.column(column)?,
+                Values::U32(_, values_mut) => *values_mut(&mut rows) = self.column(column)?,
             }
         }
         let flags: Vec<u8> = self.values(&self.columns)?;
@@ -98,15 +101,16 @@ impl Aside {
         Ok(rows)
     }
 
-    /// Of no Gaussians nothing is in the file, and nothing is read of it.
-    fn column<T: AnyBitPattern + NoUninit>(&self, of: Statistic) -> Result<Vec<T>> {
-        let place = self.columns.iter().position(|&column| column == of).unwrap_or(self.columns.len());
-        self.values(&self.columns[..place])
+    /// Reads the values of `statistic` for all Gaussians. Returns an empty list without reading if there are no
+    /// Gaussians; their file stores no statistic.
+    fn column<T: AnyBitPattern + NoUninit>(&self, statistic: Statistic) -> Result<Vec<T>> {
+        let index = self.columns.iter().position(|&column| column == statistic).unwrap_or(self.columns.len());
+        self.values(&self.columns[..index])
     }
 
-    /// A value for every Gaussian, from behind the columns `before` on.
+    /// Reads one value per Gaussian from the position behind the statistics `before`.
     fn values<T: AnyBitPattern + NoUninit>(&self, before: &[Statistic]) -> Result<Vec<T>> {
-        let start = before.iter().map(|of| of.bytes() as u64).sum::<u64>() * self.count as u64;
+        let start = before.iter().map(|statistic| statistic.bytes() as u64).sum::<u64>() * self.count as u64;
         let mut values = vec![T::zeroed(); self.count];
         self.file.read(start, bytemuck::cast_slice_mut(&mut values))?;
         Ok(values)
@@ -118,7 +122,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_set_aside_comes_back_bit_for_bit_from_a_file_without_a_name() {
+    fn spilled_rows_come_back_bit_for_bit_from_an_unnamed_file() {
         let folder = tempfile::tempdir().unwrap();
         for (count, peak) in [(0, false), (1, true), (1000, true), (1000, false)] {
             let column = |by: f64| (0..count).map(|i| (i as f64 - 7.3) * by).collect::<Vec<_>>();
@@ -135,10 +139,10 @@ mod tests {
             };
             let statistics = StatisticsRows::aside(rows.clone(), folder.path()).unwrap();
             assert_eq!(statistics.len(), count);
-            let StatisticsRows::Aside(aside) = &statistics else { panic!("it is aside") };
+            let StatisticsRows::Spilled(spilled) = &statistics else { panic!("the rows are not spilled") };
             let without = if peak { 0 } else { Statistic::W.bytes() };
             let bytes = ((Rows::BYTES_PER_GAUSSIAN - without) * count) as u64;
-            let ends_before = |byte: u64| aside.file.read(byte, &mut [0]).is_err();
+            let ends_before = |byte: u64| spilled.file.read(byte, &mut [0]).is_err();
             assert!(ends_before(bytes) && (bytes == 0 || !ends_before(bytes - 1)), "{bytes} bytes were declared");
             assert_eq!(format!("{:?}", statistics.rows().unwrap()), format!("{rows:?}"));
             assert_eq!(statistics.importance().unwrap(), [Cow::Borrowed(&rows.c[..]), Cow::Borrowed(&rows.vis[..])]);

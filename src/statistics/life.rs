@@ -1,28 +1,28 @@
-//! Life span and opacity variance: both follow from the time-dependent opacity alone.
+//! Life span and opacity variance V, which both follow from the time-dependent opacity alone.
 
 use std::mem::size_of;
 
-/// Running life span and opacity moments of a block.
+/// Running life spans and opacity moments of a block of Gaussians.
 ///
-/// V = s₂/n − (s₁/n)² with s₁, s₂ the sums of α − α₁ and (α − α₁)² over life, α₁ the opacity of the
-/// first life frame. The shift makes a constant opacity give exactly 0 and keeps full precision for
-/// a nearly constant one, where the unshifted moments cancel.
-pub(super) struct Life {
+/// V = s₂/n − (s₁/n)², where n is the number of frames in which the Gaussian is alive, s₁ and s₂ are the sums of α − α₁
+/// and (α − α₁)² over these frames, and α₁ is the opacity in the first of them. The shift by α₁ makes a constant
+/// opacity give exactly 0 and keeps full precision for a nearly constant one, where the unshifted moments cancel.
+pub(super) struct LifeSpans {
     first: Vec<f64>,
     sum: Vec<f64>,
     sum_of_squares: Vec<f64>,
     frames: Vec<u32>,
-    /// Living Gaussians in the last frame.
+    /// Number of Gaussians alive in the last frame.
     alive: u32,
-    /// Frames after the first that were like it and are not in `frames` yet.
+    /// Frames after the first with the opacities of the first that are not counted in `frames` yet.
     repeats: u32,
 }
 
-impl Life {
+impl LifeSpans {
     pub(super) const BYTES_PER_GAUSSIAN: usize = 3 * size_of::<f64>() + size_of::<u32>();
 
     pub(super) fn new(len: usize) -> Self {
-        Life {
+        LifeSpans {
             first: vec![0.0; len],
             sum: vec![0.0; len],
             sum_of_squares: vec![0.0; len],
@@ -32,10 +32,11 @@ impl Life {
         }
     }
 
-    /// Adds a frame of opacities in [0, 1]; says how many Gaussians are alive in it.
+    /// Adds a frame of opacities in [0, 1] and returns how many Gaussians are alive in it: those with an opacity of at
+    /// least `alpha_min`.
     #[inline(always)]
-    pub(super) fn frame(&mut self, opacity: &[f64], alpha_min: f64) -> u32 {
-        self.settle();
+    pub(super) fn add_frame(&mut self, opacity: &[f64], alpha_min: f64) -> u32 {
+        self.count_repeats();
         let n = opacity.len();
         let (first, sum, sum_of_squares) = (&mut self.first[..n], &mut self.sum[..n], &mut self.sum_of_squares[..n]);
         let frames = &mut self.frames[..n];
@@ -53,35 +54,36 @@ impl Life {
         all
     }
 
-    /// Adds a frame like the first, when all since were like it: every α − α₁ is 0. Says how many Gaussians are alive.
+    /// Adds a frame with the opacities of the first frame, and returns how many Gaussians are alive in it. All frames
+    /// since the first must have had its opacities, so every α − α₁ is 0.
     #[inline(always)]
-    pub(super) fn repeat(&mut self) -> u32 {
+    pub(super) fn repeat_frame(&mut self) -> u32 {
         self.repeats += 1;
         self.alive
     }
 
-    /// Counts the frames that were repeats; call before reading results.
+    /// Counts the repeated frames in `frames`; must be called before results are read.
     #[inline(always)]
-    pub(super) fn settle(&mut self) {
+    pub(super) fn count_repeats(&mut self) {
         if self.repeats > 0 {
-            // One frame is counted so far, for those that are alive.
+            // So far `frames` is 1 for the Gaussians that are alive and 0 for the others.
             self.frames.iter_mut().for_each(|frames| *frames *= 1 + self.repeats);
             self.repeats = 0;
         }
     }
 
-    /// Life frames of every Gaussian so far.
+    /// Returns the number of frames in which each Gaussian was alive so far.
     pub(super) fn frames(&self) -> &[u32] {
         &self.frames
     }
 
-    /// V of every Gaussian; 0 for one that never lived.
+    /// Returns V of every Gaussian; 0 for a Gaussian that was never alive.
     pub(super) fn variance(&self) -> Vec<f64> {
         (0..self.frames.len())
             .map(|i| {
                 let n = f64::from(self.frames[i].max(1));
                 let mean = self.sum[i] / n;
-                // Rounding can leave a hair below zero.
+                // Rounding can leave a value slightly below zero.
                 (self.sum_of_squares[i] / n - mean * mean).max(0.0)
             })
             .collect()
@@ -89,7 +91,7 @@ impl Life {
 
     #[cfg(test)]
     pub(super) fn resident_bytes(&self) -> usize {
-        let Life { first, sum, sum_of_squares, frames, alive: _, repeats: _ } = self;
+        let LifeSpans { first, sum, sum_of_squares, frames, alive: _, repeats: _ } = self;
         size_of_val(&first[..]) + size_of_val(&sum[..]) + size_of_val(&sum_of_squares[..]) + size_of_val(&frames[..])
     }
 }

@@ -1,12 +1,11 @@
-//! Statistics of every Gaussian in one pass over the frames (method.md, section 1).
+//! Statistics of every Gaussian, computed in one pass over the frames (method.md, section 1).
 //!
-//! In: the columns of a block of Gaussians, frame after frame, with the cameras of each frame.
-//! Out: one row per Gaussian. Memory: [`BYTES_PER_GAUSSIAN`] for every Gaussian of a block, whatever
-//! the number of frames. Source: "Temporally-Aware Pruning for Compact 4D Gaussian Splatting
-//! Models", section 3.2.
+//! Input: the attributes of a block of Gaussians, frame after frame, with the cameras of each frame. Output: one row of
+//! statistics per Gaussian. Memory: [`BYTES_PER_GAUSSIAN`] for every Gaussian of a block, independent of the number of
+//! frames. Source: "Temporally-Aware Pruning for Compact 4D Gaussian Splatting Models", section 3.2.
 //!
-//! Nothing here knows about files or threads, and a row depends on its own Gaussian only, so blocks
-//! may be cut anywhere and run in any order without changing a bit.
+//! The accumulators know nothing of files or threads (only [`pass`] does), and a row depends on its own Gaussian only.
+//! Blocks may therefore be cut anywhere and processed in any order without changing a bit of the result.
 
 mod anisotropy;
 pub(crate) mod aside;

@@ -1,14 +1,16 @@
-//! Trajectory magnitude D and curvature κ, streamed.
+//! Trajectory magnitude D and curvature κ, accumulated frame by frame.
 //!
-//! | | literal (the paper) | runs |
+//! [`recipe::MotionParams`] selects between two definitions:
+//!
+//! | | `Literal` (the paper) | `Runs` |
 //! |---|---|---|
-//! | a step into t counts | t in life, t not the first frame | t − 1 and t in life |
-//! | D | √(Σ‖x(t) − x(t−1)‖² / life) | √(mean ‖x(t) − x(t−1)‖²/h²) |
-//! | a turn about t counts | t in life, neither its first nor its last frame | t − 1, t and t + 1 in life |
-//! | κ | Σ‖x(t+1) − 2x(t) + x(t−1)‖ / (life − 2) | mean of the second divided difference |
+//! | the step into frame t counts | t alive, t not the first frame | t − 1 and t alive |
+//! | D | √(Σ‖x(t) − x(t−1)‖² / life span) | √(mean ‖x(t) − x(t−1)‖²/h²) |
+//! | the turn about frame t counts | t alive, neither the first nor the last frame alive | t − 1, t and t + 1 alive |
+//! | κ | Σ‖x(t+1) − 2x(t) + x(t−1)‖ / (life span − 2) | mean of the second divided difference |
 //!
-//! h is the step in units of the mean step. The previous two positions are kept as received (f32)
-//! and all arithmetic is f64: velocities rounded to f32 would lose 1e-4 of κ.
+//! h is the time step in units of the mean step. The previous two positions are stored as received (f32) and all
+//! arithmetic is f64: velocities rounded to f32 would lose 1e-4 of κ.
 
 use std::mem::size_of;
 
@@ -22,20 +24,23 @@ const ALIVE_BEFORE: u8 = 2;
 /// History bit: alive in some frame before the previous one.
 const BORN_BEFORE: u8 = 4;
 
-/// Running sums of a block.
+/// Running sums of D and κ over the frames, for a block of Gaussians.
 pub(super) struct MotionSums {
     kind: recipe::MotionParams,
     frames: u32,
-    /// Runs only: frames after the first with the lives of the first that are not in `steps`, `turns` and `history` yet.
+    /// `Runs` only: frames after the first with the opacities of the first, so that the same Gaussians are alive. They
+    /// are not counted in `steps`, `turns` and `history` yet.
     steady: u32,
-    /// x(t−1) and x(t−2), `[3, len]` each.
+    /// Positions x(t−1); `before` holds x(t−2). Shape `[3, len]` each.
     previous: Column,
     before: Column,
     sum_step2: Vec<f64>,
     sum_turn: Vec<f64>,
-    /// Literal only: the turn about a life frame that may yet prove to be the last one.
+    /// `Literal` only: norm of the turn about the last frame in which the Gaussian was alive. It counts only if the
+    /// Gaussian is alive in a later frame.
     pending: Vec<f64>,
-    /// Runs only: terms of the two sums; the literal divisors follow from the life span.
+    /// `Runs` only: number of terms of `sum_step2`; `turns` counts those of `sum_turn`. The divisors of `Literal`
+    /// follow from the life span.
     steps: Vec<u32>,
     turns: Vec<u32>,
     history: Vec<u8>,
@@ -61,27 +66,41 @@ impl MotionSums {
         }
     }
 
-    /// Adds a frame: positions `[3, len]`, opacities, and the durations, in mean steps, of the last
-    /// step and of the one before it. `steady` says that the opacities are those of every frame before.
+    /// Adds a frame of positions `[3, len]` and opacities. `steps` are the durations, in mean steps, of the last time
+    /// step and of the one before it. `steady` states that the opacities are those of every frame before.
     #[inline(always)]
-    pub(super) fn frame(&mut self, position: &Column, opacity: &[f64], alpha_min: f64, steps: [f64; 2], steady: bool) {
+    pub(super) fn add_frame(
+        &mut self,
+        position: &Column,
+        opacity: &[f64],
+        alpha_min: f64,
+        steps: [f64; 2],
+        steady: bool,
+    ) {
         let even = steps == [1.0; 2];
         match self.kind {
-            recipe::MotionParams::Runs if steady && even => self.frame_of_steady::<true>(position, steps),
-            recipe::MotionParams::Runs if steady => self.frame_of_steady::<false>(position, steps),
-            recipe::MotionParams::Runs if even => self.frame_of_runs::<true>(position, opacity, alpha_min, steps),
-            recipe::MotionParams::Runs => self.frame_of_runs::<false>(position, opacity, alpha_min, steps),
-            recipe::MotionParams::Literal => self.frame_of_literal(position, opacity, alpha_min),
+            recipe::MotionParams::Runs if steady && even => self.add_steady_frame::<true>(position, steps),
+            recipe::MotionParams::Runs if steady => self.add_steady_frame::<false>(position, steps),
+            recipe::MotionParams::Runs if even => self.add_frame_of_runs::<true>(position, opacity, alpha_min, steps),
+            recipe::MotionParams::Runs => self.add_frame_of_runs::<false>(position, opacity, alpha_min, steps),
+            recipe::MotionParams::Literal => self.add_frame_of_literal(position, opacity, alpha_min),
         }
         std::mem::swap(&mut self.previous, &mut self.before);
         self.previous.planes_mut().copy_from_slice(position.planes());
         self.frames += 1;
     }
 
-    /// `EVEN`: both steps last 1, and dividing by that would cost more than all the rest.
+    /// Adds a frame as `Runs` defines it. `EVEN` states that both steps last 1 mean step, so that the divisions are
+    /// skipped; they would cost more than the rest of the loop.
     #[inline(always)]
-    fn frame_of_runs<const EVEN: bool>(&mut self, position: &Column, opacity: &[f64], alpha_min: f64, steps: [f64; 2]) {
-        self.settle();
+    fn add_frame_of_runs<const EVEN: bool>(
+        &mut self,
+        position: &Column,
+        opacity: &[f64],
+        alpha_min: f64,
+        steps: [f64; 2],
+    ) {
+        self.count_steady_frames();
         let n = opacity.len();
         let [x, previous, before] = [position, &self.previous, &self.before].map(|column| planes(column, n));
         let (sum_step2, sum_turn) = (&mut self.sum_step2[..n], &mut self.sum_turn[..n]);
@@ -96,14 +115,14 @@ impl MotionSums {
             sum_turn[i] += if turned { turn } else { 0.0 };
             step_count[i] += u32::from(stepped);
             turn_count[i] += u32::from(turned);
-            history[i] = next(history[i], alive);
+            history[i] = next_history(history[i], alive);
         }
     }
 
-    /// [`MotionSums::frame_of_runs`] where nothing is born and nothing dies: what counts is known without looking, so
-    /// that half of the memory is touched (`cargo bench --bench scan`).
+    /// [`MotionSums::add_frame_of_runs`] for a frame in which no Gaussian appears or disappears. Which terms count is
+    /// then known without reading the history, so half of the memory is touched (`cargo bench --bench scan`).
     #[inline(always)]
-    fn frame_of_steady<const EVEN: bool>(&mut self, position: &Column, steps: [f64; 2]) {
+    fn add_steady_frame<const EVEN: bool>(&mut self, position: &Column, steps: [f64; 2]) {
         self.steady += 1;
         let n = self.history.len();
         let [x, previous, before] = [position, &self.previous, &self.before].map(|column| planes(column, n));
@@ -116,13 +135,14 @@ impl MotionSums {
         }
     }
 
-    /// Counts the steady frames, those of the dead for nothing; call before reading results.
+    /// Counts the steady frames in `steps`, `turns` and `history`, and clears the sums of Gaussians that are not alive;
+    /// must be called before results are read.
     #[inline(always)]
-    pub(super) fn settle(&mut self) {
+    pub(super) fn count_steady_frames(&mut self) {
         if self.steady == 0 {
             return;
         }
-        // They follow the first frame, which nothing precedes.
+        // Steady frames follow the first frame directly, so the first of them completes a step but no turn.
         for (i, history) in self.history.iter_mut().enumerate() {
             if *history & ALIVE == 0 {
                 (self.sum_step2[i], self.sum_turn[i]) = (0.0, 0.0);
@@ -136,7 +156,7 @@ impl MotionSums {
     }
 
     #[inline(always)]
-    fn frame_of_literal(&mut self, position: &Column, opacity: &[f64], alpha_min: f64) {
+    fn add_frame_of_literal(&mut self, position: &Column, opacity: &[f64], alpha_min: f64) {
         let n = opacity.len();
         let [x, previous, before] = [position, &self.previous, &self.before].map(|column| planes(column, n));
         let (sum_step2, sum_turn) = (&mut self.sum_step2[..n], &mut self.sum_turn[..n]);
@@ -145,24 +165,24 @@ impl MotionSums {
         for i in 0..n {
             let alive = opacity[i] >= alpha_min;
             let (step2, turn) = differences::<true>([row(x, i), row(previous, i), row(before, i)], [1.0; 2]);
-            // The previous frame is a center if it lives and is not the first that does.
+            // The previous frame is the center of a counting turn if it is alive and not the first frame alive.
             let center = (history[i] & ALIVE != 0) & (history[i] & BORN_BEFORE != 0);
             let waiting = if center { turn } else { pending[i] };
-            // Once life goes on, the center in waiting was not its last frame.
+            // The pending center was not the last frame alive if the Gaussian is alive now.
             sum_turn[i] += if alive { waiting } else { 0.0 };
             pending[i] = if alive { 0.0 } else { waiting };
             sum_step2[i] += if alive & !first { step2 } else { 0.0 };
-            history[i] = next(history[i], alive);
+            history[i] = next_history(history[i], alive);
         }
     }
 
-    /// D of every Gaussian, given its life frames; 0 where no step counts.
+    /// Returns D of every Gaussian from its life span in frames; 0 if no step counts.
     pub(super) fn magnitude(&self, life: &[u32]) -> Vec<f64> {
         let terms = |i: usize| if self.is_literal() { life[i] } else { self.steps[i] };
         (0..life.len()).map(|i| (self.sum_step2[i] / f64::from(terms(i).max(1))).sqrt()).collect()
     }
 
-    /// κ of every Gaussian, given its life frames; 0 where no turn counts.
+    /// Returns κ of every Gaussian from its life span in frames; 0 if no turn counts.
     pub(super) fn curvature(&self, life: &[u32]) -> Vec<f64> {
         let terms = |i: usize| if self.is_literal() { life[i].saturating_sub(2) } else { self.turns[i] };
         (0..life.len()).map(|i| self.sum_turn[i] / f64::from(terms(i).max(1))).collect()
@@ -194,20 +214,22 @@ impl MotionSums {
     }
 }
 
-/// Planes x, y, z of a column of `n` Gaussians; equal lengths known to the compiler spare the bounds checks.
+/// Returns the planes x, y, z of a column of `n` Gaussians. Slicing to `n` shows the compiler equal lengths, which
+/// removes the bounds checks.
 #[inline(always)]
 fn planes(column: &Column, n: usize) -> [&[f32]; 3] {
     std::array::from_fn(|axis| &column.plane(axis)[..n])
 }
 
-/// Spelled out, as `map` over an array stays a call in a function with other target features.
+/// Returns the position of Gaussian `i`. Written without `map`, which over an array stays a function call in functions
+/// with other target features.
 #[inline(always)]
 fn row([x, y, z]: [&[f32]; 3], i: usize) -> [f32; 3] {
     [x[i], y[i], z[i]]
 }
 
-/// ‖last step‖² and ‖turn about the previous frame‖ per mean step, from the positions now, in the previous frame
-/// and in the one before it; meaningless where the history is shorter.
+/// Returns ‖last step‖² and ‖turn about the previous frame‖ per mean step, from the positions in the current frame, the
+/// previous one and the one before it. The values are meaningless if fewer frames were added.
 #[inline(always)]
 fn differences<const EVEN: bool>([now, previous, before]: [[f32; 3]; 3], [step, step_before]: [f64; 2]) -> (f64, f64) {
     let (mut step2, mut turn2) = (0.0, 0.0);
@@ -229,9 +251,9 @@ fn differences<const EVEN: bool>([now, previous, before]: [[f32; 3]; 3], [step, 
     (step2, turn2.sqrt())
 }
 
-/// History once the current frame has become the previous one.
+/// Returns the history bits after the current frame has become the previous one.
 #[inline(always)]
-fn next(history: u8, alive: bool) -> u8 {
+fn next_history(history: u8, alive: bool) -> u8 {
     let now = if alive { ALIVE } else { 0 };
     let before = if history & ALIVE != 0 { ALIVE_BEFORE | BORN_BEFORE } else { 0 };
     now | before | (history & BORN_BEFORE)

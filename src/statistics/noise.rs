@@ -1,34 +1,34 @@
-//! Motion that is only the rounding of f32 positions.
+//! Removal of apparent motion that is only the rounding of f32 positions.
 //!
-//! A resting Gaussian whose positions are rounded to f32 shows D ≈ 0.71 ulp and κ ≈ 1.2 ulp of its
-//! coordinates. The coordinates of a whole scene share one offset, so one ulp, that of the largest
-//! of them, is the yardstick of all.
+//! A resting Gaussian whose positions are rounded to f32 has D ≈ 0.71 ulp and κ ≈ 1.2 ulp of its coordinates. All
+//! coordinates of a scene share one offset, so one ulp, that of the largest coordinate, is the unit for every Gaussian.
 
 use crate::model::{Flags, Rows};
 
-/// D below this many ulp is noise.
+/// Bound below which D counts as noise, in ulp of the largest coordinate.
 const D_NOISE_ULP: f64 = 2.0;
-/// κ below this many ulp is noise.
+/// Bound below which κ counts as noise, in ulp of the largest coordinate.
 const KAPPA_NOISE_ULP: f64 = 4.0;
 
-/// How many values were set to 0.
+/// Numbers of values that were set to 0.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Snapped {
-    /// Gaussians whose D was.
+    /// Number of Gaussians whose D was set to 0.
     pub d: usize,
-    /// Gaussians whose κ was.
+    /// Number of Gaussians whose κ was set to 0.
     pub kappa: usize,
 }
 
-/// Distance from `x` (finite, not negative) to the next f32 above, in f64 so that it exists for
+/// Returns the distance from `x` (finite, not negative) to the next larger f32, as f64 so that it exists for
 /// [`f32::MAX`] too.
 pub fn ulp(x: f32) -> f64 {
     let exponent = (x.to_bits() >> 23 & 0xff) as i32;
     2f64.powi(exponent.max(1) - 127 - 23)
 }
 
-/// Sets D below 2 ulp and κ below 4 ulp of `largest_coordinate` (over the whole scene, at least 0) to
-/// exactly 0, flags the rows and counts them. What is 0 already is neither flagged nor counted.
+/// Sets D below 2 ulp and κ below 4 ulp of `largest_coordinate` to exactly 0, flags these rows and counts them.
+/// `largest_coordinate` is the largest |coordinate| of the whole scene, at least 0. Values that are 0 already are
+/// neither flagged nor counted.
 pub fn snap(rows: &mut Rows, largest_coordinate: f32) -> Snapped {
     let ulp = ulp(largest_coordinate);
     Snapped {
@@ -62,7 +62,7 @@ mod tests {
     }
 
     #[test]
-    fn only_what_lies_between_zero_and_the_floor_is_snapped_and_counted() {
+    fn only_values_between_zero_and_the_floor_are_snapped() {
         let floor = 2.0 * ulp(1e6);
         let mut rows = Rows {
             d: vec![0.0, floor * 0.99, floor],

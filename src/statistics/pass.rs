@@ -1,4 +1,4 @@
-//! The scan: every Gaussian at every frame once, blocks of Gaussians on all threads.
+//! The scan: one pass over every Gaussian at every frame, with blocks of Gaussians on all threads.
 
 pub(crate) mod blocks;
 pub(crate) mod staged;
@@ -17,36 +17,36 @@ use crate::source::{FrameSource, Ids};
 use crate::statistics::pass::blocks::BlockScans;
 use crate::statistics::{BlockScan, NEEDED, ScanPlan, wanted};
 
-/// What a scan gives.
+/// Result of a scan.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 pub struct Scanned {
-    /// One row per Gaussian; D and κ before noise is snapped, E not filled.
+    /// One row per Gaussian. D and κ still include rounding noise, and E is not filled.
     pub rows: Rows,
-    /// Living Gaussians in each frame.
+    /// Number of Gaussians alive in each frame.
     pub alive_per_frame: Vec<u32>,
     /// Largest |coordinate| of any position in any frame.
     pub largest_coordinate: f32,
 }
 
-/// Scans `source` as seen by the cameras of `schedule`: blocks side by side, or, where the bytes are waited for
-/// ([`FrameSource::ahead`]), in stages.
+/// Scans `source` as seen by the cameras of `schedule`. Blocks of Gaussians run in parallel, or in pipeline stages if
+/// the source is slow to read ([`FrameSource::ahead`]).
 ///
-/// Memory: a row per Gaussian, twice while blocks are joined, 4 bytes per frame, and per thread one block of Gaussians
-/// with its accumulators ([`crate::statistics::BYTES_PER_GAUSSIAN`] each), its state at one frame, and its reader; in stages
-/// two readers.
+/// Memory: a row per Gaussian, twice while blocks are joined, and 4 bytes per frame. Per thread: one block of Gaussians
+/// with its accumulators ([`crate::statistics::BYTES_PER_GAUSSIAN`] each), its state at one frame, and its reader; two
+/// readers in stages.
+///
+/// # Errors
+/// Frames that cannot be read.
 pub fn scan(source: &dyn FrameSource, schedule: &Schedule, plan: &ScanPlan) -> Result<Scanned> {
     scan_blocks(source, schedule, plan, 0..scan_units(source.info()), &Events::IGNORED)
 }
 
-/// How many blocks of Gaussians [`scan`] goes through.
+/// Returns the number of blocks of Gaussians that [`scan`] processes.
 pub fn scan_units(info: &SequenceInfo) -> usize {
     info.count.div_ceil(BLOCK)
 }
 
-/// [`scan`] of consecutive blocks of Gaussians alone; [`Scanned::join`] makes one of several.
-///
-/// # Errors
-/// Frames that cannot be read.
+/// Scans some consecutive blocks of Gaussians only. [`Scanned::join`] combines several such results.
 pub fn scan_blocks(
     source: &dyn FrameSource,
     schedule: &Schedule,
@@ -67,7 +67,7 @@ pub fn scan_blocks(
 }
 
 impl Scanned {
-    /// Adds what was found of the Gaussians behind these, in the same frames.
+    /// Appends the result of the Gaussians that follow these, for the same frames.
     pub fn join(&mut self, mut other: Scanned) {
         self.rows.append(&mut other.rows);
         self.alive_per_frame.iter_mut().zip(other.alive_per_frame).for_each(|(sum, alive)| *sum += alive);
@@ -75,7 +75,7 @@ impl Scanned {
     }
 }
 
-/// The blocks of a sequence, in order, as one.
+/// Joins the rows and largest coordinates of consecutive blocks into one result.
 fn joined(blocks: impl IntoIterator<Item = (Rows, f32)>, alive_per_frame: Vec<u32>) -> Scanned {
     let mut rows = Rows::default();
     let mut largest_coordinate = 0.0f32;
@@ -86,23 +86,26 @@ fn joined(blocks: impl IntoIterator<Item = (Rows, f32)>, alive_per_frame: Vec<u3
     Scanned { rows, alive_per_frame, largest_coordinate }
 }
 
-/// A scan of frames as they arrive: [`scan`] with the frames cut into parts that are seen once each.
+/// Scan of frames that arrive over time: [`scan`] with the frames cut into groups that are read once each.
 ///
 /// Memory: the accumulators of all Gaussians ([`crate::statistics::BYTES_PER_GAUSSIAN`] each), 4 bytes per frame, and
-/// per thread one block's state at one frame.
+/// one block's state at one frame per thread.
 pub struct RunningScan<'a> {
     blocks: Vec<BlockScan<'a>>,
     alive_per_frame: Vec<u32>,
 }
 
 impl<'a> RunningScan<'a> {
-    /// No frames yet of `count` Gaussians.
+    /// Creates a scan of `count` Gaussians without frames.
     pub fn new(count: usize, plan: &'a ScanPlan) -> Self {
         let block = |start: usize| BlockScan::new(BLOCK.min(count - start), start, plan);
         RunningScan { blocks: (0..count).step_by(BLOCK).map(block).collect(), alive_per_frame: Vec::new() }
     }
 
-    /// Adds the next frames: all those of `source`, each with the cameras that see it.
+    /// Adds the next frames: all frames of `source`, each with the cameras that see it.
+    ///
+    /// # Errors
+    /// Frames that cannot be read.
     pub fn add(&mut self, source: &dyn FrameSource, cameras: &[Vec<&Camera>]) -> Result<()> {
         let info = source.info();
         let first = self.alive_per_frame.len();
@@ -116,7 +119,8 @@ impl<'a> RunningScan<'a> {
                 let mut reader = source.open(Ids::Range(range))?;
                 for (t, cameras) in cameras.iter().enumerate() {
                     let changed = wanted(first + t, info.varying);
-                    // The state is new, though the accumulators know what does not vary.
+                    // The state buffer is new, so the first read fills attributes that do not vary too; the
+                    // accumulators know them already.
                     let want = if t == 0 { changed | NEEDED } else { changed };
                     reader.read(t, want, &mut state)?;
                     scan.frame(first + t, &state, cameras, changed);
@@ -133,10 +137,10 @@ impl<'a> RunningScan<'a> {
         Ok(())
     }
 
-    /// The rows, by the plan that knows all frames.
+    /// Returns the rows, computed with the plan for the complete sequence.
     ///
     /// # Panics
-    /// If `plan` is not of the frames that were added ([`ScanPlan::finishes`]).
+    /// If `plan` does not belong to the frames that were added ([`ScanPlan::finishes`]).
     pub fn finish(self, plan: &ScanPlan) -> Scanned {
         let blocks = self.blocks.into_iter().map(|block| {
             let found = block.finish_by(plan);
@@ -156,26 +160,26 @@ mod tests {
     use crate::recipe::Recipe;
     use crate::source::BlockReader;
 
-    /// A scene of which only positions vary, and what was asked of it.
-    struct Asked {
+    /// Scene whose positions alone vary, which records the reads of its readers.
+    struct RecordingScene {
         scene: Scene,
         info: SequenceInfo,
-        /// Frames and columns.
+        /// Frame and columns of each read.
         reads: Mutex<Vec<(usize, Columns)>>,
     }
 
-    struct AskedReader<'a>(&'a Asked, Box<dyn BlockReader + 'a>);
+    struct RecordingReader<'a>(&'a RecordingScene, Box<dyn BlockReader + 'a>);
 
-    impl FrameSource for Asked {
+    impl FrameSource for RecordingScene {
         fn info(&self) -> &SequenceInfo {
             &self.info
         }
         fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>> {
-            Ok(Box::new(AskedReader(self, self.scene.open(ids)?)))
+            Ok(Box::new(RecordingReader(self, self.scene.open(ids)?)))
         }
     }
 
-    impl BlockReader for AskedReader<'_> {
+    impl BlockReader for RecordingReader<'_> {
         fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
             self.0.reads.lock().unwrap().push((frame, want));
             self.1.read(frame, want & Columns::POSITION, out)?;
@@ -184,18 +188,19 @@ mod tests {
     }
 
     #[test]
-    fn what_does_not_vary_is_read_once_and_reading_it_again_changes_no_bit() {
+    fn constant_columns_are_read_once_without_changing_a_bit() {
         let scene = Scene::new(1500, 5);
         let info = scene.info().clone();
         let schedule = scene.rig().schedule(&info.times, Some(Split::Train)).unwrap();
-        let mut asked = Asked { scene, info, reads: Mutex::default() };
-        let mut by = |varying: Columns| {
-            asked.info.varying = varying;
-            let plan = ScanPlan::new(&Recipe::preset("default").unwrap().scan, &asked.info.times, &schedule).unwrap();
-            let found = scan(&asked, &schedule, &plan).unwrap();
-            (format!("{:?}", found.rows), found.alive_per_frame, std::mem::take(&mut *asked.reads.lock().unwrap()))
+        let mut recording = RecordingScene { scene, info, reads: Mutex::default() };
+        let mut scan_with = |varying: Columns| {
+            recording.info.varying = varying;
+            let plan =
+                ScanPlan::new(&Recipe::preset("default").unwrap().scan, &recording.info.times, &schedule).unwrap();
+            let found = scan(&recording, &schedule, &plan).unwrap();
+            (format!("{:?}", found.rows), found.alive_per_frame, std::mem::take(&mut *recording.reads.lock().unwrap()))
         };
-        let (skipping, everything) = (by(Columns::POSITION), by(Columns::all()));
+        let (skipping, everything) = (scan_with(Columns::POSITION), scan_with(Columns::all()));
         assert_eq!((&skipping.0, &skipping.1), (&everything.0, &everything.1));
         for (frame, want) in &skipping.2 {
             assert_eq!(*want, if *frame == 0 { Columns::all() } else { Columns::POSITION }, "frame {frame}");

@@ -1,89 +1,92 @@
-//! Projected coverage: how many pixels a Gaussian covers in a picture, times its opacity.
+//! Projected coverage: the number of pixels that a Gaussian covers in one view, times its opacity.
 //!
-//! Elliptical weighted averaging with the conventions of the original rasteriser: culled at depth
-//! z ≤ 0.2 (the camera's near plane), Jacobian at x/z and y/z clamped to ±1.3·tan(fov/2), 0.3 px² added to the diagonal of the
-//! 2-D covariance Σ = MMᵀ + 0.3·I, where M = J·W·R·S is 2×3 (EWA splatting, Zwicker et al. 2001).
+//! Elliptical weighted averaging with the conventions of the original rasterizer: Gaussians at depth z ≤ 0.2 (the
+//! camera's near plane) are culled, the Jacobian is evaluated at x/z and y/z clamped to ±1.3·tan(fov/2), and 0.3 px² is
+//! added to the diagonal of the 2-D covariance Σ = MMᵀ + 0.3·I, where M = J·W·R·S is 2×3 (EWA splatting, Zwicker et al.
+//! 2001).
 //!
-//! A = 9π·√det Σ × (share of the box u ± 3√Σ_xx, v ± 3√Σ_yy that lies inside the picture), the area
-//! of the 3σ ellipse. As √det Σ ≤ √(Σ_xx Σ_yy), A is at most π/4 of the picture without a cap.
+//! A = 9π·√det Σ × (fraction of the box u ± 3√Σ_xx, v ± 3√Σ_yy that lies inside the image), where 9π·√det Σ is the area
+//! of the 3σ ellipse. As √det Σ ≤ √(Σ_xx Σ_yy), A is at most π/4 of the image without a cap.
 //!
-//! det Σ is never formed as Σ_xx Σ_yy − Σ_xy², which has no correct digit left for a long needle:
-//! det(MMᵀ + d·I) = Σ(2×2 minors of M)² + d·tr(MMᵀ) + d² has positive terms only (Cauchy–Binet).
+//! det Σ is never computed as Σ_xx Σ_yy − Σ_xy², which has no correct digit left for a long needle. The sum det(MMᵀ +
+//! d·I) = Σ(2×2 minors of M)² + d·tr(MMᵀ) + d² has positive terms only (Cauchy–Binet).
 //!
-//! The inner loop runs over planes without branches, so that it vectorizes; no fused multiply-add is
-//! used, so every instruction set gives the same bits.
+//! The inner loop runs over planes without branches, so that it vectorizes. It uses no fused multiply-add, so every
+//! instruction set gives the same bits.
 
 use std::f64::consts::FRAC_PI_4;
 
 use crate::model::Camera;
 
-/// Share of the half field of view to which the Jacobian's argument is clamped.
+/// Multiple of the tangent of half the field of view to which x/z and y/z are clamped in the Jacobian.
 const JACOBIAN_CLAMP: f64 = 1.3;
-/// Added to the diagonal of the 2-D covariance, px².
+/// Value added to the diagonal of the 2-D covariance, px².
 const DILATION_PX2: f64 = 0.3;
-/// Footprints reach this many standard deviations.
+/// Half size of a footprint's bounding box, in standard deviations.
 const REACH: f64 = 3.0;
-/// Gaussians taken through one stage of the projection before the next. A single loop over all stages is
-/// a chain of some 150 cycles per iteration, too long for a processor to work on two at a time.
-const LANES: usize = 32;
-/// 2⁵²: adding it to x in [0, 2⁵²) leaves x, rounded, in the low bits of the sum.
+/// Number of Gaussians processed by one stage of the projection before the next stage. A single loop over all stages is
+/// a dependency chain of about 150 cycles per iteration, too long for a processor to overlap two iterations.
+const BLOCK_LANES: usize = 32;
+/// Constant 2⁵². Adding it to x in [0, 2⁵²) leaves x, rounded to an integer, in the low bits of the sum.
 const ROUNDER: f64 = 4_503_599_627_370_496.0;
 
-/// Planes over a block of Gaussians at one frame; all of one length.
+/// Attribute planes of a block of Gaussians at one frame, all of equal length.
 #[derive(Debug, Clone, Copy)]
 pub struct FootprintPlanes<'a> {
-    /// World positions, planes x, y, z.
+    /// World positions: planes x, y, z.
     pub position: [&'a [f32]; 3],
-    /// R·S: column k is the k-th axis of the Gaussian times its scale; plane 3·row + k.
+    /// Matrix R·S. Column k is the k-th axis of the Gaussian times its scale; the entry in `row` and column k is plane
+    /// 3·row + k.
     pub axes: [&'a [f64]; 9],
     /// Opacity in [0, 1].
     pub opacity: &'a [f64],
 }
 
-/// Sums over the pairs (frame, view) so far; of the same length as the [`FootprintPlanes`].
+/// Sums over the (frame, view) pairs so far, with the length of the [`FootprintPlanes`].
 #[derive(Debug)]
 pub struct CoverageSums<'a> {
     /// Σ A·opacity in units of 2^−exponent px.
     pub coverage: &'a mut [u64],
-    /// Pairs in which the Gaussian is alive and its box touches the picture.
+    /// Number of pairs in which the Gaussian is alive and its box overlaps the image.
     pub touched: &'a mut [u32],
 }
 
-/// What a contribution is measured by.
+/// Fixed-point scale of contributions, and the opacity threshold.
 #[derive(Debug, Clone, Copy)]
 pub struct CoverageScale {
-    /// Contributions are rounded to multiples of 2^−exponent px; picture area · 2^exponent < 2⁵².
+    /// Exponent of the fixed-point scale. Contributions are rounded to multiples of 2^−exponent px; image area ·
+    /// 2^exponent < 2⁵².
     pub exponent: i32,
-    /// Least opacity of a living Gaussian.
+    /// Minimum opacity of a Gaussian that counts as alive.
     pub alpha_min: f64,
 }
 
-/// Adds the picture of `camera` to the sums.
+/// Adds the view of `camera` to the sums.
 ///
-/// Values that are not finite give some count, but no panic. Finite ones of any size give the
-/// contribution above to about 1e-14 relative and half a unit of fixed point.
+/// Values that are not finite give an arbitrary count, but no panic. Finite values of any size give the contribution
+/// above with a relative error of about 1e-14 plus half a fixed-point unit.
 ///
 /// # Panics
 /// If the planes differ in length.
-pub fn project(camera: &Camera, from: &FootprintPlanes<'_>, scale: CoverageScale, sums: &mut CoverageSums<'_>) {
+pub fn project(camera: &Camera, planes: &FootprintPlanes<'_>, scale: CoverageScale, sums: &mut CoverageSums<'_>) {
     let view = ScanView::new(camera);
     #[cfg(target_arch = "x86_64")]
     if std::arch::is_x86_feature_detected!("avx2") {
         // SAFETY: the line above saw that this processor has AVX2.
-        unsafe { project_avx2(&view, from, scale, sums) };
+        unsafe { project_avx2(&view, planes, scale, sums) };
         return;
     }
-    project_planes(&view, from, scale, sums);
+    project_planes(&view, planes, scale, sums);
 }
 
 /// [`project_planes`] compiled for AVX2: the same operations, four lanes at a time.
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2")]
-fn project_avx2(view: &ScanView, from: &FootprintPlanes<'_>, scale: CoverageScale, sums: &mut CoverageSums<'_>) {
-    project_planes(view, from, scale, sums);
+fn project_avx2(view: &ScanView, planes: &FootprintPlanes<'_>, scale: CoverageScale, sums: &mut CoverageSums<'_>) {
+    project_planes(view, planes, scale, sums);
 }
 
-/// A camera as the loop wants it.
+/// Camera parameters in the form that the inner loop uses.
 struct ScanView {
     rotation: [[f64; 3]; 3],
     translation: [f64; 3],
@@ -110,22 +113,22 @@ impl ScanView {
     }
 }
 
-/// The definition, in stages over [`LANES`] Gaussians; inlined into each instruction set's copy.
+/// Adds one view to the sums, in stages over [`BLOCK_LANES`] Gaussians. Inlined into the copy for each instruction set.
 #[inline(always)]
-fn project_planes(view: &ScanView, from: &FootprintPlanes<'_>, scale: CoverageScale, sums: &mut CoverageSums<'_>) {
-    let n = from.opacity.len();
-    let blocks = n / LANES;
-    let mut stage = ProjectedBlock::<LANES>::new();
+fn project_planes(view: &ScanView, planes: &FootprintPlanes<'_>, scale: CoverageScale, sums: &mut CoverageSums<'_>) {
+    let n = planes.opacity.len();
+    let blocks = n / BLOCK_LANES;
+    let mut stage = ProjectedBlock::<BLOCK_LANES>::new();
     for block in 0..blocks {
-        stage.project(view, from, scale, sums, block);
+        stage.project(view, planes, scale, sums, block);
     }
     let mut stage = ProjectedBlock::<1>::new();
-    for i in blocks * LANES..n {
-        stage.project(view, from, scale, sums, i);
+    for i in blocks * BLOCK_LANES..n {
+        stage.project(view, planes, scale, sums, i);
     }
 }
 
-/// What the stages hand on about `N` Gaussians.
+/// Intermediate values of `N` Gaussians that one stage passes to the next.
 struct ProjectedBlock<const N: usize> {
     depth: [f64; N],
     /// 1/depth; 1 for a culled Gaussian.
@@ -144,30 +147,30 @@ impl<const N: usize> ProjectedBlock<N> {
         ProjectedBlock { depth: zeros, inverse_depth: zeros, slope: [zeros; 2], sigma: [zeros; 2], root_det: zeros }
     }
 
-    /// Projects the `block`-th `N` Gaussians.
+    /// Projects the `N` Gaussians of number `block` and adds them to the sums.
     #[inline(always)]
     fn project(
         &mut self,
         view: &ScanView,
-        from: &FootprintPlanes<'_>,
+        planes: &FootprintPlanes<'_>,
         scale: CoverageScale,
         sums: &mut CoverageSums<'_>,
         block: usize,
     ) {
-        self.place(view, from.position.map(|plane| &plane.as_chunks().0[block]));
-        self.spread(view, from.axes.map(|plane| &plane.as_chunks().0[block]));
+        self.project_centers(view, planes.position.map(|plane| &plane.as_chunks().0[block]));
+        self.project_covariances(view, planes.axes.map(|plane| &plane.as_chunks().0[block]));
         self.accumulate(
             view,
-            &from.opacity.as_chunks().0[block],
+            &planes.opacity.as_chunks().0[block],
             scale,
             &mut sums.coverage.as_chunks_mut().0[block],
             &mut sums.touched.as_chunks_mut().0[block],
         );
     }
 
-    /// Where the centers lie in the camera.
+    /// Projects the centers: depth and slopes x/z, y/z in camera space.
     #[inline(always)]
-    fn place(&mut self, view: &ScanView, [px, py, pz]: [&[f32; N]; 3]) {
+    fn project_centers(&mut self, view: &ScanView, [px, py, pz]: [&[f32; N]; 3]) {
         let ScanView { rotation: [w0, w1, w2], translation: t, near, .. } = view;
         for i in 0..N {
             let world = [f64::from(px[i]), f64::from(py[i]), f64::from(pz[i])];
@@ -180,10 +183,10 @@ impl<const N: usize> ProjectedBlock<N> {
         }
     }
 
-    /// The 2-D covariance.
+    /// Computes the 2-D covariance of each Gaussian.
     #[inline(always)]
     #[expect(clippy::needless_range_loop, reason = "i runs over many planes at once")]
-    fn spread(&mut self, view: &ScanView, axes: [&[f64; N]; 9]) {
+    fn project_covariances(&mut self, view: &ScanView, axes: [&[f64; N]; 9]) {
         let ScanView { rotation: [w0, w1, w2], focal, slope_limit, .. } = view;
         for i in 0..N {
             let row = |k: usize, w: &[f64; 3]| {
@@ -204,7 +207,7 @@ impl<const N: usize> ProjectedBlock<N> {
         }
     }
 
-    /// What the picture shows of them.
+    /// Adds the area inside the image times the opacity to the sums.
     #[inline(always)]
     fn accumulate(
         &self,
@@ -232,17 +235,17 @@ impl<const N: usize> ProjectedBlock<N> {
     }
 }
 
-/// Row of J·W: the gradient of a pixel coordinate, f/z·(w − slope·w₂).
+/// Returns a row of J·W, the gradient of a pixel coordinate: f/z·(w − slope·w₂).
 #[inline(always)]
 fn jacobian_row(focal_over_depth: f64, slope: f64, w: &[f64; 3], w2: &[f64; 3]) -> [f64; 3] {
     std::array::from_fn(|k| focal_over_depth * (w[k] - slope * w2[k]))
 }
 
-/// Length of [center − reach, center + reach] inside [0, size]; not positive when outside.
+/// Returns the length of [center − reach, center + reach] inside [0, size]; not positive if the interval lies outside.
 #[inline(always)]
 fn overlap(center: f64, reach: f64, size: f64) -> f64 {
     let (low, high) = (center - reach, center + reach);
-    // Plain comparisons become single instructions; f64::min must also sort out NaN.
+    // Plain comparisons compile to single instructions; f64::min must also handle NaN.
     (if high < size { high } else { size }) - (if low > 0.0 { low } else { 0.0 })
 }
 
@@ -275,8 +278,8 @@ mod tests {
         (hash_id(k as u64) >> 11) as f64 / 2f64.powi(53)
     }
 
-    /// Runs `with` on Gaussians around a camera, some behind it, some giant.
-    fn run(
+    /// Runs `with` on Gaussians around a camera, including some behind it and some very large ones.
+    fn run_on_random_gaussians(
         with: impl Fn(&ScanView, &FootprintPlanes<'_>, CoverageScale, &mut CoverageSums<'_>),
     ) -> (Vec<u64>, Vec<u32>) {
         let camera = Camera {
@@ -316,8 +319,9 @@ mod tests {
     fn avx2_gives_the_bits_of_the_baseline() {
         assert!(std::arch::is_x86_feature_detected!("avx2"), "this processor has no AVX2");
         // SAFETY: the line above saw that this processor has AVX2.
-        let wide = run(|view, from, scale, sums| unsafe { project_avx2(view, from, scale, sums) });
-        let baseline = run(project_planes);
+        let wide =
+            run_on_random_gaussians(|view, planes, scale, sums| unsafe { project_avx2(view, planes, scale, sums) });
+        let baseline = run_on_random_gaussians(project_planes);
         assert!(baseline.1.iter().filter(|&&touched| touched > 0).count() > 200, "the case must see something");
         assert_eq!(wide, baseline);
     }

@@ -1,28 +1,30 @@
-//! One block of Gaussians through all frames: accumulators in, rows of statistics out.
+//! Scan of one block of Gaussians through all frames: accumulators of every statistic, and the rows that follow from
+//! them.
 
 use std::mem::size_of;
 
-use super::life::Life;
+use super::life::LifeSpans;
 use super::motion::MotionSums;
 use super::plan::{PAIRS_PER_CARRY, ScanPlan};
 use super::projection::{CoverageScale, CoverageSums, FootprintPlanes, project};
 use super::state::{BlockState, CHUNK};
 use crate::model::{Camera, Columns, Flags, Gaussians, Rows};
 
-/// Resident bytes of a [`BlockScan`] per Gaussian, whatever the number of frames.
+/// Resident bytes of a [`BlockScan`] per Gaussian, independent of the number of frames.
 pub const BYTES_PER_GAUSSIAN: usize = BlockState::BYTES_PER_GAUSSIAN
-    + Life::BYTES_PER_GAUSSIAN
+    + LifeSpans::BYTES_PER_GAUSSIAN
     + MotionSums::BYTES_PER_GAUSSIAN
     + size_of::<u64>()
     + 2 * size_of::<u32>();
 
-/// Opacities below this, 2⁻⁵³, add nothing to a coverage sum, as a picture has fewer than 2⁵² units.
-const NOTHING: f64 = 0.5 * f64::EPSILON;
+/// Opacity, 2⁻⁵³, below which a Gaussian adds nothing to a coverage sum: a view has fewer than 2⁵² fixed-point units.
+const NEGLIGIBLE_OPACITY: f64 = 0.5 * f64::EPSILON;
 
-/// Bits of a coverage sum that stay when it is carried: 2³² pairs of at most 2⁵¹ leave 2³¹ above them.
+/// Number of low bits of a coverage sum that remain when the rest is carried. 2³² pairs of at most 2⁵¹ leave 31 bits
+/// above them.
 const CARRY_BITS: u32 = 52;
 
-/// Columns a scan needs whatever the model; SH may be left out.
+/// Columns that a scan needs for every model; SH may be omitted.
 pub const NEEDED: Columns = Columns::all().difference(Columns::SH);
 
 /// Returns the columns to read at `frame`: all of them at the first frame, the `varying` ones after it.
@@ -30,26 +32,26 @@ pub(super) fn wanted(frame: usize, varying: Columns) -> Columns {
     if frame == 0 { Columns::all() } else { varying }
 }
 
-/// The running statistics of consecutive Gaussians.
+/// Running statistics of a block of consecutive Gaussians.
 pub struct BlockScan<'a> {
     plan: &'a ScanPlan,
     first_id: usize,
     next_frame: usize,
-    /// Whether opacities are those of the first frame.
+    /// Whether the opacities of all frames so far equal those of the first frame.
     steady: bool,
     state: BlockState,
-    life: Life,
+    life: LifeSpans,
     motion: MotionSums,
-    /// Σ A·opacity in fixed point is `carried · 2^CARRY_BITS + coverage`.
+    /// Low part of Σ A·opacity in fixed point; the sum is `carried · 2^CARRY_BITS + coverage`.
     coverage: Vec<u64>,
     carried: Vec<u32>,
-    /// Pairs added to `coverage` since it was last carried.
+    /// Number of pairs added to `coverage` since it was last carried.
     uncarried: usize,
     touched: Vec<u32>,
     alive_per_frame: Vec<u32>,
 }
 
-/// What a block gave.
+/// Statistics of a block after its last frame.
 #[derive(Debug, Clone, PartialEq)]
 pub struct BlockStatistics {
     /// Id of the block's first Gaussian.
@@ -57,15 +59,15 @@ pub struct BlockStatistics {
     /// One row per Gaussian. `e` is 0 until [`super::fill_anisotropy`]; D and κ include rounding noise until
     /// [`super::snap`]. A Gaussian with [`Flags::NON_FINITE`] has zeros throughout.
     pub rows: Rows,
-    /// Living Gaussians of the block in each of the T frames that [`BlockScan::take_alive`] has not given; those
-    /// with NaN somewhere included.
+    /// Number of the block's Gaussians alive in each frame that [`BlockScan::take_alive`] has not returned yet;
+    /// Gaussians with NaN values are included.
     pub alive_per_frame: Vec<u32>,
     /// Largest finite |coordinate| of a position in the block, scene units.
     pub largest_coordinate: f32,
 }
 
 impl<'a> BlockScan<'a> {
-    /// An empty scan of the Gaussians `first_id .. first_id + len`.
+    /// Creates an empty scan of the Gaussians `first_id .. first_id + len`.
     pub fn new(len: usize, first_id: usize, plan: &'a ScanPlan) -> Self {
         BlockScan {
             plan,
@@ -73,7 +75,7 @@ impl<'a> BlockScan<'a> {
             next_frame: 0,
             steady: true,
             state: BlockState::new(len),
-            life: Life::new(len),
+            life: LifeSpans::new(len),
             motion: MotionSums::new(len, plan.motion),
             coverage: vec![0; len],
             carried: vec![0; len],
@@ -83,12 +85,12 @@ impl<'a> BlockScan<'a> {
         }
     }
 
-    /// Adds frame `t` with the cameras that see it. `changed` names the columns that may differ from
-    /// the previous frame; in frame 0 all but SH count as changed. SH is only searched for NaN, and
-    /// only where `changed` names it.
+    /// Adds frame `t` with the cameras that see it. `changed` names the columns that may differ from the previous
+    /// frame; in frame 0 all columns but SH count as changed. SH is only checked for non-finite values, and only if
+    /// `changed` contains it.
     ///
     /// # Panics
-    /// If frames do not come in order, or a column is not as long as the block.
+    /// If frames are not added in order, or a column does not have the length of the block.
     pub fn frame(&mut self, t: usize, gaussians: &Gaussians, cameras: &[&Camera], changed: Columns) {
         assert_eq!(t, self.next_frame, "frames are scanned in order");
         self.next_frame += 1;
@@ -103,7 +105,7 @@ impl<'a> BlockScan<'a> {
         }
     }
 
-    /// Makes room in `coverage` for as many pairs again.
+    /// Moves the high bits of `coverage` to `carried`, so that [`PAIRS_PER_CARRY`] more pairs fit.
     fn carry(&mut self) {
         for (coverage, carried) in self.coverage.iter_mut().zip(&mut self.carried) {
             *carried += (*coverage >> CARRY_BITS) as u32;
@@ -112,7 +114,8 @@ impl<'a> BlockScan<'a> {
         self.uncarried = 0;
     }
 
-    /// Living Gaussians of the block in each frame since this was last asked.
+    /// Returns the number of the block's Gaussians alive in each frame added since the last call, and removes these
+    /// numbers.
     pub fn take_alive(&mut self) -> Vec<u32> {
         std::mem::take(&mut self.alive_per_frame)
     }
@@ -124,29 +127,31 @@ impl<'a> BlockScan<'a> {
             unsafe { self.advance_avx2(t, gaussians, changed) };
             return;
         }
-        self.advance_plainly(t, gaussians, changed);
+        self.advance_portable(t, gaussians, changed);
     }
 
-    /// [`BlockScan::advance_plainly`] compiled for AVX2: the same operations, several lanes at a time.
+    /// [`BlockScan::advance_portable`] compiled for AVX2: the same operations, several lanes at a time.
     #[cfg(target_arch = "x86_64")]
     #[target_feature(enable = "avx2")]
     fn advance_avx2(&mut self, t: usize, gaussians: &Gaussians, changed: Columns) {
-        self.advance_plainly(t, gaussians, changed);
+        self.advance_portable(t, gaussians, changed);
     }
 
-    /// State, life and motion; inlined, with the loops it calls, into each instruction set's copy.
+    /// Updates state, life spans and motion by one frame. Inlined, with the loops it calls, into the copy for each
+    /// instruction set.
     #[inline(always)]
-    fn advance_plainly(&mut self, t: usize, gaussians: &Gaussians, changed: Columns) {
+    fn advance_portable(&mut self, t: usize, gaussians: &Gaussians, changed: Columns) {
         self.state.update(gaussians, changed);
         let alpha_min = self.plan.alpha_min;
-        // The first frame is what the others may be like; named or not, its opacities are new.
+        // The first frame is the one that the others are compared with; its opacities are new even if `changed` omits
+        // them.
         self.steady &= t == 0 || !changed.contains(Columns::OPACITY);
         let repeats = t > 0 && self.steady;
         let opacity = &self.state.opacity;
-        let alive = if repeats { self.life.repeat() } else { self.life.frame(opacity, alpha_min) };
+        let alive = if repeats { self.life.repeat_frame() } else { self.life.add_frame(opacity, alpha_min) };
         self.alive_per_frame.push(alive);
         let steps = [self.plan.step(t), self.plan.step(t.saturating_sub(1))];
-        self.motion.frame(&gaussians.position, opacity, alpha_min, steps, repeats);
+        self.motion.add_frame(&gaussians.position, opacity, alpha_min, steps, repeats);
     }
 
     fn project(&mut self, gaussians: &Gaussians, cameras: &[&Camera]) {
@@ -155,10 +160,10 @@ impl<'a> BlockScan<'a> {
         for start in (0..len).step_by(CHUNK) {
             let range = start..len.min(start + CHUNK);
             let opacity = &self.state.opacity[range.clone()];
-            if opacity.iter().all(|&opacity| opacity < scale.alpha_min.min(NOTHING)) {
+            if opacity.iter().all(|&opacity| opacity < scale.alpha_min.min(NEGLIGIBLE_OPACITY)) {
                 continue;
             }
-            self.state.turn(gaussians, range.clone());
+            self.state.update_axes(gaussians, range.clone());
             let from = FootprintPlanes {
                 position: std::array::from_fn(|axis| &gaussians.position.plane(axis)[range.clone()]),
                 axes: std::array::from_fn(|plane| &self.state.axes[plane][range.clone()]),
@@ -178,22 +183,20 @@ impl<'a> BlockScan<'a> {
         self.state.resident_bytes() + self.life.resident_bytes() + self.motion.resident_bytes() + sums
     }
 
-    /// The statistics, once every frame was added.
-    ///
-    /// # Panics
-    /// If frames are missing.
+    /// Returns the statistics after every frame was added.
     pub fn finish(self) -> BlockStatistics {
         let plan = self.plan;
         self.finish_by(plan)
     }
 
-    /// The statistics of a scan begun before all frames were known, by the plan that knows them.
+    /// Returns the statistics of a scan that began before all frames were known. `plan` is the plan for the complete
+    /// sequence.
     ///
     /// # Panics
-    /// If frames are missing, or `plan` does not finish the one this scan began with.
+    /// If frames are missing, or `plan` does not finish the plan with which this scan began.
     pub fn finish_by(mut self, plan: &ScanPlan) -> BlockStatistics {
-        self.life.settle();
-        self.motion.settle();
+        self.life.count_repeats();
+        self.motion.count_steady_frames();
         assert_eq!(self.next_frame, plan.frames, "every frame is scanned");
         assert!(std::ptr::eq(plan, self.plan) || plan.finishes(self.plan), "the plan is that of another scan");
         let pairs = f64::from(plan.pairs.max(1));
@@ -240,10 +243,10 @@ mod tests {
         (hash_id(k as u64) >> 40) as f32 / (1 << 24) as f32
     }
 
-    /// Positions and opacities of frame `t`; opacities follow `opacity_of`.
-    fn made(t: usize, opacity_of: usize) -> Gaussians {
+    /// Returns a frame with the positions of frame `t` and the opacities of frame `opacity_frame`.
+    fn test_frame(t: usize, opacity_frame: usize) -> Gaussians {
         let mut frame = Gaussians::zeros(77, 0);
-        for (column, t) in [(Columns::POSITION, t), (Columns::OPACITY, opacity_of), (Columns::ROTATION, 0)] {
+        for (column, t) in [(Columns::POSITION, t), (Columns::OPACITY, opacity_frame), (Columns::ROTATION, 0)] {
             for (i, x) in frame.column_mut(column).planes_mut().iter_mut().enumerate() {
                 // About half of the opacities are below 1/255.
                 *x = 10.0 * random(1000 * t + i) - if column == Columns::OPACITY { 10.5 } else { 7.0 };
@@ -253,21 +256,21 @@ mod tests {
     }
 
     #[test]
-    fn opacities_that_are_not_named_as_changed_count_as_if_they_were() {
+    fn unchanged_opacities_may_be_omitted_from_changed() {
         for motion in [MotionParams::Literal, MotionParams::Runs] {
             let scan = ScanParams { motion, ..Recipe::preset("default").unwrap().scan };
-            // The frame whose opacities each frame has: for ever the first's; changed late, and steady again; from the
-            // second frame on; one frame.
-            let cases: [&[usize]; 4] = [&[0; 7], &[0, 0, 0, 3, 3, 3, 6], &[0, 1, 1, 1], &[0]];
-            for opacities in cases {
+            // Number of the frame whose opacities each frame has: always the first; changed late, then steady again;
+            // changed from the second frame on; a single frame.
+            let opacity_frames: [&[usize]; 4] = [&[0; 7], &[0, 0, 0, 3, 3, 3, 6], &[0, 1, 1, 1], &[0]];
+            for opacities in opacity_frames {
                 let times: Vec<f64> = (0..opacities.len()).map(|t| t as f64 + f64::from(t > 4)).collect();
                 let mut schedule = Schedule::default();
                 schedule.push(times.len(), &[]);
                 let plan = ScanPlan::new(&scan, &times, &schedule).unwrap();
                 let [mut all, mut named] = [BlockScan::new(77, 0, &plan), BlockScan::new(77, 0, &plan)];
-                for (t, &of) in opacities.iter().enumerate() {
-                    let frame = made(t, of);
-                    let changed = t > 0 && of != opacities[t - 1];
+                for (t, &opacity_frame) in opacities.iter().enumerate() {
+                    let frame = test_frame(t, opacity_frame);
+                    let changed = t > 0 && opacity_frame != opacities[t - 1];
                     all.frame(t, &frame, &[], NEEDED);
                     let opacity = if changed { Columns::OPACITY } else { Columns::empty() };
                     named.frame(t, &frame, &[], Columns::POSITION | opacity);
@@ -299,7 +302,7 @@ mod tests {
                     }
                     frame.position.set_row(t, [f32::NAN, f32::INFINITY, -3.0]);
                     wide.advance(t, &frame, NEEDED);
-                    baseline.advance_plainly(t, &frame, NEEDED);
+                    baseline.advance_portable(t, &frame, NEEDED);
                     wide.next_frame += 1;
                     baseline.next_frame += 1;
                 }

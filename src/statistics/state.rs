@@ -1,27 +1,27 @@
-//! What a frame's stored columns mean: opacities and scaled axes in f64, kept between frames so that
-//! only columns that changed are decoded again.
+//! Decoded attributes of a block at the current frame: opacities and scaled axes in f64. They are kept between frames,
+//! so only columns that changed are decoded again.
 
 use std::mem::size_of;
 use std::ops::Range;
 
 use crate::model::{self, Column, Columns, Flags, Gaussians};
 
-/// Largest ln(scale) that is taken at its word: e¹⁰⁰ scene units overflows nothing downstream and
-/// already covers every picture whole.
+/// Largest ln(scale); larger values are clamped to it. e¹⁰⁰ scene units cause no overflow later and already cover every
+/// view entirely.
 const MAX_LOG_SCALE: f64 = 100.0;
 
-/// Gaussians projected at a time: about 108 bytes each, so that every view of a frame but the first
-/// finds them in the first-level cache.
+/// Number of Gaussians projected together. At about 108 bytes each, every view of a frame but the first finds them in
+/// the first-level cache.
 pub(super) const CHUNK: usize = 256;
 
-/// Decoded state of a block at the current frame.
+/// Decoded attributes of a block at the current frame.
 pub(super) struct BlockState {
     /// Opacity in [0, 1].
     pub(super) opacity: Vec<f64>,
-    /// R·S, plane 3·row + axis; of a chunk when it was last turned.
+    /// Matrix R·S, plane 3·row + axis, as of the last update of the Gaussian's chunk.
     pub(super) axes: [Vec<f64>; 9],
-    /// Whether R or S of a chunk have changed since.
-    turned: Vec<bool>,
+    /// Whether R or S of each chunk changed since its axes were updated.
+    axes_outdated: Vec<bool>,
     pub(super) flags: Vec<Flags>,
     /// Largest finite |coordinate| so far.
     pub(super) largest_coordinate: f32,
@@ -34,14 +34,14 @@ impl BlockState {
         BlockState {
             opacity: vec![0.0; len],
             axes: std::array::from_fn(|_| vec![0.0; len]),
-            turned: vec![false; len.div_ceil(CHUNK)],
+            axes_outdated: vec![false; len.div_ceil(CHUNK)],
             flags: vec![Flags::empty(); len],
             largest_coordinate: 0.0,
         }
     }
 
-    /// Takes over the columns `changed`, and flags what is odd in them. The axes are for projections only: they wait for
-    /// [`BlockState::turn`].
+    /// Decodes the columns `changed` and flags non-finite values and zero quaternions in them. Axes are only needed for
+    /// projection; [`BlockState::update_axes`] updates them.
     #[inline(always)]
     pub(super) fn update(&mut self, gaussians: &Gaussians, changed: Columns) {
         for column in changed.iter() {
@@ -64,7 +64,7 @@ impl BlockState {
             self.flag_zero_rotation(&gaussians.rotation);
         }
         if changed.intersects(Columns::ROTATION | Columns::LOG_SCALE) {
-            self.turned.fill(true);
+            self.axes_outdated.fill(true);
         }
     }
 
@@ -86,9 +86,9 @@ impl BlockState {
         }
     }
 
-    /// Brings the axes of a chunk up to the state of `gaussians`.
-    pub(super) fn turn(&mut self, gaussians: &Gaussians, chunk: Range<usize>) {
-        if !std::mem::take(&mut self.turned[chunk.start / CHUNK]) {
+    /// Recomputes the axes of a chunk from `gaussians` if they are outdated.
+    pub(super) fn update_axes(&mut self, gaussians: &Gaussians, chunk: Range<usize>) {
+        if !std::mem::take(&mut self.axes_outdated[chunk.start / CHUNK]) {
             return;
         }
         for i in chunk {
@@ -106,15 +106,15 @@ impl BlockState {
 
     #[cfg(test)]
     pub(super) fn resident_bytes(&self) -> usize {
-        let BlockState { opacity, axes, turned: _, flags, largest_coordinate: _ } = self;
+        let BlockState { opacity, axes, axes_outdated: _, flags, largest_coordinate: _ } = self;
         size_of_val(&opacity[..])
             + axes.iter().map(|plane| size_of_val(&plane[..])).sum::<usize>()
             + size_of_val(&flags[..])
     }
 }
 
-/// Largest |x|, or something that is not finite if any value is not. The bits of magnitudes sort like the magnitudes,
-/// those of NaN and infinity last, and integers are compared many at a time.
+/// Returns the largest |x|, or a non-finite value if any value is not finite. The bits of magnitudes order like the
+/// magnitudes, with infinity and NaN last, and integers are compared many at a time.
 #[inline(always)]
 fn largest_magnitude(values: &[f32]) -> f32 {
     f32::from_bits(values.iter().fold(0, |largest, x| largest.max(x.abs().to_bits())))
@@ -124,8 +124,8 @@ fn largest_finite(values: &[f32]) -> f32 {
     values.iter().filter(|x| x.is_finite()).fold(0.0, |largest, x| largest.max(x.abs()))
 }
 
-/// Rows of the rotation of a wxyz quaternion of any length but zero. Dividing the quadratic form by
-/// the squared length needs no square root; f64 holds the square of any f32, subnormals included.
+/// Returns the rows of the rotation matrix of a wxyz quaternion of any length but zero. Dividing the quadratic form by
+/// the squared length avoids a square root; f64 holds the square of any f32, including subnormals.
 fn rotation_matrix([w, x, y, z]: [f64; 4]) -> [[f64; 3]; 3] {
     let s = 2.0 / (w * w + x * x + y * y + z * z);
     [

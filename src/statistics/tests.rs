@@ -1,4 +1,5 @@
-//! Claims about the scan: against the slow answer of [`crate::diagnostics::selfcheck::oracle`], against analysis, and as laws.
+//! Tests of the scan: against the slow definitions in [`crate::diagnostics::selfcheck::oracle`], against closed
+//! formulas, and as invariants.
 
 use glam::{DMat3, DQuat, DVec3};
 use proptest::prelude::*;
@@ -13,12 +14,12 @@ fn recipe(motion: MotionParams) -> ScanParams {
     ScanParams { motion, ..Recipe::preset("default").unwrap().scan }
 }
 
-/// The `k`-th of a fixed stream of numbers in [0, 1).
+/// Returns the `k`-th number of a fixed pseudo-random stream in [0, 1).
 fn random(seed: u64, k: u64) -> f64 {
     (hash_id(hash_id(seed) ^ k) >> 11) as f64 / 2f64.powi(53)
 }
 
-/// A camera on the sphere of radius 4 that looks at the origin.
+/// Returns a camera on the sphere of radius 4 that looks at the origin.
 fn camera(seed: u64) -> Camera {
     let eye = DQuat::from_rotation_y(6.3 * random(seed, 0)) * DVec3::new(0.0, 2.0 * random(seed, 1) - 1.0, -4.0);
     let forward = -eye.normalize();
@@ -44,19 +45,27 @@ fn schedule(frames: usize, views: u32) -> Schedule {
     schedule
 }
 
-/// N wandering Gaussians; about a third of their frames are dead.
+/// Returns the frames of `n` wandering Gaussians. Each is dead in about a third of its frames.
 fn wanderers(n: usize, frames: usize, seed: u64) -> Vec<Gaussians> {
     (0..frames)
         .map(|t| {
             let mut g = Gaussians::zeros(n, 0);
             for i in 0..n {
-                let r = |k: u64| 2.0 * random(seed, (i as u64) << 32 | k) - 1.0;
-                let s = |k: u64| 2.0 * random(seed, ((t as u64) << 20 | i as u64) << 8 | k | 1 << 60) - 1.0;
-                g.position.set_row::<3>(i, std::array::from_fn(|a| (3.0 * r(a as u64) + 0.3 * s(a as u64)) as f32));
-                g.rotation.set_row::<4>(i, std::array::from_fn(|a| (r(9 + a as u64) + 0.1 * s(9 + a as u64)) as f32));
-                g.log_scale
-                    .set_row::<3>(i, std::array::from_fn(|a| (-3.0 + 2.0 * r(4 + a as u64) + 0.2 * s(20)) as f32));
-                g.opacity_logit.set_row(i, [(if s(30) < -0.33 { -6.0 } else { 3.0 * s(31) }) as f32]);
+                let constant = |k: u64| 2.0 * random(seed, (i as u64) << 32 | k) - 1.0;
+                let varying = |k: u64| 2.0 * random(seed, ((t as u64) << 20 | i as u64) << 8 | k | 1 << 60) - 1.0;
+                g.position.set_row::<3>(
+                    i,
+                    std::array::from_fn(|a| (3.0 * constant(a as u64) + 0.3 * varying(a as u64)) as f32),
+                );
+                g.rotation.set_row::<4>(
+                    i,
+                    std::array::from_fn(|a| (constant(9 + a as u64) + 0.1 * varying(9 + a as u64)) as f32),
+                );
+                g.log_scale.set_row::<3>(
+                    i,
+                    std::array::from_fn(|a| (-3.0 + 2.0 * constant(4 + a as u64) + 0.2 * varying(20)) as f32),
+                );
+                g.opacity_logit.set_row(i, [(if varying(30) < -0.33 { -6.0 } else { 3.0 * varying(31) }) as f32]);
             }
             g
         })
@@ -81,8 +90,8 @@ fn scan(frames: &[Gaussians], schedule: &Schedule, scan: &ScanParams) -> BlockSt
     scan_at(&even_times(frames.len()), frames, schedule, scan)
 }
 
-/// One Gaussian, at x(t) with opacity α(t), seen by nobody.
-fn lone(
+/// Scans one Gaussian at x(t) with opacity α(t), without cameras.
+fn scan_one(
     frames: usize,
     x: impl Fn(usize) -> f32,
     opacity: impl Fn(usize) -> f64,
@@ -101,9 +110,9 @@ fn lone(
     block.finish()
 }
 
-fn close(what: &str, got: f64, expected: f64, relative: f64, absolute: f64) {
+fn close(name: &str, got: f64, expected: f64, relative: f64, absolute: f64) {
     let tolerance = relative * expected.abs() + absolute;
-    assert!((got - expected).abs() <= tolerance, "{what}: got {got:e}, expected {expected:e}, tolerance {tolerance:e}");
+    assert!((got - expected).abs() <= tolerance, "{name}: got {got:e}, expected {expected:e}, tolerance {tolerance:e}");
 }
 
 const ALIVE: f64 = 0.5;
@@ -137,7 +146,7 @@ fn sinusoid_over_100_000_steps_has_its_analytic_motion() {
     let (steps, omega) = (100_000, std::f64::consts::TAU / 1000.0);
     let half = (omega / 2.0).sin();
     for motion in BOTH {
-        let rows = lone(steps + 1, |t| (omega * t as f64).sin() as f32, |_| ALIVE, motion).rows;
+        let rows = scan_one(steps + 1, |t| (omega * t as f64).sin() as f32, |_| ALIVE, motion).rows;
         // Mean of (sin ωt − sin ω(t−1))² over whole periods: 2 sin²(ω/2). The paper divides by |life|.
         let divisor = steps + usize::from(motion == MotionParams::Literal);
         close("D", rows.d[0], half * (2.0 * steps as f64 / divisor as f64).sqrt(), 1e-6, 0.0);
@@ -152,13 +161,13 @@ fn sinusoid_over_100_000_steps_has_its_analytic_motion() {
 #[test]
 fn constant_opacity_has_variance_exactly_0_over_100_000_frames() {
     for alpha in [0.3, 0.999, 1.0 - 1e-7] {
-        assert_eq!(lone(100_000, |_| 0.0, |_| alpha, MotionParams::Runs).rows.v[0], 0.0);
+        assert_eq!(scan_one(100_000, |_| 0.0, |_| alpha, MotionParams::Runs).rows.v[0], 0.0);
     }
 }
 
 #[test]
 fn nearly_constant_opacity_keeps_its_variance() {
-    let rows = lone(10_000, |_| 0.0, |t| 0.999 + 1e-5 * (t % 2) as f64, MotionParams::Runs).rows;
+    let rows = scan_one(10_000, |_| 0.0, |t| 0.999 + 1e-5 * (t % 2) as f64, MotionParams::Runs).rows;
     // f32 logits around 7 place the two opacities to 5e-10, 5e-5 of their distance.
     close("V", rows.v[0], 2.5e-11, 1e-3, 0.0);
 }
@@ -166,59 +175,60 @@ fn nearly_constant_opacity_keeps_its_variance() {
 #[test]
 fn one_frame_has_no_motion_and_two_have_one_step() {
     for motion in BOTH {
-        let rows = lone(1, |_| 5.0, |_| ALIVE, motion).rows;
+        let rows = scan_one(1, |_| 5.0, |_| ALIVE, motion).rows;
         assert_eq!((rows.d[0], rows.kappa[0], rows.v[0], rows.life[0]), (0.0, 0.0, 0.0, 1));
     }
-    let rows = lone(2, |t| 3.0 * t as f32, |_| ALIVE, MotionParams::Runs).rows;
+    let rows = scan_one(2, |t| 3.0 * t as f32, |_| ALIVE, MotionParams::Runs).rows;
     assert_eq!((rows.d[0], rows.kappa[0]), (3.0, 0.0));
-    let rows = lone(2, |t| 3.0 * t as f32, |_| ALIVE, MotionParams::Literal).rows;
+    let rows = scan_one(2, |t| 3.0 * t as f32, |_| ALIVE, MotionParams::Literal).rows;
     assert_eq!((rows.d[0], rows.kappa[0]), ((9.0f64 / 2.0).sqrt(), 0.0), "the paper divides one step by |life| = 2");
 }
 
 #[test]
-fn teleport_while_dead_is_no_motion_and_while_alive_is() {
+fn jumps_count_as_motion_only_while_alive() {
     let x = |t: usize| if t < 5 { 0.0 } else { 100.0 };
-    let dead = lone(10, x, |t| if t == 4 || t == 5 { DEAD } else { ALIVE }, MotionParams::Runs).rows;
+    let dead = scan_one(10, x, |t| if t == 4 || t == 5 { DEAD } else { ALIVE }, MotionParams::Runs).rows;
     assert_eq!((dead.d[0], dead.kappa[0]), (0.0, 0.0));
-    let alive = lone(10, x, |_| ALIVE, MotionParams::Runs).rows;
+    let alive = scan_one(10, x, |_| ALIVE, MotionParams::Runs).rows;
     assert_eq!((alive.d[0], alive.kappa[0]), ((1e4f64 / 9.0).sqrt(), 200.0 / 8.0));
 }
 
 #[test]
-fn life_of_1_2_3_frames_has_0_0_1_curvature_terms() {
+fn life_span_of_1_2_3_frames_has_0_0_1_curvature_terms() {
     for motion in BOTH {
         for (life, expected) in [(1, 0.0), (2, 0.0), (3, 2.0)] {
             let alive = |t: usize| if (2..2 + life).contains(&t) { ALIVE } else { DEAD };
-            let rows = lone(8, |t| (t * t) as f32, alive, motion).rows;
+            let rows = scan_one(8, |t| (t * t) as f32, alive, motion).rows;
             assert_eq!((rows.life[0] as usize, rows.kappa[0]), (life, expected), "{motion:?}, life of {life}");
         }
     }
 }
 
 #[test]
-fn alternating_life_has_no_interior_triples() {
+fn alternating_opacity_has_no_interior_triples() {
     let alive = |t: usize| if t.is_multiple_of(2) { ALIVE } else { DEAD };
-    let rows = lone(9, |t| (t * t) as f32, alive, MotionParams::Runs).rows;
+    let rows = scan_one(9, |t| (t * t) as f32, alive, MotionParams::Runs).rows;
     assert_eq!((rows.d[0], rows.kappa[0], rows.life[0]), (0.0, 0.0, 5));
-    // To the letter, neighbors of a center need not live: centers 2, 4 and 6 turn by 2 each.
-    assert_eq!(lone(9, |t| (t * t) as f32, alive, MotionParams::Literal).rows.kappa[0], 2.0);
+    // In the paper's formula, the neighbors of a center need not be alive: centers 2, 4 and 6 turn by 2 each.
+    assert_eq!(scan_one(9, |t| (t * t) as f32, alive, MotionParams::Literal).rows.kappa[0], 2.0);
 }
 
 #[test]
-fn turn_about_the_last_life_frame_is_discarded() {
-    // Straight until death, then a jump: only the turn about the last life frame would see it.
+fn turn_about_the_last_frame_alive_is_ignored() {
+    // Straight motion while alive, then a jump: only the turn about the last frame alive would see the jump.
     for (last, motion) in [(6, BOTH[0]), (6, BOTH[1]), (9, BOTH[0]), (9, BOTH[1])] {
         let x = |t: usize| if t <= last { t as f32 } else { 50.0 };
-        assert_eq!(lone(10, x, |t| if t <= last { ALIVE } else { DEAD }, motion).rows.kappa[0], 0.0);
+        assert_eq!(scan_one(10, x, |t| if t <= last { ALIVE } else { DEAD }, motion).rows.kappa[0], 0.0);
     }
-    // With a later life frame the center was interior, and the jump counts.
-    let rows = lone(10, |t| if t <= 6 { t as f32 } else { 50.0 }, |t| if t == 7 { DEAD } else { ALIVE }, BOTH[0]).rows;
+    // If a later frame is alive, the center is interior and the jump counts.
+    let rows =
+        scan_one(10, |t| if t <= 6 { t as f32 } else { 50.0 }, |t| if t == 7 { DEAD } else { ALIVE }, BOTH[0]).rows;
     close("kappa", rows.kappa[0], (43.0 + 0.0) / 7.0, 1e-12, 0.0);
 }
 
 #[test]
-fn opacity_0_and_1_give_zeros_and_no_nan() {
-    let nothing = lone(20, |t| t as f32, |_| 1e-30, MotionParams::Runs).rows;
+fn opacities_0_and_1_give_zero_variance() {
+    let nothing = scan_one(20, |t| t as f32, |_| 1e-30, MotionParams::Runs).rows;
     assert_eq!((nothing.d[0], nothing.kappa[0], nothing.v[0], nothing.life[0]), (0.0, 0.0, 0.0, 0));
     let plan = ScanPlan::new(&recipe(MotionParams::Runs), &even_times(20), &schedule(20, 0)).unwrap();
     let mut block = BlockScan::new(1, 0, &plan);
@@ -230,7 +240,7 @@ fn opacity_0_and_1_give_zeros_and_no_nan() {
 }
 
 #[test]
-fn non_finite_values_in_any_column_and_frame_are_flagged_zeroed_and_leave_others_alone() {
+fn non_finite_values_clear_only_their_own_row() {
     let (clean, schedule, recipe) = (wanderers(300, 6, 2), schedule(6, 2), recipe(MotionParams::Runs));
     let expected = scan(&clean, &schedule, &recipe);
     for (k, column) in Columns::all().iter().enumerate() {
@@ -253,7 +263,7 @@ fn non_finite_values_in_any_column_and_frame_are_flagged_zeroed_and_leave_others
 }
 
 #[test]
-fn zero_quaternion_is_the_identity_and_flagged() {
+fn zero_quaternion_is_flagged_and_counts_as_identity() {
     let (mut frames, schedule, recipe) = (wanderers(2, 4, 3), schedule(4, 3), recipe(MotionParams::Runs));
     for frame in &mut frames {
         frame.rotation.set_row(0, [1.0, 0.0, 0.0, 0.0]);
@@ -264,15 +274,15 @@ fn zero_quaternion_is_the_identity_and_flagged() {
     assert_eq!((got.c, got.flags), (expected.c, vec![Flags::ZERO_ROTATION, Flags::empty()]));
 }
 
-/// Area and visibility of one Gaussian in one picture.
-fn picture(position: DVec3, scale: [f64; 3], rotation: [f32; 4]) -> (f64, f64, f64) {
+/// Returns the area, the visibility and the area by the oracle of one Gaussian in one view.
+fn one_view(position: DVec3, scale: [f64; 3], rotation: [f32; 4]) -> (f64, f64, f64) {
     let schedule = schedule(1, 1);
     let mut g = Gaussians::zeros(1, 0);
     g.position.set_row(0, position.to_array().map(|x| x as f32));
-    g.log_scale.set_row(0, scale.map(|s| s.ln() as f32));
+    g.log_scale.set_row(0, scale.map(|varying| varying.ln() as f32));
     g.rotation.set_row(0, rotation);
     let rows = scan(std::slice::from_ref(&g), &schedule, &recipe(MotionParams::Runs)).rows;
-    // The opacity is ½.
+    // The opacity is ½, so the area is twice C.
     (2.0 * rows.c[0], rows.vis[0], oracle::area(&g, 0, &schedule.cameras[0]))
 }
 
@@ -283,29 +293,29 @@ fn behind_the_camera_or_nearer_than_0_2_is_culled() {
     let camera = camera(0);
     let ahead = camera.rotation.row(2);
     for (depth, culled) in [(-3.0, true), (0.0, true), (0.199, true), (0.201, false), (4.0, false)] {
-        let (area, vis, _) = picture(camera.center() + depth * ahead, [0.01; 3], [1.0, 0.0, 0.0, 0.0]);
+        let (area, vis, _) = one_view(camera.center() + depth * ahead, [0.01; 3], [1.0, 0.0, 0.0, 0.0]);
         assert_eq!((area == 0.0, vis == 0.0), (culled, culled), "depth {depth}: {area}");
     }
 }
 
 #[test]
-fn area_is_finite_and_within_the_picture_for_scales_from_1e_minus_12_to_1e6_and_beyond() {
+fn area_stays_within_the_image_for_extreme_scales() {
     let camera = camera(0);
     for depth in [0.2001, 0.3, 4.0, 1e4, 1e30] {
         for scale in [[1e-12; 3], [1e6; 3], [1e6, 1e-12, 1e-12], [1e6, 1e6, 1e-12], [1e38, 1.0, 1e-38]] {
             let position = camera.center() + depth * camera.rotation.row(2);
-            let (area, vis, _) = picture(position, scale, [0.3, -0.5, 0.7, 0.1]);
+            let (area, vis, _) = one_view(position, scale, [0.3, -0.5, 0.7, 0.1]);
             assert!((0.0..=IMAGE_PX2).contains(&area) && vis.is_finite(), "depth {depth}, {scale:?}: {area}");
             assert!(depth > 4.0 || area > 0.0 || scale[0] > 1e3, "depth {depth}, {scale:?}: {area}");
         }
     }
-    let (tiny, _, _) = picture(DVec3::ZERO, [1e-12; 3], [1.0, 0.0, 0.0, 0.0]);
+    let (tiny, _, _) = one_view(DVec3::ZERO, [1e-12; 3], [1.0, 0.0, 0.0, 0.0]);
     close("a point's area is that of the dilation", tiny, 9.0 * std::f64::consts::PI * 0.3, 1e-12, 1e-9);
 }
 
 #[test]
 fn needle_keeps_the_digits_of_its_area() {
-    // Σ_xx·Σ_yy is 1e13 times det Σ here: their difference would keep three digits.
+    // Here Σ_xx·Σ_yy is 1e13 times det Σ, so the difference Σ_xx Σ_yy − Σ_xy² would keep three digits.
     let camera = camera(0);
     let (length, depth) = (1e5, camera.center().length());
     let mut g = Gaussians::zeros(1, 0);
@@ -317,7 +327,7 @@ fn needle_keeps_the_digits_of_its_area() {
     let mut schedule = Schedule::new(vec![camera.clone()]);
     schedule.push(1, &[(0, 0)]);
     let area = 2.0 * scan(std::slice::from_ref(&g), &schedule, &recipe(MotionParams::Runs)).rows.c[0];
-    // A diagonal line: det = 0.3·(Σ_xx + Σ_yy − 0.3), clipped to the picture's share of its box.
+    // A diagonal line: det = 0.3·(Σ_xx + Σ_yy − 0.3), clipped to the fraction of its box inside the image.
     let (sx, sy) = (250.0 * length / depth / 2f64.sqrt(), 260.0 * length / depth / 2f64.sqrt());
     let det = 0.3 * (sx * sx + sy * sy);
     let expected = 9.0 * std::f64::consts::PI * det.sqrt() * IMAGE_PX2 / (36.0 * sx * sy);
@@ -326,15 +336,16 @@ fn needle_keeps_the_digits_of_its_area() {
 }
 
 #[test]
-fn offset_up_to_1e7_leaves_motion_finite_and_snaps_only_noise() {
+fn offsets_up_to_1e7_snap_only_noise() {
     for offset in [1e2, 1e4, 1e6, 1e7] {
         let noise = ulp(offset as f32);
-        let resting = lone(2000, |t| (offset + noise * random(4, t as u64)) as f32, |_| ALIVE, MotionParams::Runs);
+        let resting = scan_one(2000, |t| (offset + noise * random(4, t as u64)) as f32, |_| ALIVE, MotionParams::Runs);
         let mut rows = resting.rows;
         assert!(rows.d[0] > 0.0 && rows.d[0] < 2.0 * noise && rows.kappa[0] < 4.0 * noise, "{rows:?}");
         let snapped = snap(&mut rows, resting.largest_coordinate);
         assert_eq!((snapped.d, snapped.kappa, rows.d[0], rows.kappa[0]), (1, 1, 0.0, 0.0));
-        let moving = lone(2000, |t| (offset + 8.0 * noise * (t * t % 7) as f64) as f32, |_| ALIVE, MotionParams::Runs);
+        let moving =
+            scan_one(2000, |t| (offset + 8.0 * noise * (t * t % 7) as f64) as f32, |_| ALIVE, MotionParams::Runs);
         let mut rows = moving.rows;
         assert_eq!(snap(&mut rows, moving.largest_coordinate).d, 0);
         assert!(rows.d[0].is_finite() && rows.kappa[0].is_finite());
@@ -342,7 +353,7 @@ fn offset_up_to_1e7_leaves_motion_finite_and_snaps_only_noise() {
 }
 
 #[test]
-fn uneven_frames_are_measured_in_real_time() {
+fn uneven_frames_are_measured_by_their_time_stamps() {
     // x = τ² sampled at uneven τ: the second divided difference is the second derivative, 2, everywhere.
     let stamps = [0.0, 1.0, 1.5, 3.0, 3.25, 5.0, 8.0];
     let unit = 8.0 / 6.0;
@@ -365,8 +376,8 @@ fn uneven_frames_are_measured_in_real_time() {
 }
 
 #[test]
-fn coverage_of_very_many_pictures_is_that_of_one() {
-    // Far more contributions than a 64-bit sum in fixed point holds; the mean of equal ones is any of them.
+fn mean_coverage_of_300_000_equal_views_is_that_of_one() {
+    // More contributions than a 64-bit fixed-point sum holds; the mean of equal contributions is any of them.
     let (mut frames, one) = (wanderers(40, 1, 3), schedule(1, 1));
     frames[0].log_scale.planes_mut().fill(2.0);
     let mut many = Schedule::new(one.cameras.clone());
@@ -380,7 +391,7 @@ fn coverage_of_very_many_pictures_is_that_of_one() {
 }
 
 #[test]
-fn unchanged_columns_need_not_be_announced() {
+fn unchanged_columns_may_be_left_out_of_changed() {
     let (mut frames, schedule) = (wanderers(300, 5, 8), schedule(5, 2));
     let first = frames[0].clone();
     for frame in &mut frames {
@@ -398,7 +409,7 @@ fn unchanged_columns_need_not_be_announced() {
 }
 
 #[test]
-fn bytes_per_gaussian_are_what_is_declared() {
+fn declared_bytes_per_gaussian_are_exact() {
     let plan = ScanPlan::new(&recipe(MotionParams::Runs), &even_times(3), &schedule(3, 1)).unwrap();
     assert_eq!(BlockScan::new(1000, 0, &plan).resident_bytes(), 1000 * BYTES_PER_GAUSSIAN);
 }
@@ -425,7 +436,7 @@ proptest! {
     }
 
     #[test]
-    fn rigid_motion_of_the_whole_scene_changes_no_statistic(seed in any::<u64>(), angle in 0.0..6.0f64, shift in -3.0..3.0f64) {
+    fn statistics_are_invariant_under_rigid_motion(seed in any::<u64>(), angle in 0.0..6.0f64, shift in -3.0..3.0f64) {
         let (frames, before, recipe) = (wanderers(60, 6, seed), schedule(6, 2), recipe(MotionParams::Runs));
         let turn = DQuat::from_axis_angle(DVec3::new(0.6, -0.48, 0.64), angle);
         let offset = DVec3::new(shift, -shift, 0.5 * shift);
@@ -437,7 +448,8 @@ proptest! {
         }
         let (expected, got) = (scan(&frames, &before, &recipe).rows, scan(&moved, &after, &recipe).rows);
         for i in 0..60 {
-            // Positions of size ≤ 10 are rounded to f32 anew: 1e-6 each; pixels follow at f/z_min = 1300 per unit.
+            // Positions of size ≤ 10 are rounded to f32 again: 1e-6 each. Pixels differ by f/z_min = 1300 per scene
+            // unit.
             close("D", got.d[i], expected.d[i], 0.0, 1e-5);
             close("kappa", got.kappa[i], expected.kappa[i], 0.0, 1e-5);
             prop_assert_eq!((got.v[i], got.life[i]), (expected.v[i], expected.life[i]));
@@ -446,7 +458,7 @@ proptest! {
     }
 }
 
-/// The Gaussians of `range`.
+/// Returns the Gaussians of `range`.
 fn slice(from: &Gaussians, range: std::ops::Range<usize>) -> Gaussians {
     let mut out = Gaussians::zeros(range.len(), 0);
     for column in Columns::all().iter() {

@@ -1,138 +1,144 @@
-//! Frames one after the other, and the tracks that go through them.
+//! Linking of frames in order: which Gaussian of a frame continues which track.
 
 use std::mem::size_of;
 
 use rayon::prelude::*;
 
+use super::appearance::ComparedAppearance;
+use super::confidence::LinkConfidence;
 use super::grid::CellGrid;
 use super::links::Links;
-use super::look::ComparedAppearance;
-use super::track::{NAMED, NONE, Offer, OpenTrack, ROUNDS};
-use super::trust::LinkConfidence;
+use super::track::{Candidate, MAX_CANDIDATES, NONE, OpenTrack, ROUNDS};
 use crate::model::Gaussians;
 
-/// Frames that a track may be missing from before it ends.
+/// Maximum number of consecutive frames that a track may be missing from before it ends.
 pub const GAP: u32 = 3;
-/// r and q of the [module](super) of what a track that is missed was succeeded by.
-const BESIDE: (f32, f32) = (0.25, 1.0);
-/// Of fewer, those that go on tell nothing of a cut.
-const FEWEST: usize = 16;
+/// Parameters r and q of the [module](super) for a Gaussian that succeeds a missing track.
+const SUCCESSION: (f32, f32) = (0.25, 1.0);
+/// Minimum number of Gaussians for the detection of cuts.
+const MIN_FOR_CUT: usize = 16;
 
-/// Links frames that come one after the other.
+/// Links frames that arrive in order.
 #[derive(Default)]
 pub struct Linker {
-    /// Those that may go on, by their numbers.
+    /// Open tracks, in the order of their numbers.
     tracks: Vec<OpenTrack>,
     born: u32,
 }
 
-/// What became of a frame.
+/// Result of linking a frame.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct FrameLinks {
-    /// The track of every Gaussian.
+    /// Number of the track of every Gaussian.
     pub tracks: Vec<u32>,
-    /// How many go on by repeating to the bit.
+    /// Number of Gaussians that continue a track as an exact repeat.
     pub repeated: usize,
-    /// How many go on in all.
+    /// Number of Gaussians that continue a track, exact repeats included.
     pub linked: usize,
-    /// How many would go on, but nobody can tell as which: they begin new tracks.
+    /// Number of Gaussians whose link was dropped as doubtful. They begin new tracks.
     pub doubtful: usize,
-    /// Whether the frame before shows something else, so that nothing goes on.
+    /// Whether the previous frame shows something else (a cut), so that no track continues.
     pub is_cut: bool,
 }
 
 impl Linker {
-    /// Bytes for each Gaussian of the frame that is linked, beside the frame.
+    /// Bytes for each Gaussian of the frame that is linked, without the frame itself.
     pub const BYTES_PER_GAUSSIAN: usize = 3 * size_of::<ComparedAppearance>() + 9 * size_of::<u32>();
-    /// Bytes for each track that may go on, in a list that grows by being copied to twice its length.
+    /// Bytes for each open track, in a list that grows by being copied to twice its length.
     pub const BYTES_PER_TRACK: usize =
-        2 * size_of::<OpenTrack>() + 2 * size_of::<u32>() + NAMED * size_of::<Offer>() + size_of::<f32>();
+        2 * size_of::<OpenTrack>() + 2 * size_of::<u32>() + MAX_CANDIDATES * size_of::<Candidate>() + size_of::<f32>();
 
-    /// How many tracks may go on.
+    /// Returns the number of open tracks.
     pub fn may_go_on(&self) -> usize {
         self.tracks.len()
     }
 
-    /// Those that may go on, by their numbers.
-    pub(super) fn living(&self) -> &[OpenTrack] {
+    /// Returns the open tracks, in the order of their numbers.
+    pub(super) fn open_tracks(&self) -> &[OpenTrack] {
         &self.tracks
     }
 
-    /// How many tracks there are so far.
+    /// Returns the number of tracks so far, including those that have ended.
     pub fn tracks(&self) -> u32 {
         self.born
     }
 
-    /// Links the next frame. The same for any number of threads.
+    /// Links the next frame. The result does not depend on the number of threads.
     pub fn link(&mut self, state: &Gaussians) -> FrameLinks {
-        let looks = ComparedAppearance::of_all(state);
-        let mut links = Links { of_track: vec![NONE; self.tracks.len()], of_point: vec![NONE; looks.len()] };
-        links.take_repeats(&self.tracks, &looks);
+        let appearances = ComparedAppearance::all_from_state(state);
+        let mut links = Links {
+            gaussian_of_track: vec![NONE; self.tracks.len()],
+            track_of_gaussian: vec![NONE; appearances.len()],
+        };
+        links.add_repeats(&self.tracks, &appearances);
         let repeated = links.count();
-        let mut trust = LinkConfidence::new(self.tracks.len());
+        let mut confidence = LinkConfidence::new(self.tracks.len());
         for round in &ROUNDS {
-            let named = links.take(&self.tracks, &looks, round);
-            trust.weigh(&links, &named, (&self.tracks, &looks), round);
+            let candidates = links.add_round(&self.tracks, &appearances, round);
+            confidence.add_round(&links, &candidates, (&self.tracks, &appearances), round);
         }
-        let before = self.tracks.iter().filter(|track| track.ago == 1).count();
-        let fewer = before.min(looks.len());
-        let is_cut = fewer >= FEWEST && 4 * links.count() < fewer;
+        let before = self.tracks.iter().filter(|track| track.frames_since_seen == 1).count();
+        let fewer = before.min(appearances.len());
+        let is_cut = fewer >= MIN_FOR_CUT && 4 * links.count() < fewer;
         if is_cut {
             self.tracks.clear();
-            links = Links { of_track: Vec::new(), of_point: vec![NONE; looks.len()] };
+            links = Links { gaussian_of_track: Vec::new(), track_of_gaussian: vec![NONE; appearances.len()] };
         }
-        let doubtful = if is_cut { Vec::new() } else { trust.give_up(&mut links) };
+        let doubtful = if is_cut { Vec::new() } else { confidence.drop_doubtful(&mut links) };
         let linked = links.count();
-        let tracks = self.go_on(&links, &looks, &doubtful);
+        let tracks = self.extend_tracks(&links, &appearances, &doubtful);
         FrameLinks { tracks, repeated: if is_cut { 0 } else { repeated }, linked, doubtful: doubtful.len(), is_cut }
     }
 
-    /// Moves the tracks on by a frame; gives that of every Gaussian. Of those `in_doubt` tracks begin.
-    fn go_on(&mut self, links: &Links, looks: &[ComparedAppearance], in_doubt: &[u32]) -> Vec<u32> {
-        let mut of_points = vec![NONE; looks.len()];
+    /// Advances the open tracks by a frame and returns the track of every Gaussian. The Gaussians `in_doubt` begin
+    /// tracks whose link was doubtful.
+    fn extend_tracks(&mut self, links: &Links, appearances: &[ComparedAppearance], in_doubt: &[u32]) -> Vec<u32> {
+        let mut track_numbers = vec![NONE; appearances.len()];
         let born = self.born;
-        for track in self.succeeded(links, looks) {
+        for track in self.succeeded_tracks(links, appearances) {
             self.tracks[track as usize].is_succeeded = true;
         }
-        for (track, &point) in self.tracks.iter_mut().zip(&links.of_track) {
-            if point == NONE {
-                track.ago += 1;
+        for (track, &gaussian) in self.tracks.iter_mut().zip(&links.gaussian_of_track) {
+            if gaussian == NONE {
+                track.frames_since_seen += 1;
             } else {
-                of_points[point as usize] = track.number;
-                track.see(looks[point as usize]);
+                track_numbers[gaussian as usize] = track.number;
+                track.extend(appearances[gaussian as usize]);
             }
         }
-        self.tracks.retain(|track| track.ago <= GAP + 1);
-        for (point, of_point) in of_points.iter_mut().enumerate().filter(|(_, track)| **track == NONE) {
-            *of_point = self.born;
-            self.tracks.push(OpenTrack::begin(self.born, looks[point]));
+        self.tracks.retain(|track| track.frames_since_seen <= GAP + 1);
+        for (gaussian, track_number) in track_numbers.iter_mut().enumerate().filter(|(_, track)| **track == NONE) {
+            *track_number = self.born;
+            self.tracks.push(OpenTrack::new(self.born, appearances[gaussian]));
             self.born += 1;
         }
         let first = self.tracks.partition_point(|track| track.number < born);
-        for &point in in_doubt {
-            self.tracks[first + (of_points[point as usize] - born) as usize].is_in_doubt = true;
+        for &gaussian in in_doubt {
+            self.tracks[first + (track_numbers[gaussian as usize] - born) as usize].is_in_doubt = true;
         }
-        of_points
+        track_numbers
     }
 
-    /// Those that are missed for the first time while another is where they are expected and looks like them.
-    fn succeeded(&self, links: &Links, looks: &[ComparedAppearance]) -> Vec<u32> {
-        let is_missed = |&i: &u32| links.of_track[i as usize] == NONE && self.tracks[i as usize].ago == 1;
-        let missed: Vec<u32> = (0..links.of_track.len() as u32).filter(is_missed).collect();
-        if missed.is_empty() || looks.is_empty() {
+    /// Returns the tracks that are missing for the first time although a Gaussian at their expected position looks like
+    /// them.
+    fn succeeded_tracks(&self, links: &Links, appearances: &[ComparedAppearance]) -> Vec<u32> {
+        let is_newly_missing =
+            |&i: &u32| links.gaussian_of_track[i as usize] == NONE && self.tracks[i as usize].frames_since_seen == 1;
+        let newly_missing: Vec<u32> = (0..links.gaussian_of_track.len() as u32).filter(is_newly_missing).collect();
+        if newly_missing.is_empty() || appearances.is_empty() {
             return Vec::new();
         }
-        let (reach, strictness) = BESIDE;
-        let grid = CellGrid::new(looks, &Vec::from_iter(0..looks.len() as u32), reach);
+        let (reach, strictness) = SUCCESSION;
+        let grid = CellGrid::new(appearances, &Vec::from_iter(0..appearances.len() as u32), reach);
         let is_succeeded = |i: &u32| {
             let track = &self.tracks[*i as usize];
-            let look = track.look.at(track.expected());
+            let appearance = track.appearance.at(track.expected_position());
             let mut found = false;
-            grid.near(&look, look.position, reach * look.size, |_, other| {
-                found |= look.apart(other, reach, strictness) <= 1.0;
+            grid.for_each_near(&appearance, appearance.position, reach * appearance.size, |_, other| {
+                found |= appearance.distance_cost(other, reach, strictness) <= 1.0;
             });
             found
         };
-        missed.into_par_iter().with_min_len(1024).filter(is_succeeded).collect()
+        newly_missing.into_par_iter().with_min_len(1024).filter(is_succeeded).collect()
     }
 }

@@ -1,109 +1,113 @@
-//! Which track goes on as which Gaussian of a frame.
+//! Links between open tracks and the Gaussians of a frame.
 
 use rayon::prelude::*;
 
+use super::appearance::ComparedAppearance;
 use super::grid::CellGrid;
-use super::look::ComparedAppearance;
-use super::track::{NONE, Offers, OpenTrack, Round};
+use super::track::{Candidates, NONE, OpenTrack, Round};
 
-/// Most times that all tracks are asked whether they would exchange.
-const EXCHANGES: usize = 4;
+/// Maximum number of rounds in which tracks exchange their Gaussians.
+const MAX_EXCHANGES: usize = 4;
 
-/// Which track goes on as which Gaussian.
+/// Links between open tracks and the Gaussians of a frame.
 pub(super) struct Links {
-    /// Gaussian of every track, and track of every Gaussian; none of what is not linked.
-    pub(super) of_track: Vec<u32>,
-    pub(super) of_point: Vec<u32>,
+    /// Gaussian of every track; `NONE` if the track is not linked. `track_of_gaussian` holds the track of every Gaussian.
+    pub(super) gaussian_of_track: Vec<u32>,
+    pub(super) track_of_gaussian: Vec<u32>,
 }
 
 impl Links {
     pub(super) fn count(&self) -> usize {
-        self.of_track.iter().filter(|&&point| point != NONE).count()
+        self.gaussian_of_track.iter().filter(|&&gaussian| gaussian != NONE).count()
     }
 
-    fn link(&mut self, track: u32, point: u32) {
-        (self.of_track[track as usize], self.of_point[point as usize]) = (point, track);
+    fn link(&mut self, track: u32, gaussian: u32) {
+        (self.gaussian_of_track[track as usize], self.track_of_gaussian[gaussian as usize]) = (gaussian, track);
     }
 
-    /// Undoes what a track is linked to, which is given.
+    /// Removes the link of a track and returns its Gaussian.
     pub(super) fn undo(&mut self, track: u32) -> u32 {
-        let point = std::mem::replace(&mut self.of_track[track as usize], NONE);
-        self.of_point[point as usize] = NONE;
-        point
+        let gaussian = std::mem::replace(&mut self.gaussian_of_track[track as usize], NONE);
+        self.track_of_gaussian[gaussian as usize] = NONE;
+        gaussian
     }
 
-    fn is_free(&self, track: u32, point: u32) -> bool {
-        self.of_track[track as usize] == NONE && self.of_point[point as usize] == NONE
+    fn is_free(&self, track: u32, gaussian: u32) -> bool {
+        self.gaussian_of_track[track as usize] == NONE && self.track_of_gaussian[gaussian as usize] == NONE
     }
 
-    /// Links what is repeated to the bit, in order.
-    pub(super) fn take_repeats(&mut self, tracks: &[OpenTrack], looks: &[ComparedAppearance]) {
-        let buckets = (2 * looks.len()).next_power_of_two();
-        let bucket = |look: &ComparedAppearance| look.bits as usize & (buckets - 1);
+    /// Links each track to the first free Gaussian that equals it bit by bit, in the order of tracks and Gaussians.
+    pub(super) fn add_repeats(&mut self, tracks: &[OpenTrack], appearances: &[ComparedAppearance]) {
+        let buckets = (2 * appearances.len()).next_power_of_two();
+        let bucket = |appearance: &ComparedAppearance| appearance.bits as usize & (buckets - 1);
         let mut starts = vec![0u32; buckets + 1];
-        looks.iter().for_each(|look| starts[bucket(look) + 1] += 1);
+        appearances.iter().for_each(|appearance| starts[bucket(appearance) + 1] += 1);
         (0..buckets).for_each(|at| starts[at + 1] += starts[at]);
         let mut next = starts.clone();
-        let mut order = vec![0u32; looks.len()];
-        for (point, look) in looks.iter().enumerate() {
-            let to = &mut next[bucket(look)];
-            order[*to as usize] = point as u32;
+        let mut order = vec![0u32; appearances.len()];
+        for (gaussian, appearance) in appearances.iter().enumerate() {
+            let to = &mut next[bucket(appearance)];
+            order[*to as usize] = gaussian as u32;
             *to += 1;
         }
-        // From here on: the first of each bucket that is not linked.
+        // From here on, `next` holds the first Gaussian of each bucket that is not linked.
         next.copy_from_slice(&starts);
         for (number, track) in tracks.iter().enumerate() {
-            let at = bucket(&track.look);
-            let is_free = |point: u32| self.of_point[point as usize] == NONE;
-            while next[at] < starts[at + 1] && !is_free(order[next[at] as usize]) {
-                next[at] += 1;
+            let bucket = bucket(&track.appearance);
+            let is_free = |gaussian: u32| self.track_of_gaussian[gaussian as usize] == NONE;
+            while next[bucket] < starts[bucket + 1] && !is_free(order[next[bucket] as usize]) {
+                next[bucket] += 1;
             }
-            let left = &order[next[at] as usize..starts[at + 1] as usize];
-            let same = |point: u32| is_free(point) && looks[point as usize].bits == track.look.bits;
-            if let Some(&point) = left.iter().find(|&&point| same(point)) {
-                self.link(number as u32, point);
+            let left = &order[next[bucket] as usize..starts[bucket + 1] as usize];
+            let is_repeat =
+                |gaussian: u32| is_free(gaussian) && appearances[gaussian as usize].bits == track.appearance.bits;
+            if let Some(&gaussian) = left.iter().find(|&&gaussian| is_repeat(gaussian)) {
+                self.link(number as u32, gaussian);
             }
         }
     }
 
-    /// Links what a round does, of what is left; gives what each track may have gone on as.
-    pub(super) fn take(
+    /// Links the tracks and Gaussians that are still free by the costs of `round`. Returns the candidates of each track
+    /// that took part.
+    pub(super) fn add_round(
         &mut self,
         tracks: &[OpenTrack],
-        looks: &[ComparedAppearance],
+        appearances: &[ComparedAppearance],
         round: &Round,
-    ) -> Vec<(u32, Offers)> {
-        let takes_part = |track: &OpenTrack| track.ago == 1 || (round.missing && !track.is_succeeded);
+    ) -> Vec<(u32, Candidates)> {
+        let takes_part =
+            |track: &OpenTrack| track.frames_since_seen == 1 || (round.includes_missing && !track.is_succeeded);
         let free =
             |links: &[u32]| -> Vec<u32> { (0..links.len() as u32).filter(|&i| links[i as usize] == NONE).collect() };
-        let (points, mut left) = (free(&self.of_point), free(&self.of_track));
+        let (gaussians, mut left) = (free(&self.track_of_gaussian), free(&self.gaussian_of_track));
         left.retain(|&track| takes_part(&tracks[track as usize]));
-        if points.is_empty() || left.is_empty() {
+        if gaussians.is_empty() || left.is_empty() {
             return Vec::new();
         }
-        let grid = CellGrid::new(looks, &points, round.reach);
-        let offers = |&track: &u32| (track, tracks[track as usize].offers(&grid, round));
-        let named: Vec<(u32, Offers)> = left.par_iter().with_min_len(1024).map(offers).collect();
-        self.settle(&named);
-        let cost = |track: u32, point: u32| tracks[track as usize].cost(&looks[point as usize], round);
-        let mut passes = 0..EXCHANGES;
-        while passes.next().is_some() && self.exchange(&named, cost) {}
-        named
+        let grid = CellGrid::new(appearances, &gaussians, round.reach);
+        let candidates = |&track: &u32| (track, tracks[track as usize].candidates(&grid, round));
+        let candidates_by_track: Vec<(u32, Candidates)> = left.par_iter().with_min_len(1024).map(candidates).collect();
+        self.link_by_cost(&candidates_by_track);
+        let cost = |track: u32, gaussian: u32| tracks[track as usize].cost(&appearances[gaussian as usize], round);
+        let mut rounds = 0..MAX_EXCHANGES;
+        while rounds.next().is_some() && self.exchange(&candidates_by_track, cost) {}
+        candidates_by_track
     }
 
-    /// Lets two tracks that would cost less together exchange their Gaussians, in the order of the tracks; gives whether
-    /// any have.
-    fn exchange(&mut self, named: &[(u32, Offers)], cost: impl Fn(u32, u32) -> f32) -> bool {
+    /// Exchanges the Gaussians of two tracks if that lowers their total cost, in the order of the tracks. Returns
+    /// whether any exchange was made.
+    fn exchange(&mut self, candidates_by_track: &[(u32, Candidates)], cost: impl Fn(u32, u32) -> f32) -> bool {
         let mut any = false;
-        for (track, offers) in named {
-            for offer in offers.iter() {
-                let (own, other) = (self.of_track[*track as usize], self.of_point[offer.point as usize]);
+        for (track, candidates) in candidates_by_track {
+            for candidate in candidates.iter() {
+                let (own, other) =
+                    (self.gaussian_of_track[*track as usize], self.track_of_gaussian[candidate.gaussian as usize]);
                 if own == NONE || other == NONE || other == *track {
                     continue;
                 }
                 let theirs = cost(other, own);
-                if theirs <= 1.0 && offer.cost + theirs < cost(*track, own) + cost(other, offer.point) {
-                    self.link(*track, offer.point);
+                if theirs <= 1.0 && candidate.cost + theirs < cost(*track, own) + cost(other, candidate.gaussian) {
+                    self.link(*track, candidate.gaussian);
                     self.link(other, own);
                     any = true;
                 }
@@ -112,32 +116,32 @@ impl Links {
         any
     }
 
-    /// Takes offers by cost, then track, then Gaussian.
-    fn settle(&mut self, named: &[(u32, Offers)]) {
-        let mut best = vec![(f32::INFINITY, NONE); self.of_point.len()];
-        for (track, offers) in named {
-            for offer in offers.iter() {
-                let best = &mut best[offer.point as usize];
-                if (offer.cost, *track) < *best {
-                    *best = (offer.cost, *track);
+    /// Links candidates in the order of cost, then track, then Gaussian.
+    fn link_by_cost(&mut self, candidates_by_track: &[(u32, Candidates)]) {
+        let mut best = vec![(f32::INFINITY, NONE); self.track_of_gaussian.len()];
+        for (track, candidates) in candidates_by_track {
+            for candidate in candidates.iter() {
+                let best = &mut best[candidate.gaussian as usize];
+                if (candidate.cost, *track) < *best {
+                    *best = (candidate.cost, *track);
                 }
             }
         }
-        // Those that are best for one another come before all others of both: no need to sort them.
-        for (track, offers) in named {
-            if let Some(first) = offers.iter().next().filter(|first| best[first.point as usize].1 == *track) {
-                self.link(*track, first.point);
+        // Mutually best candidates come before all others of both, so they are linked without sorting.
+        for (track, candidates) in candidates_by_track {
+            if let Some(first) = candidates.iter().next().filter(|first| best[first.gaussian as usize].1 == *track) {
+                self.link(*track, first.gaussian);
             }
         }
         let mut left = Vec::new();
-        for (track, offers) in named {
-            let free = offers.iter().filter(|offer| self.is_free(*track, offer.point));
-            left.extend(free.map(|offer| (offer.cost, *track, offer.point)));
+        for (track, candidates) in candidates_by_track {
+            let free = candidates.iter().filter(|candidate| self.is_free(*track, candidate.gaussian));
+            left.extend(free.map(|candidate| (candidate.cost, *track, candidate.gaussian)));
         }
         left.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then((a.1, a.2).cmp(&(b.1, b.2))));
-        for (_, track, point) in left {
-            if self.is_free(track, point) {
-                self.link(track, point);
+        for (_, track, gaussian) in left {
+            if self.is_free(track, gaussian) {
+                self.link(track, gaussian);
             }
         }
     }

@@ -1,136 +1,142 @@
-//! A track that may go on, and what it may go on as.
+//! An open track, and the Gaussians that may continue it.
 
+use super::appearance::ComparedAppearance;
 use super::grid::CellGrid;
-use super::look::ComparedAppearance;
 
-/// Gaussians that a track may go on as.
-pub(super) const NAMED: usize = 4;
-/// Most that speed adds to how far a Gaussian may be from where it is expected, in sizes.
-const MOST_FROM_SPEED: f32 = 3.0;
-/// No track, no Gaussian.
+/// Maximum number of candidates of a track.
+pub(super) const MAX_CANDIDATES: usize = 4;
+/// Largest term that speed adds to the unit of distance of a track, in sizes.
+const MAX_SPEED_UNITS: f32 = 3.0;
+/// Number that stands for no track, or no Gaussian.
 pub(super) const NONE: u32 = u32::MAX;
 
-/// Rounds of linking, each of what the one before left.
+/// Rounds of linking. Each round links what the previous ones left free.
 pub(super) const ROUNDS: [Round; 3] = [
-    Round { reach: 0.25, strictness: 4.0, missing: false },
-    Round { reach: 1.0, strictness: 1.0, missing: true },
-    Round { reach: 4.0, strictness: 4.0, missing: true },
+    Round { reach: 0.25, strictness: 4.0, includes_missing: false },
+    Round { reach: 1.0, strictness: 1.0, includes_missing: true },
+    Round { reach: 4.0, strictness: 4.0, includes_missing: true },
 ];
 
-/// r and q of the [module](super), and whether tracks take part that were not in the frame before.
+/// Parameters of a round: `reach` is r and `strictness` is q of the [module](super). `includes_missing` states whether tracks
+/// that were missing in the previous frame take part.
 pub(super) struct Round {
     pub(super) reach: f32,
     pub(super) strictness: f32,
-    pub(super) missing: bool,
+    pub(super) includes_missing: bool,
 }
 
-/// A track that may go on.
+/// Track that may continue.
 #[derive(Clone, Copy)]
 pub(super) struct OpenTrack {
     pub(super) number: u32,
-    /// Frames since it was seen: 1 for one of the frame before.
-    pub(super) ago: u32,
-    /// Scene units per frame; none before its first step.
+    /// Number of frames since the track was seen: 1 if it was seen in the previous frame.
+    pub(super) frames_since_seen: u32,
+    /// Velocity, scene units per frame; `None` before the first step.
     pub(super) velocity: Option<[f32; 3]>,
-    pub(super) look: ComparedAppearance,
-    /// Whether it has begun as nobody could tell which track goes on as it.
+    pub(super) appearance: ComparedAppearance,
+    /// Whether the track began because the link of its first Gaussian was doubtful.
     pub(super) is_in_doubt: bool,
-    /// Whether another was where it was expected when it was missed first: only as what it was to the bit it goes on.
+    /// Whether a Gaussian that looks like the track was at its expected position when it was first missing. The track
+    /// then continues only with an exact repeat.
     pub(super) is_succeeded: bool,
 }
 
-/// What going on as a Gaussian costs.
+/// Gaussian that may continue a track, and the cost of that link.
 #[derive(Clone, Copy, PartialEq)]
-pub(super) struct Offer {
+pub(super) struct Candidate {
     pub(super) cost: f32,
-    pub(super) point: u32,
+    pub(super) gaussian: u32,
 }
 
 impl OpenTrack {
-    /// One that begins.
-    pub(super) fn begin(number: u32, look: ComparedAppearance) -> OpenTrack {
-        OpenTrack { number, ago: 1, velocity: None, look, is_in_doubt: false, is_succeeded: false }
+    /// Creates a track that begins with a Gaussian.
+    pub(super) fn new(number: u32, appearance: ComparedAppearance) -> OpenTrack {
+        OpenTrack { number, frames_since_seen: 1, velocity: None, appearance, is_in_doubt: false, is_succeeded: false }
     }
 
-    /// Where it is expected.
-    pub(super) fn expected(&self) -> [f32; 3] {
+    /// Returns the expected position in the next frame.
+    pub(super) fn expected_position(&self) -> [f32; 3] {
         let velocity = self.velocity.unwrap_or_default();
-        std::array::from_fn(|c| self.look.position[c] + self.ago as f32 * velocity[c])
+        std::array::from_fn(|c| self.appearance.position[c] + self.frames_since_seen as f32 * velocity[c])
     }
 
-    /// u of the [module](super): what a distance is counted in.
-    fn unit(&self) -> f32 {
+    /// Returns u of the [module](super), the unit of distance.
+    fn distance_unit(&self) -> f32 {
         let speed = self.velocity.unwrap_or_default().iter().map(|v| v * v).sum::<f32>().sqrt();
-        self.look.size + (0.5 * self.ago as f32 * speed).min(MOST_FROM_SPEED * self.look.size)
+        self.appearance.size + (0.5 * self.frames_since_seen as f32 * speed).min(MAX_SPEED_UNITS * self.appearance.size)
     }
 
-    /// What going on as `look` costs; more than 1 where that is too much, whatever it is.
-    pub(super) fn cost(&self, look: &ComparedAppearance, round: &Round) -> f32 {
-        self.cost_at(look, self.expected(), round.reach * self.unit(), round.strictness)
+    /// Returns the cost that a Gaussian with this appearance continues the track. A link is impossible above 1; if the
+    /// distance alone costs more than 1, only that cost is returned.
+    pub(super) fn cost(&self, appearance: &ComparedAppearance, round: &Round) -> f32 {
+        self.cost_at(appearance, self.expected_position(), round.reach * self.distance_unit(), round.strictness)
     }
 
-    fn cost_at(&self, look: &ComparedAppearance, expected: [f32; 3], unit: f32, strictness: f32) -> f32 {
-        let distance: f32 = (0..3).map(|c| (look.position[c] - expected[c]).powi(2)).sum();
-        let apart = distance / (unit * unit);
-        // Most of those in its cells are too far away.
-        if apart > 1.0 { apart } else { apart + strictness * self.look.unlike(look) }
+    fn cost_at(&self, appearance: &ComparedAppearance, expected: [f32; 3], distance_unit: f32, strictness: f32) -> f32 {
+        let squared_distance: f32 = (0..3).map(|c| (appearance.position[c] - expected[c]).powi(2)).sum();
+        let distance = squared_distance / (distance_unit * distance_unit);
+        // Most Gaussians in the visited cells are too far away, so their difference is not computed.
+        if distance > 1.0 { distance } else { distance + strictness * self.appearance.difference(appearance) }
     }
 
-    /// Where it is, seen or not, in the frame that was linked last.
-    pub(super) fn now(&self) -> [f32; 3] {
+    /// Returns the position, observed or extrapolated, in the frame that was linked last.
+    pub(super) fn current_position(&self) -> [f32; 3] {
         let velocity = self.velocity.unwrap_or_default();
-        std::array::from_fn(|c| self.look.position[c] + (self.ago - 1) as f32 * velocity[c])
+        std::array::from_fn(|c| self.appearance.position[c] + (self.frames_since_seen - 1) as f32 * velocity[c])
     }
 
-    pub(super) fn see(&mut self, look: ComparedAppearance) {
-        let step: [f32; 3] = std::array::from_fn(|c| (look.position[c] - self.look.position[c]) / self.ago as f32);
+    /// Continues the track with a Gaussian of the next frame, and updates the velocity.
+    pub(super) fn extend(&mut self, appearance: ComparedAppearance) {
+        let step: [f32; 3] = std::array::from_fn(|c| {
+            (appearance.position[c] - self.appearance.position[c]) / self.frames_since_seen as f32
+        });
         self.velocity = Some(match self.velocity {
             None => step,
             Some(velocity) => std::array::from_fn(|c| 0.5 * (velocity[c] + step[c])),
         });
-        (self.look, self.ago, self.is_succeeded) = (look, 1, false);
+        (self.appearance, self.frames_since_seen, self.is_succeeded) = (appearance, 1, false);
     }
 
-    /// The Gaussians it may go on as.
-    pub(super) fn offers(&self, grid: &CellGrid, round: &Round) -> Offers {
-        let mut offers = Offers::default();
-        let (expected, unit) = (self.expected(), round.reach * self.unit());
-        grid.near(&self.look, expected, unit, |point, look| {
-            offers.add_within(self.cost_at(look, expected, unit, round.strictness), point);
+    /// Returns the Gaussians that may continue the track.
+    pub(super) fn candidates(&self, grid: &CellGrid, round: &Round) -> Candidates {
+        let mut candidates = Candidates::default();
+        let (expected, distance_unit) = (self.expected_position(), round.reach * self.distance_unit());
+        grid.for_each_near(&self.appearance, expected, distance_unit, |gaussian, appearance| {
+            candidates.add_within(self.cost_at(appearance, expected, distance_unit, round.strictness), gaussian);
         });
-        offers
+        candidates
     }
 }
 
-/// The cheapest offers of a track, in order.
-pub(super) struct Offers {
-    best: [Offer; NAMED],
+/// Candidates of least cost of a track, in the order of cost.
+pub(super) struct Candidates {
+    best: [Candidate; MAX_CANDIDATES],
 }
 
-impl Default for Offers {
-    fn default() -> Offers {
-        Offers { best: [Offer { cost: f32::INFINITY, point: NONE }; NAMED] }
+impl Default for Candidates {
+    fn default() -> Candidates {
+        Candidates { best: [Candidate { cost: f32::INFINITY, gaussian: NONE }; MAX_CANDIDATES] }
     }
 }
 
-impl Offers {
-    /// Takes in what costs 1 at most.
-    pub(super) fn add_within(&mut self, cost: f32, point: u32) {
+impl Candidates {
+    /// Adds a Gaussian if its cost is at most 1.
+    pub(super) fn add_within(&mut self, cost: f32, gaussian: u32) {
         if cost <= 1.0 {
-            self.add(Offer { cost, point });
+            self.add(Candidate { cost, gaussian });
         }
     }
 
-    fn add(&mut self, offer: Offer) {
-        let comes_before = |other: &Offer| (other.cost, other.point) < (offer.cost, offer.point);
-        let place = self.best.iter().take_while(|other| comes_before(other)).count();
-        if place < NAMED {
-            self.best[place..].rotate_right(1);
-            self.best[place] = offer;
+    fn add(&mut self, candidate: Candidate) {
+        let comes_before = |other: &Candidate| (other.cost, other.gaussian) < (candidate.cost, candidate.gaussian);
+        let index = self.best.iter().take_while(|other| comes_before(other)).count();
+        if index < MAX_CANDIDATES {
+            self.best[index..].rotate_right(1);
+            self.best[index] = candidate;
         }
     }
 
-    pub(super) fn iter(&self) -> impl Iterator<Item = &Offer> + Clone {
-        self.best.iter().take_while(|offer| offer.point != NONE)
+    pub(super) fn iter(&self) -> impl Iterator<Item = &Candidate> + Clone {
+        self.best.iter().take_while(|candidate| candidate.gaussian != NONE)
     }
 }

@@ -104,10 +104,10 @@ fn the_end_of_a_run_says_what_stays_what_it_costs_and_where_it_lies_in_few_lines
     let options = "compress {tiny} --cameras {tiny} --ratio 0.5";
     let most = workplace.done(&format!("{options} -o out"));
     let starts: Vec<&str> = most.lines().map(|line| line.split(' ').next().unwrap_or_default()).collect();
-    assert_eq!(starts[..5], ["kept", "size", "cost", "took", "lies"], "{most}");
+    assert_eq!(starts[..5], ["kept", "size", "quality", "took", "output"], "{most}");
     assert!(starts.len() <= 9 && most.contains("kept    150 of 300 Gaussians (50.0%)\n"), "{most}");
-    assert!(most.contains("\nlies in out\n"), "{most}");
-    assert!(["dB from the original's", "no difference in "].iter().any(|cost| most.contains(cost)), "{most}");
+    assert!(most.contains("\noutput  out\n"), "{most}");
+    assert!(["dB against the original", "no difference from the original in "].iter().any(|quality| most.contains(quality)), "{most}");
     assert!(!most.contains("left out") && !most.contains(" -> "), "{most}");
     let all = workplace.done(&format!("{options} -o again --verbose"));
     assert!(all.contains("left out: ") && all.contains(" -> ") && all.contains("\nkept    150"), "{all}");
@@ -453,7 +453,7 @@ fn every_verb_answers_on_stdout_and_keeps_quiet_elsewhere_when_asked_to() {
 fn a_demo_without_an_output_names_no_place() {
     let workplace = Workplace::new();
     let text = workplace.done("demo --gaussians 400 --frames 4 --quiet");
-    assert!(!text.contains("lies in"), "{text}");
+    assert!(!text.contains("output  "), "{text}");
     workplace.done("demo --gaussians 400 --frames 4 --quiet -o demo");
     let summary = fs::read_to_string(workplace.path("demo/summary.json")).unwrap();
     let summary: serde_json::Value = serde_json::from_str(&summary).unwrap();

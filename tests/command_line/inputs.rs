@@ -112,7 +112,7 @@ fn text_files_are_read_with_a_byte_order_mark_and_hints_fit_what_is_wrong() {
     write("bad.json", b"{\"frames\": [{\"file_path\": \"caf\xe9\"}]}");
     refused(&["bad.json, byte 30", "0xe9", "Latin-1"], &["NaN", "cut short"]);
     write("bad.json", b"{\"frames\": [{\"time\": NaN}]}");
-    refused(&["NaN and Infinity are no JSON"], &["cut short", "Latin-1"]);
+    refused(&["NaN and Infinity are not JSON"], &["cut short", "Latin-1"]);
     write("bad.json", b"\xff\xfe{\0");
     refused(&["UTF-16"], &["NaN", "Latin-1"]);
     write("r.toml", b"[score]\nmu = 2.0 # caf\xe9\n");
@@ -246,7 +246,7 @@ fn ground_truth_is_compared_where_it_exists_and_the_number_is_said() {
     assert!(commas.windows(2).all(|pair| pair[0] == pair[1]), "{csv}");
     fs::remove_dir_all(workplace.path("photos")).unwrap();
     fs::create_dir(workplace.path("photos")).unwrap();
-    workplace.refused(1, line, &["photos", "no such file, nor one of another picture"]);
+    workplace.refused(1, line, &["photos", "no such file, and no photograph of any other view"]);
 }
 
 #[test]
@@ -319,12 +319,12 @@ fn weights_that_contradict_cfg_args_are_believed_and_that_is_said() {
     let args = workplace.path("model/cfg_args");
     let text = fs::read_to_string(&args).unwrap();
     let line = "compress model -o out --dry-run --prune-only --no-refine --quiet";
-    assert!(!workplace.done(line).contains("believed"));
+    assert!(!workplace.done(line).contains("the weights are used"));
     let at = text.find("net_width=").expect("a width") + "net_width=".len();
     let end = at + text[at..].find(|c: char| !c.is_ascii_digit()).unwrap();
     fs::write(&args, format!("{}4321{}", &text[..at], &text[end..])).unwrap();
     let said = workplace.done(line);
-    assert!(said.contains("net_width = 4321") && said.contains("the weights are believed"), "{said}");
+    assert!(said.contains("net_width = 4321") && said.contains("the weights are used"), "{said}");
 }
 
 #[test]

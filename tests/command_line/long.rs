@@ -142,8 +142,8 @@ fn a_stream_longer_than_there_is_room_for_is_refused_and_the_memory_that_is_name
             assert!(text.contains(part), "{verb}: {part:?} is not in {text:?}");
         }
         assert!(fs::read_dir(workplace.path("")).unwrap().next().is_none(), "{verb}: something was left behind");
-        let enough = number(&text, "MiB, which is enough for ", ",") as usize;
-        let named = number(&text, "give it --memory ", "MiB") as u64;
+        let enough = number(&text, "MiB, which is enough for ", " frames") as usize;
+        let named = number(&text, "use --memory ", "MiB") as u64;
         let as_said = Walk { frames: enough, ..walk };
         keeps_to(&piped(&workplace, &request(named), as_said), verb, named as f64);
     }

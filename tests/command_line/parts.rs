@@ -122,7 +122,7 @@ fn a_report_in_parts_is_that_of_one_run_and_shares_the_parts_of_evaluate() {
     }
     part(2);
     let joined = workplace.run(&format!("--quiet report {models} {rest} -o page --cache work"));
-    let missing = "failure: missing of 3 parts, and computed here: 3";
+    let missing = "failure: of 3 parts these are missing and computed here: 3";
     assert!(joined.code == 0 && joined.stderr.contains(missing), "{}", joined.stderr);
     workplace.done(&format!("--quiet report {models} {rest} -o other"));
     assert!(files(&workplace.path("page")) == files(&workplace.path("other")));
@@ -158,7 +158,7 @@ fn a_missing_part_is_named_and_made_by_the_run_that_joins() {
     );
     let run = workplace.run(&format!("--quiet {line}"));
     assert!(
-        run.code == 0 && run.stderr.contains("render: missing of 5 parts, and computed here: 2, 5"),
+        run.code == 0 && run.stderr.contains("render: of 5 parts these are missing and computed here: 2, 5"),
         "{}",
         run.stderr
     );
@@ -313,8 +313,8 @@ fn divided_stages_are_listed_with_their_units() {
     let lines: Vec<&str> = listed.lines().collect();
     assert_eq!(lines[0], "scan: 2 blocks of Gaussians");
     assert!(lines[1].starts_with("visible: ") && lines[1].ends_with(" pictures"), "{listed}");
-    assert!(lines[2].starts_with("rounds-01: ") && lines.contains(&"pairs: pairs of neighbours"), "{listed}");
-    assert_eq!(list("--preset paper"), "scan: 2 blocks of Gaussians\npairs: pairs of neighbours\n");
+    assert!(lines[2].starts_with("rounds-01: ") && lines.contains(&"pairs: pairs of neighbors"), "{listed}");
+    assert_eq!(list("--preset paper"), "scan: 2 blocks of Gaussians\npairs: pairs of neighbors\n");
     assert!(list("").contains("targets: pictures"));
     workplace.refused(2, "compress scene.gseq -o out.gseq --list-stages --cache work --shard 1/2", &["--shard"]);
 }
@@ -334,7 +334,7 @@ fn a_work_folder_is_listed_and_cleaned() {
     assert!(workplace.done("work work --clean").starts_with("work: 2 files, "));
     assert_eq!(files(&workplace.path("work")).len(), 1);
     fs::remove_file(workplace.path("work/mine.txt")).unwrap();
-    assert_eq!(workplace.done("work work"), "nothing is kept here\n");
+    assert_eq!(workplace.done("work work"), "no results are stored here\n");
     workplace.done("work work --clean");
     workplace.refused(1, "work work", &["work"]);
     workplace.refused(2, "work work --clean --json", &["--json"]);
@@ -352,7 +352,7 @@ fn what_cannot_be_divided_is_refused() {
         ("render scene.gseq --all -o x --shard 1/2", "--cache"),
         ("evaluate scene.gseq smaller.gseq --cache work --shard 3/2", "i/n"),
         ("convert scene.gseq x.gseq --cache work --shard 0/2", "i/n"),
-        ("convert scene.gseq x.gseq --cache scene.gseq", "is no folder"),
+        ("convert scene.gseq x.gseq --cache scene.gseq", "expected a folder"),
     ] {
         workplace.refused(2, line, &[part]);
     }

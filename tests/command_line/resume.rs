@@ -188,7 +188,7 @@ fn a_stream_cannot_be_gone_on_with_and_a_part_needs_a_folder() {
     let workplace = Workplace::new();
     let output = ran(&workplace, "compress - -o out.gseq --cache work");
     assert_eq!(output.status.code(), Some(2));
-    assert!(told(&output).contains("splatsieve pack -"), "{}", told(&output));
+    assert!(told(&output).contains("splatsieve convert -"), "{}", told(&output));
     for (arguments, part) in [
         ("compress in.gseq -o out.gseq --shard 1/2", "--cache"),
         ("compress in.gseq -o out.gseq --cache work --shard 3/2", "3/8"),

@@ -8,7 +8,7 @@ use crate::scene::{PlyRows, Workplace, check_model_folder, index_map, lasting_fi
 use serde_json::Value;
 
 /// What a stage that runs writes down where nothing goes.
-const WHAT: &str = "fewer bands of spherical harmonics";
+const WHAT: &str = "lower SH degree";
 
 fn cloud_of(model: &Path) -> PathBuf {
     let folders = fs::read_dir(model.join("point_cloud")).unwrap();
@@ -87,7 +87,7 @@ fn bands_that_matter_stay_and_are_said_to() {
     let model = faint_above(&workplace, 3);
     let summary = workplace.summary(&format!("{QUICKLY} --ratio 0.5 --set bands_margin=90 -o small"));
     let why = why_left(&summary).unwrap();
-    assert!(why.contains("dB at degree 2") && why.contains("at least 60.0 dB were asked for"), "{why}");
+    assert!(why.contains("dB at degree 2") && why.contains("at least 60.0 dB against all degrees required"), "{why}");
     assert_eq!(summary["bands"]["sh_degree"], 3);
     let configs = [&model, &workplace.path("small")].map(|model| fs::read(model.join("cfg_args")).unwrap());
     assert!(configs[0] == configs[1]);
@@ -200,7 +200,7 @@ fn a_degree_that_is_asked_for_is_refined_to_its_best() {
             .as_array()
             .unwrap()
             .iter()
-            .any(|note| note == "harmonics above degree 0 of 3 go, as asked for")
+            .any(|note| note == "SH coefficients above degree 0 of 3 are dropped, as requested")
     );
     assert!(summary["bands"].is_null() && why_left(&summary).is_none());
     let configs = [&model, &workplace.path("small")].map(|model| fs::read_to_string(model.join("cfg_args")).unwrap());
@@ -269,7 +269,7 @@ fn so_many_bytes_go_to_the_degree_at_which_they_show_most() {
     assert_eq!([names("chosen"), names("all")], [17, 62]);
     let stage = |summary: &Value| summary["stages"].as_array().unwrap().iter().any(|stage| stage["name"] == "degree");
     assert_eq!([stage(&chosen), stage(&all)], [true, false]);
-    let said = |note: &&Value| note.as_str().unwrap().contains("those of SH degree 0 show most");
+    let said = |note: &&Value| note.as_str().unwrap().contains("SH degree 0 gives the best quality");
     assert_eq!(chosen["notes"].as_array().unwrap().iter().filter(said).count(), 1, "{}", chosen["notes"]);
     assert!(chosen["bands"].is_null() && chosen["output_bytes"].as_u64().unwrap() <= 85_000);
     let of = |summary: &Value| summary["gaussians"].as_u64().unwrap();

@@ -117,10 +117,13 @@ fn frames_are_linked_where_their_order_does_not_tell_or_where_asked() {
     let (kept, linked) = (open(&workplace, "kept", Link::Never), open(&workplace, "kept", Link::Always));
     assert_eq!(state(kept.source(), 8), state(linked.source(), 8));
     let said = workplace.done("compress mixed -o out --ratio 0.5 --no-refine --verbose --link always");
-    assert!(said.contains("frames were linked: as asked"), "{said}");
+    assert!(said.contains("frames were linked: as requested"), "{said}");
     assert!(fs::read_to_string(workplace.path("out/recipe.toml")).unwrap().contains("link = \"always\""));
     let said = workplace.done("compress kept -o in_order --ratio 0.5 --no-refine --verbose");
-    assert!(said.contains("frames are in one order: those of the same place are nearer than strangers"), "{said}");
+    assert!(
+        said.contains("frames have a common order: Gaussians of the same index are nearer than unrelated ones"),
+        "{said}"
+    );
     // What a work folder keeps of one opening is not taken for the other's.
     let small = "compress mixed --ratio 0.5 --no-refine --cache work --link";
     workplace.done(&format!("{small} never -o never"));
@@ -182,7 +185,11 @@ fn lives_that_fade_into_one_another_are_one_track_and_one_row() {
     let [apart_count, joined_count] = [&apart, &joined].map(|scene| scene.source().info().count);
     assert!(apart_count > 2 * count && joined_count <= count + count / 20, "{apart_count}, {joined_count}");
     let notes = joined.input.notes().join("\n");
-    assert!(notes.contains(&format!("{apart_count} lives of ")) && notes.contains("pictures stay within"), "{notes}");
+    assert!(
+        notes.contains(&format!("{apart_count} tracks with a median length of "))
+            && notes.contains("renders stay within"),
+        "{notes}"
+    );
     assert!(!apart.input.notes().join("\n").contains("were joined"));
     // As opaque as both were, in one row.
     workplace.done("compress frames -o all --ratio 1 --no-refine --prune-only --set bands=all");
@@ -327,7 +334,7 @@ fn what_hardly_changes_along_a_track_is_held_at_its_mean() {
     }
     assert!(parts.iter().flatten().all(|&part| part > 20), "{parts:?}");
     let notes = held.input.notes().join("\n");
-    assert!(notes.contains("% of the colours (within 0.04)") && notes.contains("pictures stay within"), "{notes}");
+    assert!(notes.contains("% of the colors (within 0.04)") && notes.contains("renders stay within"), "{notes}");
     // Files say the same, to the bit.
     workplace.done("compress frames -o all --ratio 1 --no-refine --prune-only --set bands=all");
     for (t, found) in found.iter().enumerate() {
@@ -411,7 +418,7 @@ fn a_cut_begins_new_tracks_and_is_told() {
     let scene = open(&workplace, "frames", Link::Apart);
     assert_eq!(scene.source().info().count, 600);
     let notes = scene.input.notes().join("\n");
-    assert!(notes.contains("a cut: 5.ply"), "{notes}");
+    assert!(notes.contains("a cut at 5.ply"), "{notes}");
 }
 
 #[test]
@@ -574,9 +581,9 @@ fn lives_of_a_container_and_of_its_stream_are_joined_where_asked() {
         workplace.done(&format!("compress lives.gseq -o {to} --count 200 --no-refine --verbose --link {link}"))
     };
     let said = compress("apart.gseq", "auto");
-    assert!(said.contains(" of 40 frames in the median: --link always makes one of lives that are one"), "{said}");
+    assert!(said.contains(" of 40 frames (median): --link always joins Gaussians that continue one another"), "{said}");
     let said = compress("joined.gseq", "always");
-    assert!(said.contains("were joined to these tracks") && !said.contains("--link always makes"), "{said}");
+    assert!(said.contains("were joined to ") && !said.contains("--link always joins"), "{said}");
     // In each frame what was there is there once.
     for t in (0..frames).step_by(13) {
         let mut whole = Gaussians::zeros(count, 1);
@@ -639,5 +646,5 @@ fn links_that_nobody_can_tell_begin_new_tracks_and_are_told() {
         workplace.ply(&format!("tiny/{t}.ply"), &state(scene.source(), t).pick(&order));
     }
     let notes = open(&workplace, "tiny", Link::Auto).input.notes().join("\n");
-    assert!(notes.contains("could not be told from others"), "{notes}");
+    assert!(notes.contains("links were ambiguous"), "{notes}");
 }

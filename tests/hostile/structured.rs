@@ -186,7 +186,7 @@ fn lengths_that_a_pickle_does_not_hold_are_refused() {
 fn the_largest_memo_numbers_cost_no_memory() {
     let folder = Folder::new();
     write_checkpoint(&folder.path("a.pt"), once(b"\x80\x02Nr\xff\xff\xff\xffr\xfe\xff\xff\xff0j\xff\xff\xff\xff."));
-    info(&folder, "a.pt").refused(1, &["a.pt: expected a model of a family that is read"]);
+    info(&folder, "a.pt").refused(1, &["a.pt: expected a supported model format"]);
 }
 
 #[test]
@@ -259,7 +259,7 @@ fn an_old_checkpoint_is_refused_with_the_way_out() {
     let old = b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P\x19.\x80\x02M\xe9\x03.".to_vec();
     let model = model_with_network(&folder, Entry::stored("a/data.pkl", once(b"N.")));
     folder.write("model/point_cloud/iteration_7/deformation.pth", &old);
-    info(&folder, model).refused(1, &["deformation.pth", "one of PyTorch before 1.6 has to be loaded and saved anew"]);
+    info(&folder, model).refused(1, &["deformation.pth", "if PyTorch before 1.6 saved it, load it and save it again"]);
 }
 
 /// Writes a file piece by piece.

@@ -1,45 +1,45 @@
-//! A camera: where it stands and what it shows of the world.
+//! Pinhole cameras: pose and intrinsics.
 
 use glam::{DMat3, DVec3};
 use serde::{Deserialize, Serialize};
 
-/// A pinhole camera in OpenCV axes (x right, y down, z forward); pixel centers at half integers.
+/// Pinhole camera in OpenCV axes (x right, y down, z forward). Pixel centers lie at half integers.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Camera {
-    /// Picture width in pixels.
+    /// Image width in pixels.
     pub width: u32,
-    /// Picture height in pixels.
+    /// Image height in pixels.
     pub height: u32,
     /// Focal length along x in pixels.
     pub fx: f64,
     /// Focal length along y in pixels.
     pub fy: f64,
-    /// Principal point in pixels; the picture's middle is `width / 2`.
+    /// Horizontal principal point in pixels; the image center is at `width / 2`.
     pub cx: f64,
-    /// Principal point in pixels.
+    /// Vertical principal point in pixels; the image center is at `height / 2`.
     pub cy: f64,
-    /// World to camera.
+    /// Rotation from world to camera.
     pub rotation: DMat3,
-    /// World to camera: `x_camera = rotation · x_world + translation`.
+    /// Translation from world to camera: `x_camera = rotation · x_world + translation`.
     pub translation: DVec3,
-    /// View depth up to which nothing is seen, scene units.
+    /// View depth in scene units; Gaussians at this depth or nearer are not drawn.
     pub near: f64,
 }
 
 impl Camera {
-    /// [`Camera::near`] of the original rasteriser, for which models are trained.
+    /// Value of [`Camera::near`] in the original CUDA rasterizer, with which models are trained.
     pub const NEAR: f64 = 0.2;
 
-    /// A camera at `eye` with `target` in the middle of its picture, z up in it, pixels square.
+    /// Creates a camera at `eye` that has `target` in its image center, world z pointing up and square pixels.
     ///
-    /// `angle` is the horizontal field of view in radians, `size` (width, height) in pixels. The two
-    /// points must differ and not lie above one another; else the rotation is NaN.
-    pub fn look_at(eye: DVec3, target: DVec3, angle: f64, (width, height): (u32, u32)) -> Camera {
+    /// `horizontal_fov` is the horizontal field of view in radians; the size is (width, height) in pixels. The rotation
+    /// is NaN if the two points are equal or lie on one vertical line.
+    pub fn look_at(eye: DVec3, target: DVec3, horizontal_fov: f64, (width, height): (u32, u32)) -> Camera {
         let forward = (target - eye).normalize();
         let right = forward.cross(DVec3::Z).normalize();
         let down = forward.cross(right);
         let rotation = DMat3::from_cols(right, down, forward).transpose();
-        let focal = 0.5 * f64::from(width) / (0.5 * angle).tan();
+        let focal = 0.5 * f64::from(width) / (0.5 * horizontal_fov).tan();
         Camera {
             width,
             height,
@@ -53,7 +53,7 @@ impl Camera {
         }
     }
 
-    /// Position of the camera in the world.
+    /// Returns the position of the camera in the world, scene units.
     pub fn center(&self) -> DVec3 {
         -(self.rotation.transpose() * self.translation)
     }
@@ -64,14 +64,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn center_is_where_camera_coordinates_vanish() {
+    fn center_has_camera_coordinates_zero() {
         let camera = Camera::look_at(DVec3::new(1.0, 2.0, 3.0), DVec3::new(-1.0, 0.5, 0.0), 0.9, (10, 10));
         assert!((camera.center() - DVec3::new(1.0, 2.0, 3.0)).length() < 1e-14);
         assert!((camera.rotation * camera.center() + camera.translation).length() < 1e-14);
     }
 
     #[test]
-    fn target_is_in_the_middle_and_z_is_up() {
+    fn target_is_in_the_image_center_and_z_is_up() {
         let target = DVec3::new(-1.0, 0.5, 0.0);
         let camera = Camera::look_at(DVec3::new(1.0, 2.0, 3.0), target, 0.9, (40, 30));
         let seen = camera.rotation * target + camera.translation;

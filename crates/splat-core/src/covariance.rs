@@ -1,24 +1,29 @@
-//! Scale and rotation of a covariance that no parameters say.
+//! Scales and rotation of a covariance matrix that is not given by scales and a rotation.
 //!
-//! Some families give Σ by a formula that is not R S Sᵀ Rᵀ of what they store: a quaternion that is not of unit length, a
-//! slice through four dimensions. Renderers and statistics here want scales and a rotation.
+//! Some model formats define Σ by a formula other than R S Sᵀ Rᵀ of stored values: with a quaternion that is not of
+//! unit length, or as a slice through a four-dimensional Gaussian. Renderers and statistics need scales and a rotation.
 
 use glam::{DMat3, DQuat, DVec3};
 
-/// Smallest eigenvalue: a scale of 1e-7.
-const LEAST: f64 = 1e-14;
-/// Sweeps over the three pairs; convergence is quadratic, and 6 to 8 are enough from anywhere.
+/// Smallest eigenvalue, squared scene units: that of a scale of 1e-7.
+const MIN_EIGENVALUE: f64 = 1e-14;
+/// Maximum number of sweeps over the three off-diagonal entries. Convergence is quadratic; 6 to 8 sweeps suffice from
+/// any start.
 const MAX_SWEEPS: usize = 12;
 
-/// Scales s and unit rotation R, wxyz, with Σ = R diag(s)² Rᵀ, of `sigma`: xx xy xz yy yz zz, squared scene units.
+/// Computes scales s and a unit quaternion (wxyz) of R with Σ = R diag(s)² Rᵀ. `sigma` holds xx xy xz yy yz zz of Σ,
+/// squared scene units.
 ///
-/// Axes are named and turned as those of the quaternion `like` (wxyz, of any length but 0; 0 is the identity) are: of the
-/// six orders the one whose axes lie closest to them, each in the direction of its own, but for the furthest where that
-/// would be a reflection; so is the quaternion's sign. Where eigenvalues coincide any axes are right, and those of `like`
-/// are taken if they are among them. The answer depends on nothing else, so that a Gaussian's state at a time is one.
+/// The order and directions of the axes follow the quaternion `like` (wxyz, of any length; 0 counts as the identity).
+/// Of the six orders of the axes, the one closest to the axes of `like` is taken. Each axis points in the direction of
+/// its counterpart, except that the axis furthest from its counterpart is reversed if the axes would form a reflection
+/// otherwise. The sign of the result follows the sign of `like`. If eigenvalues coincide, any axes are valid, and the
+/// axes of `like` are taken if they are valid. The result depends on nothing else, so a Gaussian has one state at each
+/// time.
 ///
-/// Jacobi's method in f64, from the axes of `like`: Σ is met to about 1e-15 of its largest entry. Eigenvalues are at least
-/// 1e-14, also such as rounding made negative. An entry that is not finite gives NaN scales and `like`.
+/// Method: Jacobi iteration in f64, started at the axes of `like`. The result reproduces Σ to about 1e-15 of its
+/// largest entry. Eigenvalues are at least 1e-14, also those that rounding made negative. An entry that is not finite
+/// gives NaN scales and the rotation `like`.
 pub fn scale_rotation(sigma: [f64; 6], like: [f64; 4]) -> ([f64; 3], [f64; 4]) {
     let [xx, xy, xz, yy, yz, zz] = sigma;
     let like = DQuat::from_xyzw(like[1], like[2], like[3], like[0]);
@@ -26,14 +31,14 @@ pub fn scale_rotation(sigma: [f64; 6], like: [f64; 4]) -> ([f64; 3], [f64; 4]) {
     if sigma.iter().any(|x| !x.is_finite()) {
         return ([f64::NAN; 3], [like.w, like.x, like.y, like.z]);
     }
-    let own = DMat3::from_quat(like);
-    let whole = DMat3::from_cols(DVec3::new(xx, xy, xz), DVec3::new(xy, yy, yz), DVec3::new(xz, yz, zz));
-    let turned = own.transpose() * whole * own;
-    let entry = |i: usize, j: usize| 0.5 * (turned.col(j)[i] + turned.col(i)[j]);
+    let axes_of_like = DMat3::from_quat(like);
+    let covariance = DMat3::from_cols(DVec3::new(xx, xy, xz), DVec3::new(xy, yy, yz), DVec3::new(xz, yz, zz));
+    let in_axes_of_like = axes_of_like.transpose() * covariance * axes_of_like;
+    let entry = |i: usize, j: usize| 0.5 * (in_axes_of_like.col(j)[i] + in_axes_of_like.col(i)[j]);
     let entries = [0, 1, 2].map(|i| [0, 1, 2].map(|j| entry(i, j)));
     let (values, axes) = eigen(entries);
 
-    // Component i of axis j is its product with axis i of `like`.
+    // Component i of axis j is its scalar product with axis i of `like`.
     let mut best = ([0, 1, 2], f64::NEG_INFINITY);
     for order in [[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]] {
         let closeness: f64 = (0..3).map(|i| axes[order[i]][i].abs()).sum();
@@ -46,18 +51,18 @@ pub fn scale_rotation(sigma: [f64; 6], like: [f64; 4]) -> ([f64; 3], [f64; 4]) {
         let furthest = (1..3).fold(0, |least, i| if frame[i][i] < frame[least][least] { i } else { least });
         frame[furthest] = -frame[furthest];
     }
-    let by = DQuat::from_mat3(&DMat3::from_cols(frame[0], frame[1], frame[2]));
-    let rotation = (like * by).normalize();
+    let relative_rotation = DQuat::from_mat3(&DMat3::from_cols(frame[0], frame[1], frame[2]));
+    let rotation = (like * relative_rotation).normalize();
     let rotation = if rotation.dot(like) < 0.0 { -rotation } else { rotation };
-    (best.0.map(|axis| values[axis].max(LEAST).sqrt()), [rotation.w, rotation.x, rotation.y, rotation.z])
+    (best.0.map(|axis| values[axis].max(MIN_EIGENVALUE).sqrt()), [rotation.w, rotation.x, rotation.y, rotation.z])
 }
 
-/// Eigenvalues and unit eigenvectors of a symmetric matrix.
+/// Computes the eigenvalues and unit eigenvectors of a symmetric matrix by Jacobi iteration.
 fn eigen(mut a: [[f64; 3]; 3]) -> ([f64; 3], [DVec3; 3]) {
     let mut axes = [DVec3::X, DVec3::Y, DVec3::Z];
     let scale = a.iter().flatten().fold(0.0f64, |most, x| most.max(x.abs()));
     for _ in 0..MAX_SWEEPS {
-        // Beneath this an entry changes no digit of the eigenvalues that the largest leaves.
+        // A smaller off-diagonal entry does not change the eigenvalues at f64 precision.
         if a[0][1].abs().max(a[0][2].abs()).max(a[1][2].abs()) <= 1e-18 * scale {
             break;
         }
@@ -65,7 +70,7 @@ fn eigen(mut a: [[f64; 3]; 3]) -> ([f64; 3], [DVec3; 3]) {
             if a[p][q] == 0.0 {
                 continue;
             }
-            // The smaller of the two angles: axes stay near where they were.
+            // The smaller of the two rotation angles keeps the axes near their present directions.
             let zeta = (a[q][q] - a[p][p]) / (2.0 * a[p][q]);
             let tangent = 1f64.copysign(zeta) / (zeta.abs() + zeta.hypot(1.0));
             let cosine = 1.0 / tangent.hypot(1.0);
@@ -91,7 +96,7 @@ mod tests {
         prop::array::uniform4(-2.0..2.0f64).prop_filter("direction", |q| q.iter().map(|x| x * x).sum::<f64>() > 0.05)
     }
 
-    /// R diag(s)² Rᵀ of a quaternion of any length, by the formula of unit ones after dividing by its length.
+    /// Returns R diag(s)² Rᵀ of a quaternion of any length, with the formula of unit quaternions after normalization.
     fn sigma(scales: [f64; 3], q: [f64; 4]) -> [f64; 6] {
         let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
         let [w, x, y, z] = q.map(|c| c / length);
@@ -104,30 +109,31 @@ mod tests {
         [entry(0, 0), entry(0, 1), entry(0, 2), entry(1, 1), entry(1, 2), entry(2, 2)]
     }
 
-    fn off(got: [f64; 6], expected: [f64; 6]) -> f64 {
+    /// Returns the largest difference of the entries, relative to the largest expected entry.
+    fn relative_error(got: [f64; 6], expected: [f64; 6]) -> f64 {
         let most = expected.iter().fold(0.0f64, |most, x| most.max(x.abs()));
-        got.iter().zip(expected).fold(0.0f64, |off, (a, b)| off.max((a - b).abs())) / most
+        got.iter().zip(expected).fold(0.0f64, |largest, (a, b)| largest.max((a - b).abs())) / most
     }
 
     proptest! {
         #[test]
-        fn factors_make_the_covariance_again(
+        fn scales_and_rotation_reproduce_the_covariance(
             q in quaternion(), like in quaternion(), logs in prop::array::uniform3(-6.0..1.0f64)
         ) {
             let expected = sigma(logs.map(f64::exp), q);
             let (scales, rotation) = scale_rotation(expected, like);
-            let off = off(sigma(scales, rotation), expected);
-            prop_assert!(off < 4e-15, "off by {off:e}: {scales:?} {rotation:?}");
+            let relative_error = relative_error(sigma(scales, rotation), expected);
+            prop_assert!(relative_error < 4e-15, "off by {relative_error:e}: {scales:?} {rotation:?}");
             prop_assert!((rotation.iter().map(|x| x * x).sum::<f64>() - 1.0).abs() < 1e-14);
             prop_assert!((0..4).map(|c| rotation[c] * like[c]).sum::<f64>() >= 0.0);
         }
 
         #[test]
-        fn a_covariance_of_nearby_axes_keeps_their_names(
-            q in quaternion(), by in prop::array::uniform3(-0.1..0.1f64), logs in prop::array::uniform3(-3.0..1.0f64)
+        fn axes_keep_their_order_under_a_small_rotation(
+            q in quaternion(), turn in prop::array::uniform3(-0.1..0.1f64), logs in prop::array::uniform3(-3.0..1.0f64)
         ) {
             prop_assume!((0..3).all(|i| (logs[i] - logs[(i + 1) % 3]).abs() > 1e-3));
-            // Nearby: less than a twelfth of a turn in all.
+            // The two rotations differ by less than a twelfth of a turn.
             let [w, x, y, z] = q;
             let product = |[a, b, c, d]: [f64; 4]| [
                 w * a - x * b - y * c - z * d,
@@ -135,7 +141,7 @@ mod tests {
                 w * c - x * d + y * a + z * b,
                 w * d + x * c - y * b + z * a,
             ];
-            let near = product([1.0, by[0], by[1], by[2]]);
+            let near = product([1.0, turn[0], turn[1], turn[2]]);
             let (scales, rotation) = scale_rotation(sigma(logs.map(f64::exp), near), q);
             for i in 0..3 {
                 prop_assert!((scales[i].ln() - logs[i]).abs() < 1e-9, "{scales:?} {logs:?}");
@@ -146,16 +152,16 @@ mod tests {
     }
 
     #[test]
-    fn a_ball_has_the_axes_it_is_compared_with() {
+    fn equal_scales_keep_the_axes_of_like() {
         let like = [0.5, -0.5, 0.5, 0.5];
         let (scales, rotation) = scale_rotation([4.0, 0.0, 0.0, 4.0, 0.0, 4.0], like);
         assert_eq!((scales, rotation), ([2.0; 3], like));
     }
 
     #[test]
-    fn flat_and_tiny_ones_have_small_scales_and_no_nan() {
+    fn flat_and_tiny_covariances_have_small_finite_scales() {
         let like = [1.0, 0.0, 0.0, 0.0];
-        // Rank 1, rounded: the two others may come out negative.
+        // Rank 1; rounding may make the other two eigenvalues negative.
         let v = [0.1f64, 0.7, -0.3];
         let (scales, rotation) =
             scale_rotation([v[0] * v[0], v[0] * v[1], v[0] * v[2], v[1] * v[1], v[1] * v[2], v[2] * v[2]], like);

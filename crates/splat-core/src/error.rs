@@ -6,77 +6,81 @@ use std::path::{Path, PathBuf};
 
 pub use gseq::{ShowPath, printable, quoted};
 
-/// Result of anything that can fail here.
+/// Result of an operation that fails with [`Error`].
 pub type Result<T> = std::result::Result<T, Error>;
 
-/// Every failure of this library.
+/// Failure of any operation of the library.
 ///
-/// [`Error::kind`] says which kind a failure is of, and [`ErrorKind::exit_code`] how the command ends:
+/// [`Error::kind`] returns the kind of a failure, and [`ErrorKind::exit_code`] the exit code of the command:
 ///
 /// | exit code | kind | meaning |
 /// |---|---|---|
-/// | 0 | – | Done. Also: the part of the work that was asked for is done. |
-/// | 1 | [`Input`](ErrorKind::Input) | A file that is read is missing, malformed, or larger than may be read. |
+/// | 0 | – | Success. Also: the requested part of the work is done. |
+/// | 1 | [`Input`](ErrorKind::Input) | An input file is missing, malformed, or larger than allowed. |
 /// | 1 | [`Output`](ErrorKind::Output) | The result or a temporary file cannot be written. |
-/// | 1 | [`Internal`](ErrorKind::Internal) | Splatsieve contradicts itself, or the self-check failed. |
-/// | 2 | [`Usage`](ErrorKind::Usage) | The arguments or the recipe make no sense, or do not fit the input. |
-/// | 2 | [`MemoryLimit`](ErrorKind::MemoryLimit) | The request takes more memory than `--memory` allows. |
+/// | 1 | [`Internal`](ErrorKind::Internal) | A bug in splatsieve, or the self-check failed. |
+/// | 2 | [`Usage`](ErrorKind::Usage) | The arguments or the recipe are invalid, or do not fit the input. |
+/// | 2 | [`MemoryLimit`](ErrorKind::MemoryLimit) | The request needs more memory than `--memory` allows. |
 /// | 128 + signal | [`Interrupted`](ErrorKind::Interrupted) | A signal ended the run. |
 ///
-/// A panic is an internal fault too; the Rust runtime ends it with exit code 101.
+/// A panic is also a bug; the Rust runtime ends it with exit code 101.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// A file holds something other than what it must hold: mend or replace the file.
+    /// Malformed content of a file. The user repairs or replaces the file.
     #[error("{0}")]
     Input(Box<InputError>),
-    /// The operating system refused: check the path, the permissions, the space left.
+    /// Failed system call. The user checks the path, the permissions and the free space.
     #[error("cannot {action} {path}: {source}{advice}", path = path.shown(), advice = advice(source))]
     Io {
-        /// What was being done, as a verb: "open", "create", "rename".
+        /// Attempted operation, as a verb: "open", "create", "rename".
         action: &'static str,
-        /// The file it was done to.
+        /// File that the operation was applied to.
         path: PathBuf,
-        /// The system's reason.
+        /// Error of the operating system.
         source: io::Error,
     },
-    /// The request itself makes no sense: change the arguments or the recipe.
+    /// Invalid request. The user changes the arguments or the recipe.
     #[error("{0}")]
     Usage(String),
-    /// The request takes more memory than it may take: raise the limit.
+    /// Request that needs more memory than allowed. The user raises the limit.
     #[error("{0}")]
     MemoryLimit(String),
-    /// Early end of a run that was asked for one part of the work and has done it. Stages return it to their callers; the
-    /// public entry points of the library turn it into a success, so no caller of the library sees it.
+    /// Early end of a run that was asked for one shard of the work and has finished it. Stages return it to their
+    /// callers. The public entry points of the library turn it into a success, so callers of the library never see it.
     #[error("{0}")]
     ShardDone(String),
-    /// The program contradicts itself, whatever the request and the input.
-    #[error("internal error: {0}\n  this is a fault of splatsieve: report it with the command line and this message")]
+    /// Inconsistent state inside the program, whatever the request and the input: a bug.
+    #[error(
+        "internal error: {0}\n  this is a bug in splatsieve: please report it with the command line and this message"
+    )]
     Internal(String),
-    /// Numbers that must agree do not: a broken build, or a broken machine.
-    #[error("selfcheck failed: {0}\n  trust no result of this program on this machine, and report the table above")]
+    /// Results of the self-check that should agree but do not: a broken build or a broken machine.
+    #[error(
+        "selfcheck failed: {0}\n  do not trust results of this program on this machine, and report the table above"
+    )]
     Unsound(String),
-    /// A `gseq` container is malformed.
+    /// Malformed `gseq` container, or failed access to it.
     #[error(transparent)]
     Container(#[from] gseq::Error),
 }
 
-/// Kind of a failure, which decides the exit code; see the table at [`Error`].
+/// Kind of a failure, which decides the exit code. See the table at [`Error`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ErrorKind {
-    /// The arguments or the recipe make no sense, or do not fit the input.
+    /// The arguments or the recipe are invalid, or do not fit the input.
     Usage,
-    /// A file that is read is missing, malformed, or larger than may be read.
+    /// An input file is missing, malformed, or larger than allowed.
     Input,
     /// The result or a temporary file cannot be written.
     Output,
-    /// The request takes more memory than it may take.
+    /// The request needs more memory than allowed.
     MemoryLimit,
-    /// A signal ended the run. No [`Error`] is of this kind: the handler of the signal ends the process.
+    /// A signal ended the run. No [`Error`] has this kind, because the signal handler ends the process.
     Interrupted {
         /// Number of the signal.
         signal: u8,
     },
-    /// The program contradicts itself, or the self-check failed.
+    /// A bug in splatsieve, or a failed self-check.
     Internal,
 }
 
@@ -90,28 +94,28 @@ impl ErrorKind {
         }
     }
 
-    /// Returns the kind of a failed system call, by what was being done.
+    /// Returns the kind of a failed system call from its `action`.
     fn from_action(action: &str) -> ErrorKind {
         const READING: [&str; 7] = ["open", "read", "list", "find", "map", "examine", "decompress"];
         let verb = action.split(' ').next().unwrap_or_default();
-        // Only what this run wrote itself is read back.
+        // Only files that this run wrote are read back, so that a failure concerns an output.
         let is_reading = READING.contains(&verb) && !action.starts_with("read back");
         if is_reading { ErrorKind::Input } else { ErrorKind::Output }
     }
 }
 
-/// A malformed input: which file, where in it, what was expected, what was found, what to do.
+/// Description of a malformed input: file, place in the file, expectation, finding, and advice.
 #[derive(Debug)]
 pub struct InputError {
-    /// The file (or folder) that was read.
+    /// File or folder that was read.
     pub path: PathBuf,
-    /// The place in it: "byte 1234", "element vertex", "frame 12, Gaussian 7"; may be empty.
+    /// Place in the file: "byte 1234", "element vertex", "frame 12, Gaussian 7". May be empty.
     pub place: String,
-    /// What a valid file would hold there.
+    /// Content that a valid file has at this place.
     pub expected: String,
-    /// What this one holds.
+    /// Content that this file has at this place.
     pub found: String,
-    /// What to do next; may be empty.
+    /// Advice on the next step. May be empty.
     pub hint: String,
 }
 
@@ -129,17 +133,18 @@ impl fmt::Display for InputError {
     }
 }
 
+/// Returns a line of advice for the user if the disk or the quota is full, otherwise an empty text.
 fn advice(source: &io::Error) -> &'static str {
     match source.kind() {
         io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded => {
-            "\n  make room there, or name another place: the output with -o, scratch files with --scratch-dir"
+            "\n  free disk space there, or choose another place: -o for the output, --scratch-dir for temporary files"
         }
         _ => "",
     }
 }
 
 impl Error {
-    /// A malformed input file; see [`InputError`].
+    /// Returns the error of a malformed input file. See [`InputError`].
     pub fn input(path: &Path, place: impl Into<String>, expected: impl Into<String>, found: impl Into<String>) -> Self {
         Error::Input(Box::new(InputError {
             path: path.to_owned(),
@@ -150,7 +155,7 @@ impl Error {
         }))
     }
 
-    /// The same error with advice on what to do next.
+    /// Adds advice on the next step to an input error. Other errors stay unchanged.
     pub fn hint(mut self, hint: impl Into<String>) -> Self {
         if let Error::Input(input) = &mut self {
             input.hint = hint.into();
@@ -158,18 +163,19 @@ impl Error {
         self
     }
 
-    /// A failed system call on `path`; use as `.map_err(Error::io("open", path))`.
+    /// Returns a function that makes an [`Error::Io`] of a failed system call on `path`. Use as
+    /// `.map_err(Error::io("open", path))`.
     pub fn io(action: &'static str, path: &Path) -> impl FnOnce(io::Error) -> Self {
         let path = path.to_owned();
         move |source| Error::Io { action, path, source }
     }
 
-    /// A request that makes no sense.
+    /// Returns the error of an invalid request.
     pub fn usage(message: impl Into<String>) -> Self {
         Error::Usage(message.into())
     }
 
-    /// A contradiction within the program.
+    /// Returns the error of an inconsistent state inside the program.
     pub fn internal(message: impl Into<String>) -> Self {
         Error::Internal(message.into())
     }

@@ -1,12 +1,12 @@
-//! The state of a block of Gaussians at one instant, as planes of f32.
+//! Attributes of a block of Gaussians at one frame, as planes of f32.
 
 use bitflags::bitflags;
 use serde::{Deserialize, Serialize};
 
 use super::sh_coefficients;
 
-/// One attribute of `len` Gaussians: `width` planes, plane `c` holding component `c` of every
-/// Gaussian. Planes keep the inner loops of projection and statistics contiguous.
+/// Values of one attribute of `len` Gaussians: `width` planes, where plane `c` holds component `c` of every Gaussian.
+/// The plane layout keeps the inner loops of projection and statistics contiguous in memory.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct Column {
     width: usize,
@@ -15,73 +15,73 @@ pub struct Column {
 }
 
 impl Column {
-    /// `width × len` zeros.
+    /// Creates `width × len` zeros.
     pub fn zeros(width: usize, len: usize) -> Self {
         Column { width, len, data: vec![0.0; width * len] }
     }
 
-    /// Planes of equal length, one after the other: `[width, len]`.
+    /// Creates an attribute from its planes, one after the other: `[width, len]`.
     ///
     /// # Panics
-    /// If `width` planes of equal length do not make up `data`.
+    /// If the length of `data` is not a multiple of `width`.
     pub fn from_planes(width: usize, data: Vec<f32>) -> Self {
         assert!(data.len().is_multiple_of(width), "{} values are not {width} planes", data.len());
         Column { width, len: data.len() / width, data }
     }
 
-    /// Components per Gaussian.
+    /// Returns the number of components per Gaussian.
     pub fn width(&self) -> usize {
         self.width
     }
 
-    /// Number of Gaussians.
+    /// Returns the number of Gaussians.
     pub fn len(&self) -> usize {
         self.len
     }
 
-    /// Whether there are no Gaussians.
+    /// Returns whether there are no Gaussians.
     pub fn is_empty(&self) -> bool {
         self.len == 0
     }
 
-    /// Makes room for `len` Gaussians; the values are unspecified until written.
+    /// Resizes to `len` Gaussians. The values are unspecified until written.
     pub fn resize(&mut self, len: usize) {
         self.len = len;
         self.data.resize(self.width * len, 0.0);
     }
 
-    /// Leaves the first `width` components, of more.
+    /// Keeps the first `width` components and drops the others.
     fn narrow(&mut self, width: usize) {
         self.width = width;
         self.data.truncate(width * self.len);
     }
 
-    /// Component `c` of every Gaussian.
+    /// Returns component `c` of every Gaussian.
     pub fn plane(&self, c: usize) -> &[f32] {
         &self.data[c * self.len..(c + 1) * self.len]
     }
 
-    /// Component `c` of every Gaussian, to write.
+    /// Returns component `c` of every Gaussian for writing.
     pub fn plane_mut(&mut self, c: usize) -> &mut [f32] {
         &mut self.data[c * self.len..(c + 1) * self.len]
     }
 
-    /// All planes, one after the other: `[width, len]`.
+    /// Returns all planes, one after the other: `[width, len]`.
     pub fn planes(&self) -> &[f32] {
         &self.data
     }
 
-    /// All planes, to write: `[width, len]`.
+    /// Returns all planes for writing: `[width, len]`.
     pub fn planes_mut(&mut self) -> &mut [f32] {
         &mut self.data
     }
 
-    /// The first `W` components of Gaussian `i`.
+    /// Returns the first `W` components of Gaussian `i`.
     pub fn row<const W: usize>(&self, i: usize) -> [f32; W] {
         std::array::from_fn(|c| self.data[c * self.len + i])
     }
 
-    /// The Gaussians `rows`, in that order.
+    /// Returns the values of the Gaussians `rows`, in that order.
     pub fn pick(&self, rows: &[u32]) -> Column {
         let data = (0..self.width).flat_map(|c| rows.iter().map(move |&i| self.plane(c)[i as usize])).collect();
         Column { width: self.width, len: rows.len(), data }
@@ -95,26 +95,26 @@ impl Column {
     }
 }
 
-/// Gaussians at one instant in stored encoding: position, wxyz quaternion (not necessarily unit),
-/// natural log of the scales, opacity logit, spherical harmonics.
+/// Attributes of Gaussians at one frame in stored encoding: position, wxyz quaternion (not necessarily of unit length),
+/// natural logarithm of the scales, opacity logit, SH coefficients.
 ///
-/// Plane `3·k + channel` of `sh` is coefficient `k` of a channel (red, green, blue).
+/// Plane `3·k + channel` of `sh` is coefficient `k` of a color channel (red, green, blue).
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct Gaussians {
-    /// `[3]`, scene units.
+    /// Position `[3]`, scene units.
     pub position: Column,
-    /// `[4]`, wxyz, any length.
+    /// Rotation `[4]`: wxyz quaternion of any length.
     pub rotation: Column,
-    /// `[3]`, natural log of scene units.
+    /// Natural logarithm of the scales `[3]`; scales are in scene units.
     pub log_scale: Column,
-    /// `[1]`, logit of the opacity.
+    /// Logit of the opacity `[1]`.
     pub opacity_logit: Column,
-    /// `[3·(degree + 1)²]`.
+    /// SH coefficients `[3·(degree + 1)²]`.
     pub sh: Column,
 }
 
 impl Gaussians {
-    /// `len` Gaussians with every value zero.
+    /// Creates `len` Gaussians whose values are all zero.
     pub fn zeros(len: usize, sh_degree: usize) -> Self {
         Gaussians {
             position: Column::zeros(3, len),
@@ -125,34 +125,34 @@ impl Gaussians {
         }
     }
 
-    /// Number of Gaussians.
+    /// Returns the number of Gaussians.
     pub fn len(&self) -> usize {
         self.position.len()
     }
 
-    /// Whether there are none.
+    /// Returns whether there are no Gaussians.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
-    /// Degree of the spherical harmonics.
+    /// Returns the SH degree.
     pub fn sh_degree(&self) -> usize {
         (self.sh.width() / 3).isqrt().saturating_sub(1)
     }
 
-    /// Drops harmonics above degree `sh_degree`.
+    /// Drops the SH coefficients above degree `sh_degree`.
     pub fn drop_bands(&mut self, sh_degree: usize) {
         self.sh.narrow(3 * sh_coefficients(sh_degree.min(self.sh_degree())));
     }
 
-    /// Makes room for `len` Gaussians; the values are unspecified until written.
+    /// Resizes to `len` Gaussians. The values are unspecified until written.
     pub fn resize(&mut self, len: usize) {
         for column in Columns::all().iter() {
             self.column_mut(column).resize(len);
         }
     }
 
-    /// The Gaussians `rows`, in that order.
+    /// Returns the Gaussians `rows`, in that order.
     pub fn pick(&self, rows: &[u32]) -> Gaussians {
         Gaussians {
             position: self.position.pick(rows),
@@ -163,10 +163,11 @@ impl Gaussians {
         }
     }
 
-    /// Writes the rows of `block`, which may have more harmonics, from row `first` on.
+    /// Copies the Gaussians of `block` to rows `first` and following. Ignores SH coefficients of `block` above this SH
+    /// degree.
     ///
     /// # Panics
-    /// If there are not as many rows.
+    /// If these rows do not exist.
     pub fn write_rows(&mut self, first: usize, block: &Gaussians) {
         for column in Columns::all().iter() {
             let (from, to) = (block.column(column), self.column_mut(column));
@@ -176,10 +177,10 @@ impl Gaussians {
         }
     }
 
-    /// The column of a single-column set.
+    /// Returns the values of a single attribute.
     ///
     /// # Panics
-    /// If `which` is not exactly one column.
+    /// If `which` is not exactly one attribute.
     pub fn column(&self, which: Columns) -> &Column {
         match which {
             Columns::POSITION => &self.position,
@@ -191,17 +192,17 @@ impl Gaussians {
         }
     }
 
-    /// The columns `which`, to write, in the order of [`Columns::all`].
+    /// Returns the values of the attributes `which` for writing, in the order of [`Columns::all`].
     pub fn columns_mut(&mut self, which: Columns) -> impl Iterator<Item = &mut Column> {
         let Gaussians { position, rotation, log_scale, opacity_logit, sh } = self;
         let all = [position, rotation, log_scale, opacity_logit, sh];
         Columns::all().iter().zip(all).filter(move |(column, _)| which.contains(*column)).map(|(_, column)| column)
     }
 
-    /// The column of a single-column set, to write.
+    /// Returns the values of a single attribute for writing.
     ///
     /// # Panics
-    /// If `which` is not exactly one column.
+    /// If `which` is not exactly one attribute.
     pub fn column_mut(&mut self, which: Columns) -> &mut Column {
         match which {
             Columns::POSITION => &mut self.position,
@@ -215,35 +216,35 @@ impl Gaussians {
 }
 
 bitflags! {
-    /// A set of columns, in storage order from bit 0; frame streams hold these bits.
+    /// Set of attributes, in storage order from bit 0. Frame streams contain these bits.
     #[derive(Debug, Clone, Copy, PartialEq, Eq)]
     pub struct Columns: u32 {
-        /// `position`.
+        /// Position.
         const POSITION = 1;
-        /// `rotation`.
+        /// Rotation.
         const ROTATION = 2;
-        /// `log_scale`.
+        /// Log scale.
         const LOG_SCALE = 4;
-        /// `opacity_logit`.
+        /// Opacity logit.
         const OPACITY = 8;
-        /// `sh`.
+        /// SH coefficients.
         const SH = 16;
     }
 }
 
 impl Columns {
-    /// Components per Gaussian of all columns of the set together, for harmonics of degree `sh_degree`.
+    /// Returns the number of components per Gaussian, summed over the attributes of the set, for SH degree `sh_degree`.
     pub fn width(self, sh_degree: usize) -> usize {
-        let of = |column: Columns| match column {
+        let components = |column: Columns| match column {
             Columns::OPACITY => 1,
             Columns::ROTATION => 4,
             Columns::SH => 3 * sh_coefficients(sh_degree),
             _ => 3,
         };
-        self.iter().map(of).sum()
+        self.iter().map(components).sum()
     }
 
-    /// Name of a single column as the container and messages spell it.
+    /// Returns the name of a single attribute in containers and messages.
     pub fn name(self) -> &'static str {
         match self {
             Columns::POSITION => "position",

@@ -1,81 +1,83 @@
-//! Derivatives of a number by what is stored of Gaussians.
+//! Derivatives of a scalar loss with respect to the stored attributes of Gaussians.
 
 use std::ops::Range;
 
 use super::{Column, Columns, Gaussians};
 
-/// ∂L/∂ value for values of N Gaussians in stored encoding: sums in f32, in the layout of [`Gaussians`].
+/// Derivatives ∂L/∂value of the stored values of N Gaussians: f32 sums in the layout of [`Gaussians`].
 ///
-/// Which columns are differentiated is a choice, and the harmonics may be of a lower degree than the Gaussians': the
-/// rest takes neither memory nor time. Memory: 4 bytes per value that is differentiated.
+/// The caller chooses the attributes that are differentiated. The SH degree may be lower than that of the Gaussians.
+/// Other values take neither memory nor time. Memory: 4 bytes per differentiated value.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Gradients {
     len: usize,
     columns: Columns,
-    /// Without rows in columns that are not differentiated.
+    /// Sums of the derivatives. Attributes that are not differentiated have no rows.
     sums: Gaussians,
 }
 
 impl Gradients {
-    /// Zeros for `columns` of `len` Gaussians, with harmonics up to `sh_degree`.
+    /// Creates zero derivatives for the attributes `columns` of `len` Gaussians, with SH coefficients up to
+    /// `sh_degree`.
     pub fn new(len: usize, columns: Columns, sh_degree: usize) -> Self {
         let mut sums = Gaussians::zeros(0, sh_degree);
         sums.columns_mut(columns).for_each(|column| column.resize(len));
         Gradients { len, columns, sums }
     }
 
-    /// Number of Gaussians.
+    /// Returns the number of Gaussians.
     pub fn len(&self) -> usize {
         self.len
     }
 
-    /// Whether there are none.
+    /// Returns whether there are no Gaussians.
     pub fn is_empty(&self) -> bool {
         self.len == 0
     }
 
-    /// Columns that are differentiated.
+    /// Returns the attributes that are differentiated.
     pub fn columns(&self) -> Columns {
         self.columns
     }
 
-    /// The sums of a single column; without rows if it is not differentiated.
+    /// Returns the sums of a single attribute. They have no rows if the attribute is not differentiated.
     ///
     /// # Panics
-    /// If `which` is not exactly one column.
+    /// If `which` is not exactly one attribute.
     pub fn column(&self, which: Columns) -> &Column {
         self.sums.column(which)
     }
 
-    /// The sums of a single column, to write.
+    /// Returns the sums of a single attribute for writing.
     ///
     /// # Panics
-    /// If `which` is not exactly one column.
+    /// If `which` is not exactly one attribute.
     pub fn column_mut(&mut self, which: Columns) -> &mut Column {
         self.sums.column_mut(which)
     }
 
-    /// Makes every sum 0.
+    /// Sets every sum to 0.
     pub fn clear(&mut self) {
         self.sums.columns_mut(self.columns).for_each(|column| column.planes_mut().fill(0.0));
     }
 
-    /// Makes the sums of the Gaussians `rows` those of `of`, in that order.
+    /// Copies the sums of Gaussian k of `source` to Gaussian `rows[k]`, for every k.
     ///
     /// # Panics
-    /// If `of` has other columns or another number of Gaussians, or there is no such row.
-    pub fn set_rows(&mut self, rows: &[u32], of: &Gradients) {
+    /// If `source` lacks an attribute, its number of Gaussians is not that of `rows`, or a row does not exist.
+    pub fn set_rows(&mut self, rows: &[u32], source: &Gradients) {
         for column in self.columns.iter() {
-            let (from, to) = (of.column(column), self.sums.column_mut(column));
+            let (from, to) = (source.column(column), self.sums.column_mut(column));
             for c in 0..to.width() {
                 let (from, to) = (from.plane(c), to.plane_mut(c));
-                assert_eq!(from.len(), rows.len(), "a row for each");
+                assert_eq!(from.len(), rows.len(), "one row per Gaussian of the source expected");
                 rows.iter().zip(from).for_each(|(&row, sum)| to[row as usize] = *sum);
             }
         }
     }
 
-    /// The sums of `len` consecutive Gaussians each, the last fewer: for threads to add to.
+    /// Splits the sums into spans of `len` consecutive Gaussians, so that threads can add to them. The last span may be
+    /// shorter.
     ///
     /// # Panics
     /// If `len` is 0.
@@ -83,53 +85,55 @@ impl Gradients {
         let ids = (0..self.len).step_by(len).map(|first| first..self.len.min(first + len));
         let mut spans: Vec<GradientSpan<'_>> =
             ids.map(|ids| GradientSpan { ids, columns: self.columns, planes: Default::default() }).collect();
-        for (place, column) in self.sums.columns_mut(Columns::all()).enumerate() {
-            // No rows, no planes.
+        for (index, column) in self.sums.columns_mut(Columns::all()).enumerate() {
+            // An attribute without rows has no planes.
             for plane in column.planes_mut().chunks_exact_mut(self.len.max(1)) {
-                spans.iter_mut().zip(plane.chunks_mut(len)).for_each(|(span, part)| span.planes[place].push(part));
+                spans.iter_mut().zip(plane.chunks_mut(len)).for_each(|(span, part)| span.planes[index].push(part));
             }
         }
         spans
     }
 }
 
-/// The sums of some consecutive Gaussians.
+/// Mutable sums of some consecutive Gaussians.
 #[derive(Debug)]
 pub struct GradientSpan<'a> {
     ids: Range<usize>,
     columns: Columns,
-    /// By column, in the order of [`Columns::all`]; none of those that are not differentiated.
+    /// Planes of each attribute, in the order of [`Columns::all`]. Attributes that are not differentiated have none.
     planes: [Vec<&'a mut [f32]>; 5],
 }
 
 impl<'a> GradientSpan<'a> {
-    /// Whose sums they are.
+    /// Returns the indices of the Gaussians of this span.
     pub fn ids(&self) -> Range<usize> {
         self.ids.clone()
     }
 
-    /// Columns that are differentiated.
+    /// Returns the attributes that are differentiated.
     pub fn columns(&self) -> Columns {
         self.columns
     }
 
-    /// The sums of a single column, a plane per component; none if it is not differentiated.
+    /// Returns the sums of a single attribute, one plane per component. Returns no planes if the attribute is not
+    /// differentiated.
     pub fn planes(&mut self, column: Columns) -> &mut [&'a mut [f32]] {
         &mut self.planes[column.bits().trailing_zeros() as usize]
     }
 
-    /// Adds `parts` to the sums of a component of a single column, of Gaussian `first` and those after it, if that
-    /// column and component are differentiated. A part that is not finite, or that f32 could not hold the sum with, is
-    /// left out, and so are parts for Gaussians beyond the span.
+    /// Adds `parts` to the sums of one component of a single attribute, for Gaussian `first` and the following ones.
+    ///
+    /// Does nothing if the attribute or component is not differentiated. Skips a part that is not finite or that would
+    /// make the f32 sum overflow. Ignores parts for Gaussians beyond the span.
     ///
     /// # Panics
-    /// If `first` lies before the span, or more than one beyond it.
+    /// If `first` lies before the span, or beyond the index that follows its last Gaussian.
     #[inline(always)]
     pub fn add(&mut self, column: Columns, component: usize, first: usize, parts: impl IntoIterator<Item = f32>) {
         let start = first - self.ids.start;
         let Some(plane) = self.planes(column).get_mut(component) else { return };
         for (sum, part) in plane[start..].iter_mut().zip(parts) {
-            // Added either way: a store that depends on a condition is slow.
+            // Adds 0 instead of skipping the store: a store that depends on a condition is slow.
             *sum += if (*sum + part).is_finite() { part } else { 0.0 };
         }
     }
@@ -140,7 +144,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn spans_cover_every_sum_once_and_leave_frozen_columns_out() {
+    fn spans_cover_every_differentiated_sum_once() {
         let columns = Columns::POSITION | Columns::SH;
         for (len, span) in [(0, 3), (1, 3), (7, 3), (6, 3), (5, 100)] {
             let mut gradients = Gradients::new(len, columns, 1);
@@ -161,7 +165,7 @@ mod tests {
     }
 
     #[test]
-    fn what_f32_cannot_hold_is_left_out() {
+    fn parts_that_overflow_f32_are_skipped() {
         let mut gradients = Gradients::new(1, Columns::OPACITY, 0);
         for part in [3e38, f32::NAN, 3e38, f32::NEG_INFINITY, -1e38] {
             gradients.spans(1)[0].add(Columns::OPACITY, 0, 0, [part]);

@@ -1,63 +1,66 @@
-//! How the state of Gaussians changes with what is stored of them.
+//! Derivative of a frame state with respect to the stored attributes.
 
 use super::{Column, Columns, Gaussians, Gradients};
 
-/// ∂ state / ∂ stored of N Gaussians at one frame. What is stored of a Gaussian in one column changes its state in that
-/// column alone.
+/// Derivatives ∂state/∂stored of N Gaussians at one frame. The stored values of an attribute change only the state of
+/// the same attribute.
 ///
-/// A column of width w has no values where the state changes as what is stored does, one factor per Gaussian, or
-/// `[w, w]`: plane `i·w + j` is ∂ component i of the state / ∂ component j of what is stored.
+/// An attribute of w components has one of three forms. Without planes, state and stored values change by the same
+/// amount. With one plane, each Gaussian has one factor for all components. With planes `[w, w]`, plane `i·w + j` is ∂
+/// state component i / ∂ stored component j.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Jacobian {
     columns: [Column; 5],
 }
 
-fn place(column: Columns) -> usize {
+/// Returns the index of a single attribute in the order of [`Columns::all`].
+fn attribute_index(column: Columns) -> usize {
     column.bits().trailing_zeros() as usize
 }
 
 impl Jacobian {
-    /// Bytes that one takes at most: positions and rotations in full, a factor for each other column.
+    /// Maximum bytes per Gaussian: full matrices for position and rotation, one factor for each other attribute.
     pub const BYTES_PER_GAUSSIAN: usize = 4 * (9 + 16 + 3);
 
-    /// The values of a single column; of width 0 where there are none.
+    /// Returns the derivatives of a single attribute. The width is 0 if state and stored values change by the same
+    /// amount.
     pub fn column(&self, which: Columns) -> &Column {
-        &self.columns[place(which)]
+        &self.columns[attribute_index(which)]
     }
 
-    /// The values of a single column, to write.
+    /// Returns the derivatives of a single attribute for writing.
     pub fn column_mut(&mut self, which: Columns) -> &mut Column {
-        &mut self.columns[place(which)]
+        &mut self.columns[attribute_index(which)]
     }
 
-    /// All columns, in the order of [`Columns::all`].
+    /// Returns the derivatives of all attributes, in the order of [`Columns::all`].
     pub fn columns(&self) -> &[Column; 5] {
         &self.columns
     }
 
-    /// All columns, to write.
+    /// Returns the derivatives of all attributes for writing.
     pub fn columns_mut(&mut self) -> &mut [Column; 5] {
         &mut self.columns
     }
 
-    /// The Gaussians at `rows`, in that order.
+    /// Returns the derivatives of the Gaussians at `rows`, in that order.
     pub fn pick(&self, rows: &[u32]) -> Jacobian {
-        let of = |column: &Column| if column.width() > 0 { column.pick(rows) } else { Column::default() };
-        Jacobian { columns: self.columns.each_ref().map(of) }
+        let picked = |column: &Column| if column.width() > 0 { column.pick(rows) } else { Column::default() };
+        Jacobian { columns: self.columns.each_ref().map(picked) }
     }
 
-    /// Of `len` Gaussians, cut into `blocks` in order, all with values in the same columns.
+    /// Concatenates the derivatives of consecutive `blocks`, `len` Gaussians in total. All blocks have the same form.
     pub fn joined(blocks: &[Jacobian], len: usize) -> Jacobian {
         let mut whole = Jacobian::default();
-        for (place, to) in whole.columns.iter_mut().enumerate() {
-            let width = blocks.first().map_or(0, |block| block.columns[place].width());
+        for (index, to) in whole.columns.iter_mut().enumerate() {
+            let width = blocks.first().map_or(0, |block| block.columns[index].width());
             if width == 0 {
                 continue;
             }
             *to = Column::zeros(width, len);
             for c in 0..width {
                 let mut rest = to.plane_mut(c);
-                for part in blocks.iter().map(|block| &block.columns[place]) {
+                for part in blocks.iter().map(|block| &block.columns[index]) {
                     let (here, after) = rest.split_at_mut(part.len());
                     here.copy_from_slice(part.plane(c));
                     rest = after;
@@ -67,48 +70,54 @@ impl Jacobian {
         whole
     }
 
-    /// Adds what the state changes by to first order when what is stored changes by `change`, in the columns that this
-    /// has rows of; harmonics of a lower degree than the state's leave those above as they are.
+    /// Adds the first-order change of the state, ∂state/∂stored · `change`, to `state`.
+    ///
+    /// Changes only attributes of which `change` has rows. If `change` has a lower SH degree than `state`, the higher
+    /// SH coefficients stay unchanged.
     pub fn add_to(&self, change: &Gaussians, state: &mut Gaussians) {
         for which in Columns::all().iter() {
-            let (by, of, to) = (self.column(which), change.column(which), state.column_mut(which));
-            if of.is_empty() {
+            let (factors, delta, to) = (self.column(which), change.column(which), state.column_mut(which));
+            if delta.is_empty() {
                 continue;
             }
-            let (len, width) = (of.len(), of.width().min(to.width()));
+            let (len, width) = (delta.len(), delta.width().min(to.width()));
             for i in 0..width {
                 let to = &mut to.plane_mut(i)[..len];
-                match by.width() {
-                    0 => to.iter_mut().zip(of.plane(i)).for_each(|(to, of)| *to += of),
-                    1 => to.iter_mut().zip(of.plane(i)).zip(by.plane(0)).for_each(|((to, of), by)| *to += by * of),
+                match factors.width() {
+                    0 => to.iter_mut().zip(delta.plane(i)).for_each(|(to, delta)| *to += delta),
+                    1 => {
+                        let terms = delta.plane(i).iter().zip(factors.plane(0));
+                        to.iter_mut().zip(terms).for_each(|(to, (delta, factor))| *to += factor * delta);
+                    }
                     _ => (0..width).for_each(|j| {
-                        let terms = of.plane(j).iter().zip(by.plane(i * width + j));
-                        to.iter_mut().zip(terms).for_each(|(to, (of, by))| *to += by * of);
+                        let terms = delta.plane(j).iter().zip(factors.plane(i * width + j));
+                        to.iter_mut().zip(terms).for_each(|(to, (delta, factor))| *to += factor * delta);
                     }),
                 }
             }
         }
     }
 
-    /// Turns derivatives by the state into derivatives by what is stored, in the columns that are differentiated; 0
-    /// where one would not be finite.
+    /// Multiplies derivatives ∂L/∂state by this Jacobian in place, which gives ∂L/∂stored of the differentiated
+    /// attributes. Results that are not finite become 0.
     pub fn pull_back(&self, gradients: &mut Gradients) {
         for which in gradients.columns().iter() {
-            let (by, of) = (self.column(which), gradients.column_mut(which));
+            let (factors, gradient) = (self.column(which), gradients.column_mut(which));
             let finite = |x: f32| if x.is_finite() { x } else { 0.0 };
-            match (by.width(), of.width()) {
+            match (factors.width(), gradient.width()) {
                 (0, _) => (),
                 (1, width) => (0..width).for_each(|c| {
-                    of.plane_mut(c).iter_mut().zip(by.plane(0)).for_each(|(of, by)| *of = finite(*of * by));
+                    let sums = gradient.plane_mut(c).iter_mut().zip(factors.plane(0));
+                    sums.for_each(|(sum, factor)| *sum = finite(*sum * factor));
                 }),
                 (_, width) => {
-                    let by_state = of.clone();
+                    let by_state = gradient.clone();
                     for j in 0..width {
-                        let to = of.plane_mut(j);
+                        let to = gradient.plane_mut(j);
                         to.fill(0.0);
                         for i in 0..width {
-                            let terms = by_state.plane(i).iter().zip(by.plane(i * width + j));
-                            to.iter_mut().zip(terms).for_each(|(to, (of, by))| *to += by * of);
+                            let terms = by_state.plane(i).iter().zip(factors.plane(i * width + j));
+                            to.iter_mut().zip(terms).for_each(|(to, (sum, factor))| *to += factor * sum);
                         }
                         to.iter_mut().for_each(|x| *x = finite(*x));
                     }
@@ -122,49 +131,50 @@ impl Jacobian {
 mod tests {
     use super::*;
 
-    /// Low-discrepancy steps, as good as noise.
-    fn noise(of: &mut Column, step: f32) {
-        of.planes_mut().iter_mut().enumerate().for_each(|(k, x)| *x = (k as f32 * step).fract() - 0.5);
+    /// Fills a column with a low-discrepancy sequence in [−0.5, 0.5), which serves as noise.
+    fn fill_with_noise(column: &mut Column, step: f32) {
+        column.planes_mut().iter_mut().enumerate().for_each(|(k, x)| *x = (k as f32 * step).fract() - 0.5);
     }
 
-    fn noisy(len: usize, step: f32) -> Gaussians {
-        let mut made = Gaussians::zeros(len, 1);
-        made.columns_mut(Columns::all()).for_each(|column| noise(column, step));
-        made
+    fn noisy_gaussians(len: usize, step: f32) -> Gaussians {
+        let mut filled = Gaussians::zeros(len, 1);
+        filled.columns_mut(Columns::all()).for_each(|column| fill_with_noise(column, step));
+        filled
     }
 
-    /// Positions and rotations in full, a factor for opacities; the others change as what is stored does.
+    /// Returns a Jacobian with full matrices for position and rotation, a factor for opacity, and no planes for the
+    /// others.
     fn jacobian(len: usize) -> Jacobian {
-        let mut made = Jacobian::default();
+        let mut filled = Jacobian::default();
         for (which, width) in [(Columns::POSITION, 9), (Columns::ROTATION, 16), (Columns::OPACITY, 1)] {
-            *made.column_mut(which) = Column::zeros(width, len);
-            noise(made.column_mut(which), 0.618_034);
+            *filled.column_mut(which) = Column::zeros(width, len);
+            fill_with_noise(filled.column_mut(which), 0.618_034);
         }
-        made
+        filled
     }
 
     #[test]
-    fn derivatives_pulled_back_say_what_a_change_of_what_is_stored_does() {
-        let (jacobian, change) = (jacobian(11), noisy(11, 0.754_878));
+    fn pull_back_is_the_adjoint_of_add_to() {
+        let (jacobian, change) = (jacobian(11), noisy_gaussians(11, 0.754_878));
         let mut state = Gaussians::zeros(11, 1);
         jacobian.add_to(&change, &mut state);
         let mut gradients = Gradients::new(11, Columns::all(), 1);
-        Columns::all().iter().for_each(|which| noise(gradients.column_mut(which), 0.569_84));
-        let of = |a: &Column, b: &Column| -> f64 {
+        Columns::all().iter().for_each(|which| fill_with_noise(gradients.column_mut(which), 0.569_84));
+        let dot = |a: &Column, b: &Column| -> f64 {
             a.planes().iter().zip(b.planes()).map(|(a, b)| f64::from(*a) * f64::from(*b)).sum()
         };
-        let expected = Columns::all().iter().map(|which| of(gradients.column(which), state.column(which)));
+        let expected = Columns::all().iter().map(|which| dot(gradients.column(which), state.column(which)));
         let expected: Vec<f64> = expected.collect();
         jacobian.pull_back(&mut gradients);
         for (which, expected) in Columns::all().iter().zip(expected) {
-            let got = of(gradients.column(which), change.column(which));
+            let got = dot(gradients.column(which), change.column(which));
             assert!((got - expected).abs() < 1e-5, "{}: got {got}, expected {expected}", which.name());
         }
     }
 
     #[test]
-    fn a_change_of_fewer_columns_and_bands_leaves_the_others_as_they_are() {
-        let (mut change, mut state) = (Gaussians::zeros(0, 0), noisy(5, 0.3));
+    fn add_to_changes_only_the_given_attributes_and_degrees() {
+        let (mut change, mut state) = (Gaussians::zeros(0, 0), noisy_gaussians(5, 0.3));
         change.sh = Column::from_planes(3, vec![1.0; 15]);
         let before = state.clone();
         jacobian(5).add_to(&change, &mut state);
@@ -174,7 +184,7 @@ mod tests {
     }
 
     #[test]
-    fn what_would_not_be_finite_is_zero() {
+    fn pulled_back_values_that_are_not_finite_become_zero() {
         let mut jacobian = jacobian(2);
         jacobian.column_mut(Columns::POSITION).planes_mut()[0] = f32::MAX;
         jacobian.column_mut(Columns::OPACITY).planes_mut()[0] = f32::MAX;

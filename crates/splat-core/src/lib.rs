@@ -1,4 +1,16 @@
-//! The vocabulary: Gaussians at an instant, sequences of them, cameras, rows of statistics.
+//! Data types shared by the whole workspace: Gaussians of one frame, sequences of frames, cameras, and per-Gaussian
+//! statistics.
+//!
+//! ```
+//! use splat_core::{Columns, Gaussians, logit, opacity};
+//!
+//! let mut gaussians = Gaussians::zeros(2, 0);
+//! gaussians.position.set_row(1, [0.5, 0.0, 2.0]);
+//! gaussians.opacity_logit.set_row(1, [logit(0.8) as f32]);
+//! assert_eq!(gaussians.position.plane(0), [0.0, 0.5]);
+//! assert!((opacity(gaussians.opacity_logit.plane(0)[1]) - 0.8).abs() < 1e-6);
+//! assert_eq!(Columns::all().width(gaussians.sh_degree()), 3 + 4 + 3 + 1 + 3);
+//! ```
 
 #![cfg_attr(not(test), deny(clippy::print_stderr, clippy::print_stdout))]
 
@@ -31,58 +43,58 @@ pub use robust_box::RobustBox;
 pub use rows::{Flags, Rows, Statistic, Values};
 pub use schedule::{Picture, Schedule};
 
-/// Zeroth spherical-harmonic basis constant: color = 0.5 + SH_C0 · f_dc.
+/// Constant of the spherical-harmonic basis function of degree 0: color = 0.5 + SH_C0 · f_dc.
 pub const SH_C0: f64 = 0.282_094_791_773_878_14;
 
-/// Opacity in [0, 1] of a stored logit, in f64.
+/// Returns the opacity in [0, 1] of a stored logit, in f64.
 pub fn opacity(logit: f32) -> f64 {
     1.0 / (1.0 + (-f64::from(logit)).exp())
 }
 
-/// The logit of an opacity, in f64.
+/// Returns the logit of an opacity, in f64.
 pub fn logit(opacity: f64) -> f64 {
     (opacity / (1.0 - opacity)).ln()
 }
 
-/// The color that a coefficient of degree 0 is from all sides, in f64.
+/// Returns the color, equal from all directions, of an SH coefficient of degree 0, in f64.
 pub fn color(harmonic: f32) -> f64 {
     0.5 + SH_C0 * f64::from(harmonic)
 }
 
-/// The coefficient of degree 0 of a color.
+/// Returns the SH coefficient of degree 0 of a color.
 pub fn harmonic(color: f64) -> f32 {
     ((color - 0.5) / SH_C0) as f32
 }
 
-/// Number of spherical-harmonic coefficients per channel of degree `d`: (d + 1)².
+/// Returns the number of SH coefficients per color channel up to degree `d`: (d + 1)².
 pub const fn sh_coefficients(degree: usize) -> usize {
     (degree + 1) * (degree + 1)
 }
 
-/// Highest degree of harmonics that a renderer knows.
+/// Highest SH degree that renderers support.
 pub const HIGHEST_DEGREE: usize = 3;
 
-/// A degree that no harmonics reach: all of them.
+/// Value of an SH degree limit that keeps all coefficients.
 pub const ALL_HARMONICS: usize = usize::MAX;
 
-/// What is known of a sequence before any frame is read.
+/// Properties of a sequence that are known before any frame is read.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SequenceInfo {
-    /// N, Gaussians in every frame.
+    /// Number of Gaussians N, the same in every frame.
     pub count: usize,
     /// Time stamp of each of the T frames, strictly increasing.
     pub times: Vec<f64>,
-    /// Degree of the spherical harmonics, 0 to 3.
+    /// SH degree, 0 to 3.
     pub sh_degree: usize,
-    /// Columns that may differ between frames; all others hold the same values in every frame.
+    /// Attributes that may differ between frames. All others have the same values in every frame.
     pub varying: Columns,
 }
 
 impl SequenceInfo {
-    /// The same frames at other times, one per frame.
+    /// Replaces the time stamps of the frames. `times` has one per frame.
     ///
     /// # Errors
-    /// A number of times other than T; times that are not finite or not strictly increasing, naming the frames.
+    /// The number of times is not T; times are not finite or not strictly increasing. The message names the frames.
     pub fn with_times(self, times: Vec<f64>) -> Result<SequenceInfo> {
         if times.len() != self.times.len() {
             return Err(Error::usage(format!("{} times were given for {} frames", times.len(), self.times.len())));
@@ -90,13 +102,13 @@ impl SequenceInfo {
         self.at(times)
     }
 
-    /// The same Gaussians with frames at `times`, however many.
+    /// Replaces the frames of the sequence by frames at `times`, of any number. The Gaussians stay.
     ///
     /// # Errors
-    /// Times that are not finite or not strictly increasing, naming the frames.
+    /// Times are not finite or not strictly increasing. The message names the frames.
     pub fn at(self, times: Vec<f64>) -> Result<SequenceInfo> {
         if let Some(i) = times.iter().position(|time| !time.is_finite()) {
-            return Err(Error::usage(format!("the time of frame {i} is {}, which is no time", times[i])));
+            return Err(Error::usage(format!("the time of frame {i} is {}: expected a finite number", times[i])));
         }
         if let Some(i) = (1..times.len()).find(|&i| times[i] <= times[i - 1]) {
             let (before, after) = (times[i - 1], times[i]);
@@ -108,3 +120,8 @@ impl SequenceInfo {
         Ok(SequenceInfo { times, ..self })
     }
 }
+
+/// Compiles the example of the README.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+mod readme {}

@@ -1,36 +1,37 @@
-//! Raw parameters that all frames of a model follow from.
+//! Stored parameters from which all frames of a model follow.
 
 use serde::{Deserialize, Serialize};
 
 use super::{Column, Columns, Gaussians};
 
-/// Raw parameters of N Gaussians of a model whose frames all follow from them.
+/// Stored parameters of N Gaussians of a model whose frames all follow from them.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct Raw {
-    /// What every family has, as it is stored.
+    /// Attributes that every model format has, in stored encoding.
     pub gaussians: Gaussians,
-    /// What a family has besides (velocities, windows, features), planes in an order of its own; of width 0 where there
-    /// is nothing.
+    /// Further parameters of the model format (velocities, time windows, features), as planes in an order of the
+    /// format. Width 0 if there are none.
     pub own: Column,
 }
 
 impl Raw {
-    /// Number of Gaussians.
+    /// Returns the number of Gaussians.
     pub fn len(&self) -> usize {
         self.gaussians.len()
     }
 
-    /// Whether there are none.
+    /// Returns whether there are no Gaussians.
     pub fn is_empty(&self) -> bool {
         self.gaussians.is_empty()
     }
 
-    /// The Gaussians `rows`, in that order.
+    /// Returns the parameters of the Gaussians `rows`, in that order.
     pub fn pick(&self, rows: &[u32]) -> Raw {
         Raw { gaussians: self.gaussians.pick(rows), own: self.own.pick(rows) }
     }
 
-    /// Makes row `to` that of Gaussian `row` of `from`, which has as many values or more.
+    /// Copies the parameters of Gaussian `row` of `from` to Gaussian `to`. `from` has at least as many values per
+    /// Gaussian.
     pub fn set_row(&mut self, to: usize, from: &Raw, row: usize) {
         let set = |column: &mut Column, from: &Column| {
             (0..column.width()).for_each(|c| column.plane_mut(c)[to] = from.plane(c)[row]);
@@ -43,7 +44,7 @@ impl Raw {
 }
 
 impl From<Gaussians> for Raw {
-    /// Of a family that has nothing besides.
+    /// Creates the parameters of a model format that has no further parameters.
     fn from(gaussians: Gaussians) -> Raw {
         let own = Column::zeros(0, gaussians.len());
         Raw { gaussians, own }
@@ -55,7 +56,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn rows_are_picked_and_set_with_all_they_have() {
+    fn pick_and_set_row_copy_all_parameters() {
         let mut raw = Raw { gaussians: Gaussians::zeros(3, 1), own: Column::zeros(2, 3) };
         raw.gaussians.columns_mut(Columns::all()).for_each(|column| {
             column.planes_mut().iter_mut().enumerate().for_each(|(k, x)| *x = k as f32);

@@ -1,4 +1,4 @@
-//! The pictures that cameras took.
+//! Cameras of a data set and the views that they took.
 
 use std::path::{Path, PathBuf};
 
@@ -8,72 +8,72 @@ use super::camera::Camera;
 use super::schedule::{Picture, Schedule};
 use crate::error::{Error, Result};
 
-/// The part of a data set a picture belongs to.
+/// Part of a data set.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Split {
-    /// Pictures the model was trained on; compression scores with these.
+    /// Training views of the model. Compression scores with these views.
     Train,
-    /// Pictures held out while it was trained; evaluation uses these where there are no others.
+    /// Validation views. Evaluation uses them if there are no test views.
     Val,
-    /// Held-out pictures; evaluation uses these.
+    /// Test views, held out of training. Evaluation uses these views.
     Test,
 }
 
-/// A picture that cameras took, or may have taken: a (time, view) pair.
+/// View that a camera took or may have taken: view number, camera, and time stamp.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Shot {
     /// View number.
     pub view: u32,
     /// Index into [`Rig::cameras`].
     pub camera: u32,
-    /// Time stamp, or none when the camera sees every frame.
+    /// Time stamp, or `None` if the view exists for every frame.
     pub time: Option<f64>,
-    /// Part of the data set.
+    /// Part of the data set that the view belongs to.
     pub split: Split,
-    /// The picture's file, if the cameras name one.
+    /// Path of the photograph, if the camera file names one.
     pub image: Option<PathBuf>,
 }
 
-/// All cameras of a data set and the pictures they took.
+/// Cameras of a data set and all of their views.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Rig {
     /// Distinct cameras.
     pub cameras: Vec<Camera>,
-    /// Every picture, in file order.
+    /// Views of all cameras, in the order of the camera file.
     pub shots: Vec<Shot>,
-    /// Linear RGB in [0, 1] behind the scene, if the cameras' file says.
+    /// Background color, linear RGB in [0, 1], if the camera file gives one.
     pub background: Option<[f32; 3]>,
-    /// Where they come from, for people: a path, or the recipe of a virtual rig.
+    /// Source of the cameras, to show to users: a path, or the recipe of a virtual rig.
     pub origin: String,
 }
 
-/// How far from a frame's time stamp a picture may be taken and still show that frame, in parts of
-/// the time span: files round their times, and a million frames are still told apart.
+/// Maximum distance between the time of a view and the time of its frame, as a fraction of the time span. Files round
+/// their times; a million frames can still be distinguished.
 const TIME_TOLERANCE: f64 = 1e-6;
 
 impl Rig {
-    /// Bytes that a distinct camera takes: itself, its copy in a schedule, and its place in a table while it is read.
+    /// Bytes per distinct camera: the camera, its copy in a schedule, and an entry in a table during reading.
     pub const CAMERA_BYTES: u64 = 2 * size_of::<Camera>() as u64 + 16;
 
-    /// Bytes that a picture takes beside its camera and the name of its file: itself, its places in two tables while it is
-    /// read, and three times its place in a schedule.
+    /// Bytes per view without its camera and file name: the view, entries in two tables during reading, and three times
+    /// its entry in a schedule.
     pub const SHOT_BYTES: u64 = size_of::<Shot>() as u64 + 32 + 3 * 40;
 
-    /// Bytes that the name of a picture's file takes beside its text, for the allocator.
+    /// Bytes per file name beside its text, for the allocator.
     pub const NAME_BYTES: u64 = 32;
 
-    /// Bytes of all cameras and pictures, and of one schedule of them.
+    /// Returns the bytes of all cameras and views, and of one schedule of them.
     pub fn bytes(&self) -> u64 {
         let names = self.shots.iter().filter_map(|shot| shot.image.as_ref());
         let names: u64 = names.map(|image| image.as_os_str().len() as u64 + Rig::NAME_BYTES).sum();
         Rig::CAMERA_BYTES * self.cameras.len() as u64 + Rig::SHOT_BYTES * self.shots.len() as u64 + names
     }
 
-    /// The distinct times of all pictures, increasing; empty when no picture has a time.
+    /// Returns the distinct times of all views, increasing. Empty if no view has a time.
     ///
-    /// Times within half the tolerance of [`Rig::schedule`] above another are that one: training and
-    /// held-out pictures of one moment may have been rounded differently.
+    /// A time that exceeds another one by at most half the tolerance of [`Rig::schedule`] counts as equal to it,
+    /// because training and test views of one moment may have been rounded differently.
     pub fn times(&self) -> Vec<f64> {
         let mut times: Vec<f64> = self.shots.iter().filter_map(|shot| shot.time).collect();
         times.sort_by(f64::total_cmp);
@@ -82,24 +82,26 @@ impl Rig {
         times
     }
 
-    /// The split that is held out: test, or val where there is none; none where every picture is for training.
+    /// Returns the held-out split: test, or validation if there are no test views. `None` if all views are training
+    /// views.
     pub fn held_out(&self) -> Option<Split> {
         [Split::Test, Split::Val].into_iter().find(|split| self.shots.iter().any(|shot| shot.split == *split))
     }
 
-    /// How far from a frame's time a picture of it may be taken, if the frames span the pictures' times.
+    /// Returns the maximum distance between the time of a view and the time of its frame, if the frames span the times
+    /// of the views.
     pub fn time_tolerance(&self) -> f64 {
         let times = self.times();
         TIME_TOLERANCE * if times.len() > 1 { span(&times) } else { 1.0 }
     }
 
-    /// Which cameras see which frame, for the pictures of one split (`None`: all of them).
+    /// Builds the schedule of the views of one split (`None`: of all splits).
     ///
-    /// `frame_times` must increase. A picture belongs to the nearest frame, which must lie within
-    /// 1e-6 of the time span (of 1, if there is one frame); a picture without a time to every frame.
+    /// `frame_times` must increase. A view with a time belongs to the nearest frame, which must lie within 1e-6 of the
+    /// time span (within 1e-6 if there is one frame). A view without a time belongs to every frame.
     ///
     /// # Errors
-    /// [`Error::Usage`] when a picture was taken at no frame's time.
+    /// [`Error::Usage`] if no frame has the time of a view.
     pub fn schedule(&self, frame_times: &[f64], split: Option<Split>) -> Result<Schedule> {
         let (mut timed, mut timeless) = (Vec::new(), Vec::new());
         for (place, shot) in self.shots.iter().enumerate() {
@@ -111,23 +113,26 @@ impl Rig {
             }
         }
         timed.sort_unstable();
-        let seen = |mut places: Vec<usize>| -> Vec<(u32, u32)> {
+        let views_of = |mut places: Vec<usize>| -> Vec<(u32, u32)> {
             places.sort_unstable();
             places.iter().map(|&place| (self.shots[place].view, self.shots[place].camera)).collect()
         };
         let mut schedule = Schedule::new(self.cameras.clone());
-        for together in timed.chunk_by(|a, b| a.0 == b.0) {
-            schedule.push(together[0].0 - schedule.frames(), &seen(timeless.clone()));
-            schedule.push(1, &seen(together.iter().map(|&(_, place)| place).chain(timeless.iter().copied()).collect()));
+        for of_one_frame in timed.chunk_by(|a, b| a.0 == b.0) {
+            schedule.push(of_one_frame[0].0 - schedule.frames(), &views_of(timeless.clone()));
+            schedule.push(
+                1,
+                &views_of(of_one_frame.iter().map(|&(_, place)| place).chain(timeless.iter().copied()).collect()),
+            );
         }
-        schedule.push(frame_times.len() - schedule.frames(), &seen(timeless));
+        schedule.push(frame_times.len() - schedule.frames(), &views_of(timeless));
         Ok(schedule)
     }
 
-    /// The frame a picture of this rig shows, by the rule of [`Rig::schedule`]; none: every frame.
+    /// Returns the frame that `shot` belongs to by the rule of [`Rig::schedule`]. `None` if it belongs to every frame.
     ///
     /// # Errors
-    /// [`Error::Usage`] when the picture was taken at no frame's time.
+    /// [`Error::Usage`] if no frame has the time of the view.
     pub fn frame_of(&self, shot: &Shot, frame_times: &[f64]) -> Result<Option<usize>> {
         let Some(time) = shot.time else { return Ok(None) };
         let tolerance = TIME_TOLERANCE * if frame_times.len() > 1 { span(frame_times) } else { 1.0 };
@@ -137,7 +142,8 @@ impl Rig {
             .ok_or_else(|| self.no_such_frame(shot.view, time, frame_times))
     }
 
-    /// The file of `picture`, if the cameras name one; `frame_times` as for [`Rig::schedule`].
+    /// Returns the path of the photograph of `picture`, if the camera file names one. `frame_times` as in
+    /// [`Rig::schedule`].
     pub fn image(&self, picture: Picture, frame_times: &[f64]) -> Option<&Path> {
         let shows = |shot: &&Shot| {
             let frame = || self.frame_of(shot, frame_times).ok();
@@ -147,21 +153,22 @@ impl Rig {
         self.shots.iter().find(shows)?.image.as_deref()
     }
 
+    /// Returns the error of a view whose time is not the time of any frame.
     fn no_such_frame(&self, view: u32, time: f64, frame_times: &[f64]) -> Error {
         let frames = match frame_times {
-            [] => "has none".to_owned(),
-            [only] => format!("has one, at time {only}"),
-            [first, .., last] => format!("has {}, from time {first} to {last}", frame_times.len()),
+            [] => "has no frames".to_owned(),
+            [only] => format!("has one frame, at time {only}"),
+            [first, .., last] => format!("has {} frames, from time {first} to {last}", frame_times.len()),
         };
         Error::usage(format!(
-            "{}: view {view} was taken at time {time}, which is no frame of the sequence: it {frames}\n  \
-             give the cameras of this scene, or --frames to match their number",
+            "{}: view {view} was taken at time {time}, but the sequence has no frame at this time: it {frames}\n  \
+             use the cameras of this scene, or set --frames to the number of times in the camera file",
             self.origin,
         ))
     }
 }
 
-/// Last minus first; 0 of fewer than two.
+/// Returns the last time minus the first, or 0 for fewer than two times.
 fn span(times: &[f64]) -> f64 {
     match times {
         [first, .., last] => last - first,
@@ -169,7 +176,7 @@ fn span(times: &[f64]) -> f64 {
     }
 }
 
-/// Index of the increasing `times` nearest to `time`, the earlier of two equally near.
+/// Returns the index of the nearest of the increasing `times`. Of two equally near times, the earlier one wins.
 fn nearest(times: &[f64], time: f64) -> Option<usize> {
     let after = times.partition_point(|&t| t < time);
     [after.wrapping_sub(1), after]
@@ -197,7 +204,7 @@ mod tests {
     }
 
     #[test]
-    fn every_picture_of_a_synchronized_rig_lands_on_its_frame() {
+    fn synchronized_views_belong_to_their_frames() {
         let times = [0.0, 1.0 / 3.0, 2.0 / 3.0, 1.0];
         let shots: Vec<_> = times.iter().flat_map(|&t| (0..3).map(move |v| (v, Some(t), Split::Train))).collect();
         let rig = rig(&shots);
@@ -208,7 +215,7 @@ mod tests {
     }
 
     #[test]
-    fn monocular_capture_has_one_view_per_frame_and_its_gaps_stay() {
+    fn monocular_frames_without_a_view_stay_empty() {
         let rig = rig(&[(0, Some(0.0), Split::Train), (1, Some(0.5), Split::Test), (2, Some(1.0), Split::Train)]);
         let times = rig.times();
         assert_eq!(times, [0.0, 0.5, 1.0]);
@@ -219,7 +226,7 @@ mod tests {
     }
 
     #[test]
-    fn picture_without_time_shows_every_frame() {
+    fn view_without_time_belongs_to_every_frame() {
         let rig = rig(&[(0, None, Split::Train), (1, None, Split::Test)]);
         assert!(rig.times().is_empty());
         let schedule = rig.schedule(&[0.0, 7.0], None).unwrap();
@@ -228,7 +235,7 @@ mod tests {
     }
 
     #[test]
-    fn pictures_with_and_without_time_keep_the_order_of_the_file() {
+    fn timed_and_timeless_views_keep_the_file_order() {
         let rig = rig(&[
             (0, None, Split::Train),
             (1, Some(1.0), Split::Train),
@@ -242,7 +249,7 @@ mod tests {
     }
 
     #[test]
-    fn rounding_of_times_neither_splits_a_frame_nor_loses_a_picture() {
+    fn rounded_times_belong_to_one_frame() {
         let exact: Vec<f64> = (0..60).map(|t| f64::from(t) / 59.0).collect();
         let shots: Vec<_> = exact
             .iter()
@@ -255,7 +262,7 @@ mod tests {
     }
 
     #[test]
-    fn a_million_frames_are_told_apart() {
+    fn a_million_frames_are_distinguished() {
         const T: usize = 1_000_000;
         let shots: Vec<_> = (0..T).map(|t| (0, Some(t as f64 / (T - 1) as f64), Split::Train)).collect();
         let rig = rig(&shots);
@@ -265,14 +272,14 @@ mod tests {
     }
 
     #[test]
-    fn picture_of_no_frame_is_refused_by_name() {
+    fn view_without_a_frame_is_an_error_with_its_details() {
         let rig = rig(&[(0, Some(0.0), Split::Train), (3, Some(0.25), Split::Test)]);
         let message = rig.schedule(&[0.0, 0.5, 1.0], None).unwrap_err().to_string();
-        for part in ["test.json", "view 3", "0.25", "has 3, from time 0 to 1", "--frames"] {
+        for part in ["test.json", "view 3", "0.25", "has 3 frames, from time 0 to 1", "--frames"] {
             assert!(message.contains(part), "{part:?} is not in {message:?}");
         }
-        assert!(rig.schedule(&[0.0, 0.5, 1.0], Some(Split::Train)).is_ok(), "the other split is not looked at");
-        assert!(rig.schedule(&[], None).unwrap_err().to_string().contains("has none"));
-        assert!(rig.schedule(&[5.0], None).unwrap_err().to_string().contains("has one, at time 5"));
+        assert!(rig.schedule(&[0.0, 0.5, 1.0], Some(Split::Train)).is_ok(), "views of other splits must be ignored");
+        assert!(rig.schedule(&[], None).unwrap_err().to_string().contains("has no frames"));
+        assert!(rig.schedule(&[5.0], None).unwrap_err().to_string().contains("has one frame, at time 5"));
     }
 }

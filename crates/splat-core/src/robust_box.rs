@@ -1,24 +1,23 @@
-//! The extent of a scene without outliers, the unit of relative lengths.
+//! Extent of a scene without outliers: the unit of relative lengths.
 
 use glam::DVec3;
 
 use crate::Column;
 
-/// Box between the 1st and 99th percentile of the positions, axis by axis: a few floaters do not
-/// stretch it.
+/// Box between the 1st and the 99th percentile of the positions along each axis. A few floaters do not enlarge it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RobustBox {
     /// 1st percentiles, scene units.
     pub low: DVec3,
-    /// Medians.
+    /// Medians, scene units.
     pub middle: DVec3,
-    /// 99th percentiles.
+    /// 99th percentiles, scene units.
     pub high: DVec3,
 }
 
 impl RobustBox {
-    /// Returns the box of `position` (`[3, N]`). Percentiles are nearest ranks over finite values; without any of them the
-    /// box is the origin.
+    /// Computes the box of `position` (`[3, N]`). Percentiles are nearest ranks over the finite values. An axis without
+    /// finite values gets 0.
     pub fn from_positions(position: &Column) -> RobustBox {
         let mut found = RobustBox { low: DVec3::ZERO, middle: DVec3::ZERO, high: DVec3::ZERO };
         for axis in 0..3 {
@@ -37,7 +36,7 @@ impl RobustBox {
         found
     }
 
-    /// The longest side; 1 for a scene without any, so that lengths can be divided by it.
+    /// Returns the longest side in scene units. Returns 1 if all sides are 0, so that lengths can be divided by it.
     pub fn extent(&self) -> f64 {
         let longest = (self.high - self.low).max_element();
         if longest > 0.0 { longest } else { 1.0 }
@@ -49,7 +48,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn floaters_and_nan_do_not_stretch_the_box() {
+    fn floaters_and_nan_do_not_enlarge_the_box() {
         let mut position = Column::zeros(3, 1000);
         for i in 0..1000 {
             position.set_row(i, [i as f32, 2.0, -(i as f32)]);
@@ -62,7 +61,7 @@ mod tests {
     }
 
     #[test]
-    fn extent_of_nothing_is_one() {
+    fn extent_of_an_empty_or_flat_scene_is_one() {
         assert_eq!(RobustBox::from_positions(&Column::zeros(3, 0)).extent(), 1.0);
         assert_eq!(RobustBox::from_positions(&Column::zeros(3, 7)).extent(), 1.0);
     }

@@ -1,56 +1,57 @@
-//! One row of statistics per Gaussian (method.md, section 1), as arrays over Gaussians.
+//! Statistics of every Gaussian, as arrays over Gaussians (src/method.md, section 1).
 //!
-//! A new statistic is a field of [`Rows`] and a [`Statistic`]: tables, histograms, scratch files and plans follow.
+//! A new statistic is a field of [`Rows`] and a variant of [`Statistic`]. Tables, histograms, temporary files and
+//! memory plans then include it.
 
 use bitflags::bitflags;
 use serde::{Deserialize, Serialize};
 
 bitflags! {
-    /// What was odd about a Gaussian.
+    /// Anomalies of a Gaussian that the scan found.
     #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
     pub struct Flags: u8 {
-        /// Some value in some frame was NaN or infinite.
+        /// A value in some frame was NaN or infinite.
         const NON_FINITE = 1;
-        /// The quaternion was zero in some frame; the identity was used.
+        /// The quaternion was zero in some frame; the identity was used there.
         const ZERO_ROTATION = 2;
-        /// D fell below the noise floor of its f32 positions and was set to 0.
+        /// D was below the noise floor of the f32 positions and was set to 0.
         const SNAPPED_D = 4;
-        /// κ fell below the noise floor of its f32 positions and was set to 0.
+        /// κ was below the noise floor of the f32 positions and was set to 0.
         const SNAPPED_KAPPA = 8;
     }
 }
 
-/// A statistic of a Gaussian: the one place that says what it is called, where its values are, and what they take.
+/// Statistic of a Gaussian. Its methods declare its names, its meaning, and the array that holds its values.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Statistic {
-    /// [`Rows::d`].
+    /// Trajectory magnitude, [`Rows::d`].
     D,
-    /// [`Rows::kappa`].
+    /// Curvature, [`Rows::kappa`].
     Kappa,
-    /// [`Rows::v`].
+    /// Variance of the opacity, [`Rows::v`].
     V,
-    /// [`Rows::life`].
+    /// Life span, [`Rows::life`].
     Life,
-    /// [`Rows::c`].
+    /// Mean contribution, [`Rows::c`].
     C,
-    /// [`Rows::e`].
+    /// Anisotropy, [`Rows::e`].
     E,
-    /// [`Rows::vis`].
+    /// Visibility, [`Rows::vis`].
     Vis,
-    /// [`Rows::w`].
+    /// Largest weight of a pixel, [`Rows::w`].
     W,
 }
 
-/// Where the values of a statistic are, by their type: to read, and to write.
+/// Accessors of the array of a statistic, by value type: for reading and for writing.
 #[derive(Debug, Clone, Copy)]
 pub enum Values {
-    /// Quantities.
+    /// Array of real numbers.
     F64(fn(&Rows) -> &Vec<f64>, fn(&mut Rows) -> &mut Vec<f64>),
-    /// Counts of frames.
+    /// Array of frame counts.
     U32(fn(&Rows) -> &Vec<u32>, fn(&mut Rows) -> &mut Vec<u32>),
 }
 
-/// What is declared of a statistic.
+/// Names, meaning and values of a statistic.
 struct Declaration {
     name: &'static str,
     column: &'static str,
@@ -63,7 +64,8 @@ impl Statistic {
     /// Every statistic, in the order of tables.
     pub const ALL: [Statistic; 8] = [Self::D, Self::Kappa, Self::V, Self::Life, Self::C, Self::E, Self::Vis, Self::W];
 
-    const fn declared(self) -> Declaration {
+    /// Returns the declaration of this statistic: the single place to describe a new one.
+    const fn declaration(self) -> Declaration {
         use Values::{F64, U32};
         match self {
             Statistic::D => Declaration {
@@ -90,67 +92,67 @@ impl Statistic {
             Statistic::Life => Declaration {
                 name: "Life",
                 column: "life",
-                meaning: "part of the frames it lives in",
+                meaning: "fraction of the frames in which it is alive",
                 property: "life span",
                 values: U32(|rows| &rows.life, |rows| &mut rows.life),
             },
             Statistic::C => Declaration {
                 name: "C",
                 column: "C",
-                meaning: "mean coverage, pixels",
+                meaning: "mean contribution per view, pixels",
                 property: "coverage",
                 values: F64(|rows| &rows.c, |rows| &mut rows.c),
             },
             Statistic::E => Declaration {
                 name: "E",
                 column: "E",
-                meaning: "how far its scales differ",
+                meaning: "anisotropy of the scales",
                 property: "anisotropy",
                 values: F64(|rows| &rows.e, |rows| &mut rows.e),
             },
             Statistic::Vis => Declaration {
                 name: "Vis",
                 column: "vis",
-                meaning: "part of the pictures it touches",
+                meaning: "fraction of the views it touches",
                 property: "visibility",
                 values: F64(|rows| &rows.vis, |rows| &mut rows.vis),
             },
             Statistic::W => Declaration {
                 name: "W",
                 column: "W",
-                meaning: "largest share of a pixel",
+                meaning: "largest alpha · transmittance of a pixel",
                 property: "coverage",
                 values: F64(|rows| &rows.w, |rows| &mut rows.w),
             },
         }
     }
 
-    /// As scores and reports call it.
+    /// Returns the name in scores and reports.
     pub fn name(self) -> &'static str {
-        self.declared().name
+        self.declaration().name
     }
 
-    /// As tables of rows call it.
+    /// Returns the name of the table column.
     pub fn column(self) -> &'static str {
-        self.declared().column
+        self.declaration().column
     }
 
-    /// What it measures, with the unit; counts of frames are told as a part of all.
+    /// Returns a description with the unit. Counts of frames are described as a fraction of all frames.
     pub fn meaning(self) -> &'static str {
-        self.declared().meaning
+        self.declaration().meaning
     }
 
-    /// The property that it grades Gaussians by.
+    /// Returns the property of a Gaussian that this statistic measures.
     pub fn property(self) -> &'static str {
-        self.declared().property
+        self.declaration().property
     }
 
-    /// Where its values are.
+    /// Returns the accessors of the values.
     pub const fn values(self) -> Values {
-        self.declared().values
+        self.declaration().values
     }
 
-    /// Bytes of a Gaussian's value.
+    /// Returns the bytes per Gaussian.
     pub const fn bytes(self) -> usize {
         match self.values() {
             Values::F64(..) => size_of::<f64>(),
@@ -159,32 +161,32 @@ impl Statistic {
     }
 }
 
-/// Statistics of N Gaussians; every array has N entries, but for a `w` that is empty.
+/// Statistics of N Gaussians. Every array has N entries, except that `w` may be empty.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct Rows {
-    /// D, trajectory magnitude: root mean square step, scene units per frame.
+    /// Trajectory magnitude D: root mean square step, scene units per frame.
     pub d: Vec<f64>,
-    /// κ, mean norm of the second difference, scene units per frame².
+    /// Curvature κ: mean norm of the second difference of the position, scene units per frame².
     pub kappa: Vec<f64>,
-    /// V, variance of the opacity over the life span.
+    /// Variance V of the opacity over the life span.
     pub v: Vec<f64>,
     /// Life span in frames.
     pub life: Vec<u32>,
-    /// C, mean projected or visible coverage, pixels.
+    /// Mean projected or visible contribution C, pixels.
     pub c: Vec<f64>,
-    /// W, largest alpha · transmittance of any pixel of any picture, in [0, 0.99]; empty where C is
-    /// projected coverage.
+    /// Largest alpha · transmittance W of any pixel of any view, in [0, 0.99]. Empty if C is the projected
+    /// contribution.
     pub w: Vec<f64>,
-    /// E, anisotropy: largest over smallest canonical scale.
+    /// Anisotropy E of the canonical scales: s_max/s_min, or ln(s_max/s_mid) in the logarithmic form.
     pub e: Vec<f64>,
     /// Fraction of (frame, view) pairs in which the Gaussian is alive and touches the image.
     pub vis: Vec<f64>,
-    /// What was odd.
+    /// Anomalies that the scan found.
     pub flags: Vec<Flags>,
 }
 
 impl Rows {
-    /// Memory of a row that has a W.
+    /// Bytes of all statistics and flags of one Gaussian, W included.
     pub const BYTES_PER_GAUSSIAN: usize = {
         let (mut bytes, mut k) = (size_of::<Flags>(), 0);
         while k < Statistic::ALL.len() {
@@ -194,33 +196,33 @@ impl Rows {
         bytes
     };
 
-    /// Number of Gaussians.
+    /// Returns the number of Gaussians.
     pub fn len(&self) -> usize {
         self.d.len()
     }
 
-    /// Whether there are none.
+    /// Returns whether there are no Gaussians.
     pub fn is_empty(&self) -> bool {
         self.d.is_empty()
     }
 
-    /// Appends the rows of the next block.
+    /// Appends the statistics of the next block and leaves `next` empty.
     pub fn append(&mut self, next: &mut Rows) {
-        for of in Statistic::ALL {
-            match of.values() {
-                Values::F64(_, of) => of(self).append(of(next)),
-                Values::U32(_, of) => of(self).append(of(next)),
+        for statistic in Statistic::ALL {
+            match statistic.values() {
+                Values::F64(_, values) => values(self).append(values(next)),
+                Values::U32(_, values) => values(self).append(values(next)),
             }
         }
         self.flags.append(&mut next.flags);
     }
 
-    /// Sets the statistics of Gaussian `i` to 0; its flags stay.
+    /// Sets the statistics of Gaussian `i` to 0. The flags stay.
     pub fn clear(&mut self, i: usize) {
-        for of in Statistic::ALL {
-            match of.values() {
-                Values::F64(_, of) => of(self).get_mut(i).into_iter().for_each(|value| *value = 0.0),
-                Values::U32(_, of) => of(self).get_mut(i).into_iter().for_each(|value| *value = 0),
+        for statistic in Statistic::ALL {
+            match statistic.values() {
+                Values::F64(_, values) => values(self).get_mut(i).into_iter().for_each(|value| *value = 0.0),
+                Values::U32(_, values) => values(self).get_mut(i).into_iter().for_each(|value| *value = 0),
             }
         }
     }
@@ -231,7 +233,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_of_statistics_are_told_apart() {
+    fn names_of_statistics_are_distinct() {
         for name in [Statistic::name, Statistic::column] {
             let mut names = Statistic::ALL.map(name);
             names.sort_unstable();
@@ -240,12 +242,12 @@ mod tests {
     }
 
     #[test]
-    fn every_array_of_rows_is_a_statistic_with_values_of_its_own() {
+    fn every_array_of_rows_belongs_to_one_statistic() {
         let mut rows = Rows::default();
-        for (k, of) in Statistic::ALL.into_iter().enumerate() {
-            match of.values() {
-                Values::F64(_, of) => of(&mut rows).push(k as f64),
-                Values::U32(_, of) => of(&mut rows).push(k as u32),
+        for (k, statistic) in Statistic::ALL.into_iter().enumerate() {
+            match statistic.values() {
+                Values::F64(_, values) => values(&mut rows).push(k as f64),
+                Values::U32(_, values) => values(&mut rows).push(k as u32),
             }
         }
         let mut all = Rows::default();

@@ -1,101 +1,102 @@
-//! Which cameras see which frame.
+//! Assignment of cameras to frames.
 
 use serde::{Deserialize, Serialize};
 
 use super::camera::Camera;
 
-/// Which cameras see which frame.
+/// Views of every frame: the cameras that see it, with their view numbers.
 ///
-/// Memory: 16 bytes for a run of frames that the same cameras see, 8 for each of these: it grows with the pictures that the
-/// cameras name, not with frames.
+/// Memory: 16 bytes per run of frames with equal views, and 8 bytes per view of a run. Memory grows with the number of
+/// images that the camera file names, not with the number of frames.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct Schedule {
     /// Distinct cameras.
     pub cameras: Vec<Camera>,
-    runs: Vec<FrameRun>,
-    /// (View number, camera index) pairs of run after run.
+    runs: Vec<ViewRun>,
+    /// Pairs (view number, camera index) of all runs, one run after the other.
     views: Vec<(u32, u32)>,
     frames: usize,
 }
 
-/// Frames one after the other that have the same pictures; they end where the next run begins.
+/// Consecutive frames that have equal views. A run ends where the next one begins.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-struct FrameRun {
-    /// Its first frame.
+struct ViewRun {
+    /// Index of the first frame of the run.
     frame: usize,
-    /// Its first pair.
+    /// Index of the first pair of the run in `views`.
     view: usize,
 }
 
-/// A picture to make: what a camera sees at a frame.
+/// View of one frame: the image of one camera at one frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Picture {
-    /// Frame of the sequence.
+    /// Index of the frame in the sequence.
     pub frame: usize,
     /// View number.
     pub view: u32,
-    /// Index of its camera.
+    /// Index of the camera in [`Schedule::cameras`].
     pub camera: u32,
 }
 
 impl Picture {
-    /// `tNNN_vNN`: frame and view, with more digits where they need them.
+    /// Returns the name `tNNN_vNN` of frame and view number, with more digits where needed.
     pub fn name(&self) -> String {
         format!("t{:03}_v{:02}", self.frame, self.view)
     }
 }
 
 impl Schedule {
-    /// No frames yet, for pictures by `cameras`.
+    /// Creates a schedule of `cameras` without frames.
     pub fn new(cameras: Vec<Camera>) -> Schedule {
         Schedule { cameras, ..Schedule::default() }
     }
 
-    /// The next `count` frames are each seen by `views`: (view number, camera index) pairs.
+    /// Appends `count` frames that have the given views: pairs (view number, camera index).
     pub fn push(&mut self, count: usize, views: &[(u32, u32)]) {
-        let goes_on = self.runs.last().is_some_and(|last| &self.views[last.view..] == views);
-        if count > 0 && !goes_on {
-            self.runs.push(FrameRun { frame: self.frames, view: self.views.len() });
+        let extends_last_run = self.runs.last().is_some_and(|last| &self.views[last.view..] == views);
+        if count > 0 && !extends_last_run {
+            self.runs.push(ViewRun { frame: self.frames, view: self.views.len() });
             self.views.extend_from_slice(views);
         }
         self.frames += count;
     }
 
-    /// Bytes of `runs` runs of at most `views` pictures a frame, twice over, as vectors grow.
+    /// Returns the bytes of `runs` runs with at most `views` views per frame. Doubled, because growing vectors reserve
+    /// up to twice their length.
     pub const fn bytes(runs: u64, views: u64) -> u64 {
-        2 * runs * (size_of::<FrameRun>() as u64 + views * size_of::<(u32, u32)>() as u64)
+        2 * runs * (size_of::<ViewRun>() as u64 + views * size_of::<(u32, u32)>() as u64)
     }
 
-    /// T, the number of frames.
+    /// Returns the number of frames T.
     pub fn frames(&self) -> usize {
         self.frames
     }
 
-    /// (View number, camera index) pairs of a frame.
+    /// Returns the views of a frame: pairs (view number, camera index).
     ///
     /// # Panics
-    /// If there is no such frame.
+    /// If the frame does not exist.
     pub fn views(&self, frame: usize) -> &[(u32, u32)] {
         assert!(frame < self.frames, "no frame {frame} of {}", self.frames);
-        self.of_run(self.runs.partition_point(|run| run.frame <= frame) - 1)
+        self.views_of_run(self.runs.partition_point(|run| run.frame <= frame) - 1)
     }
 
-    /// [`Schedule::views`] of every frame.
+    /// Iterates over [`Schedule::views`] of all frames.
     pub fn iter(&self) -> impl Iterator<Item = &[(u32, u32)]> {
-        (0..self.runs.len()).flat_map(|run| std::iter::repeat_n(self.of_run(run), self.run_length(run)))
+        (0..self.runs.len()).flat_map(|run| std::iter::repeat_n(self.views_of_run(run), self.run_length(run)))
     }
 
-    /// M, the number of (time, view) pairs.
+    /// Returns the number of (frame, view) pairs M.
     pub fn pairs(&self) -> usize {
-        (0..self.runs.len()).map(|run| self.run_length(run) * self.of_run(run).len()).sum()
+        (0..self.runs.len()).map(|run| self.run_length(run) * self.views_of_run(run).len()).sum()
     }
 
-    /// Most pictures of one frame.
+    /// Returns the maximum number of views of a frame.
     pub fn most_views(&self) -> usize {
-        (0..self.runs.len()).map(|run| self.of_run(run).len()).max().unwrap_or(0)
+        (0..self.runs.len()).map(|run| self.views_of_run(run).len()).max().unwrap_or(0)
     }
 
-    /// Indices of the cameras that see any frame, increasing.
+    /// Returns the indices of the cameras that see at least one frame, increasing.
     pub fn used(&self) -> Vec<u32> {
         let mut used: Vec<u32> = self.views.iter().map(|&(_, camera)| camera).collect();
         used.sort_unstable();
@@ -103,11 +104,13 @@ impl Schedule {
         used
     }
 
-    fn of_run(&self, run: usize) -> &[(u32, u32)] {
+    /// Returns the views of each frame of a run: pairs (view number, camera index).
+    fn views_of_run(&self, run: usize) -> &[(u32, u32)] {
         let end = self.runs.get(run + 1).map_or(self.views.len(), |next| next.view);
         &self.views[self.runs[run].view..end]
     }
 
+    /// Returns the number of frames of a run.
     fn run_length(&self, run: usize) -> usize {
         self.runs.get(run + 1).map_or(self.frames, |next| next.frame) - self.runs[run].frame
     }
@@ -118,14 +121,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn frames_have_what_was_pushed_and_equal_ones_share_a_run() {
+    fn frames_with_equal_views_share_a_run() {
         let pushed: [(usize, &[(u32, u32)]); 8] = [
             (0, &[(9, 9)]),
             (2, &[]),
             (1, &[(0, 0), (1, 1)]),
             (3, &[(0, 0), (1, 1)]),
             (1, &[(1, 1)]),
-            // As many views, but others.
+            // As many views as before, but different ones.
             (1, &[(1, 0)]),
             (0, &[(3, 3)]),
             (2, &[]),
@@ -144,16 +147,16 @@ mod tests {
     }
 
     #[test]
-    fn what_a_camera_of_its_own_for_every_frame_takes_is_counted() {
+    fn bytes_cover_one_camera_per_frame() {
         for (frames, views) in [(1, 1), (1000, 1), (1025, 3), (70_000, 2)] {
             let mut schedule = Schedule::default();
             for frame in 0..frames {
-                let of_frame: Vec<(u32, u32)> = (0..views).map(|view| (view, frame)).collect();
-                schedule.push(1, &of_frame);
+                let views_of_frame: Vec<(u32, u32)> = (0..views).map(|view| (view, frame)).collect();
+                schedule.push(1, &views_of_frame);
             }
             let held =
-                schedule.runs.capacity() * size_of::<FrameRun>() + schedule.views.capacity() * size_of::<(u32, u32)>();
-            // A vector begins with room for four.
+                schedule.runs.capacity() * size_of::<ViewRun>() + schedule.views.capacity() * size_of::<(u32, u32)>();
+            // The first allocation of a vector has a capacity of four.
             let counted = Schedule::bytes(frames.max(4).into(), views.into());
             assert!(held as u64 <= counted, "{frames} frames of {views}: {held} bytes, counted {counted}");
             assert!(schedule.runs.len() == frames as usize && counted <= 2 * (held as u64).max(96), "{held} {counted}");

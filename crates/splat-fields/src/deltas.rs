@@ -1,30 +1,32 @@
-//! What the field changes: state = raw·mask + delta, back, and the derivative.
+//! Application of deltas and masks: state = raw·mask + delta, its inverse, and its derivative.
 
 use splat_core::{Column, Columns, Gaussians, Jacobian};
 
-/// Changes of a block of Gaussians at one time.
+/// Deltas and masks of a block of Gaussians at one time.
 ///
-/// For an active column state = raw·mask + delta, except the rotation, which is never masked and is
-/// raw + delta, or raw ⊗ delta normalized when the field multiplies rotations. An inactive column is
-/// raw itself, unmasked.
+/// An active attribute has state = raw·mask + delta. The rotation is an exception: it is never masked, and its state is
+/// raw + delta, or raw ⊗ delta normalized if the field multiplies rotations. An inactive attribute has state = raw,
+/// without a mask.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Deltas {
-    /// Deltas in stored encoding; only the `active` columns mean anything.
+    /// Deltas in stored encoding. Only the `active` attributes are valid.
     pub delta: Gaussians,
-    /// `[N]`; none: every mask is 1.
+    /// Mask of each Gaussian `[N]`; `None` if every mask is 1.
     pub mask: Option<Vec<f32>>,
-    /// Columns the field changes and that were asked for.
+    /// Requested attributes that the field changes.
     pub active: Columns,
-    /// The rotation delta is a factor.
+    /// Whether the rotation delta is a factor.
     pub multiply_rotation: bool,
 }
 
 impl Deltas {
-    /// An empty block for a cloud of `sh_degree`, to be filled by [`Field::deltas`](super::Field::deltas).
+    /// Creates an empty block for Gaussians of SH degree `sh_degree`, to be filled by
+    /// [`Field::deltas`](super::Field::deltas).
     pub fn new(sh_degree: usize) -> Self {
         Deltas { delta: Gaussians::zeros(0, sh_degree), mask: None, active: Columns::empty(), multiply_rotation: false }
     }
 
+    /// Starts a block of `rows` Gaussians: resizes the `active` attributes and stores the arguments.
     pub(super) fn begin(&mut self, rows: usize, active: Columns, multiply_rotation: bool) {
         for column in active.iter() {
             self.delta.column_mut(column).resize(rows);
@@ -33,7 +35,7 @@ impl Deltas {
         self.multiply_rotation = multiply_rotation;
     }
 
-    /// The state of `raw` in the columns `want`, into `state`, which is resized in those columns.
+    /// Computes the state of `raw` in the attributes `want` into `state`, which is resized in these attributes.
     pub fn apply(&self, raw: &Gaussians, want: Columns, state: &mut Gaussians) {
         for column in want.iter() {
             let from = raw.column(column);
@@ -59,8 +61,10 @@ impl Deltas {
         }
     }
 
-    /// How the state changes with the raw parameters, deltas and masks held as they are, where it is not by as much; 0
-    /// where that would not be finite. `rotation` is raw.
+    /// Computes the derivative of the state with respect to the raw parameters, with deltas and masks held constant.
+    ///
+    /// Attributes whose state changes by the same amount as the raw value get no values. Values that are not finite
+    /// become 0. `rotation` holds the raw quaternions.
     pub(super) fn jacobian(&self, rotation: &Column, out: &mut Jacobian) {
         for column in self.active.iter() {
             if column == Columns::ROTATION && self.multiply_rotation {
@@ -69,9 +73,9 @@ impl Deltas {
                     let (raw, delta) = (rotation.row(i), self.delta.rotation.row(i));
                     for component in 0..4 {
                         let by_state = std::array::from_fn(|c| f32::from(u8::from(c == component)));
-                        let by_raw = pull_unit_product(raw, delta, by_state);
-                        for (c, by) in by_raw.into_iter().enumerate() {
-                            out.column_mut(column).plane_mut(4 * component + c)[i] = finite(by);
+                        let by_raw = unit_product_gradient(raw, delta, by_state);
+                        for (c, derivative) in by_raw.into_iter().enumerate() {
+                            out.column_mut(column).plane_mut(4 * component + c)[i] = finite(derivative);
                         }
                     }
                 }
@@ -81,9 +85,10 @@ impl Deltas {
         }
     }
 
-    /// The raw parameters whose state is `state`, in the columns `want`: the inverse of [`Deltas::apply`].
-    /// Exact to rounding; a rotation is recovered up to its length. Where a mask or a rotation delta is
-    /// zero no raw value leads to `state` and the result is not finite.
+    /// Computes the raw parameters whose state is `state`, in the attributes `want`: the inverse of [`Deltas::apply`].
+    ///
+    /// Exact up to rounding; a rotation is recovered up to its length. If a mask or a rotation delta is zero, no raw
+    /// value leads to `state` and the result is not finite.
     pub fn solve(&self, state: &Gaussians, want: Columns, raw: &mut Gaussians) {
         for column in want.iter() {
             let from = state.column(column);
@@ -111,7 +116,7 @@ impl Deltas {
     }
 }
 
-/// Hamilton product of two wxyz quaternions.
+/// Returns the Hamilton product of two wxyz quaternions.
 fn product(a: [f32; 4], b: [f32; 4]) -> [f32; 4] {
     [
         a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
@@ -121,19 +126,20 @@ fn product(a: [f32; 4], b: [f32; 4]) -> [f32; 4] {
     ]
 }
 
-/// The quaternion at unit length; zero stays zero, for the reader of the state to flag.
+/// Returns the quaternion at unit length. Zero stays zero, so that the reader of the state can flag it.
 fn unit(q: [f32; 4]) -> [f32; 4] {
     let length = q.iter().map(|x| x * x).sum::<f32>().sqrt();
     if length == 0.0 { q } else { q.map(|x| x / length) }
 }
 
-/// `x`, or 0 if it is not finite.
+/// Returns `x`, or 0 if it is not finite.
 pub(super) fn finite(x: f32) -> f32 {
     if x.is_finite() { x } else { 0.0 }
 }
 
-/// Derivative by `a`, given that by the product of `a` and `b` at unit length; none where that is zero.
-fn pull_unit_product(a: [f32; 4], b: [f32; 4], by_unit: [f32; 4]) -> [f32; 4] {
+/// Returns the derivative with respect to `a`, given the derivative with respect to the normalized product of `a` and
+/// `b`. Returns 0 if the product is zero.
+fn unit_product_gradient(a: [f32; 4], b: [f32; 4], by_unit: [f32; 4]) -> [f32; 4] {
     let whole = product(a, b);
     let length = whole.iter().map(|x| x * x).sum::<f32>().sqrt();
     if length == 0.0 {

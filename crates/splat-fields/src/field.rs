@@ -1,9 +1,8 @@
-//! The deformation field: features, trunk, heads, and how their deltas change raw parameters.
+//! Deformation field of a 4DGaussians model: plane features, trunk and heads.
 //!
-//! Data in: tensors of a state dict, canonical positions, a time. Data out: deltas and masks per
-//! Gaussian. Memory: the tensors, [`Field::bytes_per_gaussian`] per prepared Gaussian, and about
-//! 4·LANES·(features + trunk + heads) bytes of scratch per reader.
-//! Source: Wu et al., "4D Gaussian Splatting for Real-Time Dynamic Scene Rendering", 2024, and the
+//! Input: tensors of a state dict, canonical positions, a time. Output: deltas and masks per Gaussian. Memory: the
+//! tensors, [`Field::bytes_per_gaussian`] per prepared Gaussian, and about 4·LANES·(features + trunk + heads) bytes of
+//! scratch per reader. Source: Wu et al., "4D Gaussian Splatting for Real-Time Dynamic Scene Rendering", 2024, and the
 //! behavior of its public renderer.
 
 use std::path::Path;
@@ -17,69 +16,72 @@ use super::planes::{Planes, PreparedPlanes, TimeLines};
 use super::tensors::{Lookup, Tensors};
 use super::voxel::VoxelMask;
 
-/// What of a model's hyper-parameters decides the evaluation and cannot be told from tensor shapes.
+/// Hyper-parameters that decide the evaluation and cannot be inferred from tensor shapes.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FieldConfig {
-    /// Columns whose heads are on (`no_dx`, `no_ds`, `no_dr`, `no_do`, `no_dshs` are off).
+    /// Attributes whose heads are on (their flags `no_dx`, `no_ds`, `no_dr`, `no_do`, `no_dshs` are false).
     pub active: Columns,
-    /// A head of the hidden features gives the mask; takes precedence over `empty_voxel`.
+    /// Whether a head on the hidden features gives the mask. Takes precedence over `empty_voxel`.
     pub static_mlp: bool,
-    /// A voxel grid gives the mask.
+    /// Whether a voxel grid gives the mask.
     pub empty_voxel: bool,
-    /// Above 1: features become `[f, sin(p·f), cos(p·f)]` with p this number.
+    /// Frequency p. Above 1, features f become `[f, sin(p·f), cos(p·f)]`.
     pub grid_pe: i64,
-    /// The trunk reads `[x, y, z, t]` instead of plane features.
+    /// Whether the trunk reads `[x, y, z, t]` instead of plane features.
     pub no_grid: bool,
-    /// The rotation delta multiplies the quaternion instead of being added.
+    /// Whether the rotation delta multiplies the quaternion instead of being added.
     pub apply_rotation: bool,
 }
 
+/// Mask that multiplies the stored attributes other than the rotation.
 #[derive(Debug, Clone)]
 pub(super) enum Mask {
+    /// No mask.
     None,
-    /// The last head, of the hidden features: varies with time.
+    /// Mask of the last head, from the hidden features. Varies with time.
     Head,
-    /// Constant in time.
+    /// Mask of a voxel grid. Constant in time.
     Voxel(VoxelMask),
 }
 
-/// One head: hidden layer, ReLU, output layer, on top of the trunk's ReLU.
+/// Output head of the trunk: hidden layer, ReLU, output layer. Reads the trunk's output after ReLU.
 #[derive(Debug, Clone)]
 pub(super) struct Head {
-    /// The column it deforms; none for the mask of `static_mlp`.
+    /// Attribute that the head deforms; `None` for the mask of `static_mlp`.
     pub(super) column: Option<Columns>,
     pub(super) hidden: Linear,
     pub(super) output: Linear,
 }
 
-/// A 4DGaussians deformation field. Evaluates any block of Gaussians at any time; the result of a
-/// Gaussian has the same bits whatever block it is evaluated in.
+/// Deformation field of a 4DGaussians model. Evaluates any block of Gaussians at any time. The result of a Gaussian has
+/// the same bits in every block.
 #[derive(Debug, Clone)]
 pub struct Field {
     pub(super) config: FieldConfig,
-    /// None when the trunk reads positions.
+    /// Feature planes; `None` if the trunk reads positions.
     pub(super) planes: Option<Planes>,
     pub(super) trunk: Vec<Linear>,
     pub(super) heads: Vec<Head>,
     pub(super) mask: Mask,
 }
 
-/// What does not depend on time for one block of Gaussians.
+/// Time-independent part of the evaluation of one block of Gaussians.
 #[derive(Debug, Clone)]
 pub struct Prepared {
     rows: usize,
     input: PreparedInput,
-    /// Mask of `empty_voxel`.
+    /// Mask of `empty_voxel` per Gaussian.
     voxel: Option<Vec<f32>>,
 }
 
+/// Time-independent input of the trunk: plane features, or positions.
 #[derive(Debug, Clone)]
 enum PreparedInput {
     Planes(PreparedPlanes),
     Position(Column),
 }
 
-/// Reusable activations of one reader.
+/// Reusable buffers for the activations of one reader.
 #[derive(Debug, Clone, Default)]
 pub struct Scratch {
     features: Vec<CacheLine>,
@@ -87,7 +89,7 @@ pub struct Scratch {
     hidden: Vec<CacheLine>,
 }
 
-/// Name of a column's head in the state dict and its flag in `cfg_args`.
+/// Returns the name of an attribute's head in the state dict, and the flag in `cfg_args` that turns it on.
 fn head_name(column: Columns) -> (&'static str, &'static str) {
     match column {
         Columns::POSITION => ("pos_deform", "no_dx=False"),
@@ -99,13 +101,13 @@ fn head_name(column: Columns) -> (&'static str, &'static str) {
 }
 
 impl Field {
-    /// Builds the field from the state dict read from `path`, for a cloud of `sh_degree`.
+    /// Builds the field from the state dict read from `path`, for Gaussians of SH degree `sh_degree`.
     ///
-    /// Depth, widths, levels and resolutions follow from the tensors' shapes. Tensors the evaluation
-    /// does not use (`timenet.*`, `*_poc`, heads that are off) are ignored.
+    /// Depth, widths, levels and resolutions follow from the shapes of the tensors. Unused tensors (`timenet.*`,
+    /// `*_poc`, heads that are off) are ignored.
     ///
     /// # Errors
-    /// A tensor that is missing, of the wrong shape, or not finite; the error names it.
+    /// A tensor is missing, has the wrong shape, or is not finite. The message names the tensor.
     pub fn new(tensors: &Tensors, config: FieldConfig, sh_degree: usize, path: &Path) -> Result<Self> {
         let lookup = Lookup { tensors, path };
         let planes = if config.no_grid { None } else { Some(Planes::load(lookup)?) };
@@ -115,10 +117,10 @@ impl Field {
             Some(planes) => planes.width(),
         };
         let layer = |i: usize| format!("deformation_net.feature_out.{}", 2 * i);
-        let mut trunk = vec![Linear::load(lookup, &layer(0), inputs, None, "the features it reads")?];
+        let mut trunk = vec![Linear::load(lookup, &layer(0), inputs, None, "one input per feature")?];
         let width = trunk[0].outputs;
         while lookup.has(&format!("{}.weight", layer(trunk.len()))) {
-            trunk.push(Linear::load(lookup, &layer(trunk.len()), width, Some(width), "the width of the network")?);
+            trunk.push(Linear::load(lookup, &layer(trunk.len()), width, Some(width), "width of the network")?);
         }
 
         let shape = Gaussians::zeros(0, sh_degree);
@@ -145,34 +147,34 @@ impl Field {
         Ok(Field { config, planes, trunk, heads, mask })
     }
 
-    /// Columns that change with time.
+    /// Returns the attributes that change with time.
     pub fn active(&self) -> Columns {
         self.config.active
     }
 
-    /// Whether a mask multiplies what is stored.
+    /// Returns whether a mask multiplies stored attributes.
     pub fn has_mask(&self) -> bool {
         !matches!(self.mask, Mask::None)
     }
 
-    /// The hyper-parameters the field was built with.
+    /// Returns the hyper-parameters of the field.
     pub fn config(&self) -> &FieldConfig {
         &self.config
     }
 
-    /// Bytes one Gaussian takes in [`Prepared`].
+    /// Returns the bytes per Gaussian in [`Prepared`].
     pub fn bytes_per_gaussian(&self) -> usize {
         let input = self.planes.as_ref().map_or(12, Planes::bytes_per_gaussian);
         input + if matches!(self.mask, Mask::Voxel(_)) { 4 } else { 0 }
     }
 
-    /// Multiplications by weights that a Gaussian takes at one time.
+    /// Returns the number of multiplications by weights per Gaussian and time.
     pub fn multiplications(&self) -> usize {
         let heads = self.heads.iter().flat_map(|head| [&head.hidden, &head.output]);
         self.trunk.iter().chain(heads).map(Linear::multiplications).sum()
     }
 
-    /// Computes what does not depend on time for Gaussians at canonical `position` `[N, 3]`.
+    /// Computes the time-independent part for Gaussians at canonical `position` `[3, N]`.
     pub fn prepare(&self, position: &Column) -> Prepared {
         Prepared {
             rows: position.len(),
@@ -187,11 +189,11 @@ impl Field {
         }
     }
 
-    /// Deltas and masks at `time` of the prepared block, for the active columns among `want`; other
-    /// columns of `out` are left alone. `time` is used as it is, clamped to [−1, 1] by the planes.
+    /// Computes deltas and masks of the prepared block at `time`, for the active attributes among `want`. Other
+    /// attributes of `out` stay unchanged. `time` is used without mapping; the planes clamp it to [−1, 1].
     ///
     /// # Errors
-    /// A time that is not finite, or `out` of another SH degree than the field was built for.
+    /// `time` is not finite, or `out` has another SH degree than the field.
     pub fn deltas(
         &self,
         prepared: &Prepared,
@@ -201,14 +203,19 @@ impl Field {
         out: &mut Deltas,
     ) -> Result<()> {
         if !time.is_finite() {
-            return Err(Error::internal(format!("a deformation field has no state at time {time}")));
+            return Err(Error::internal(format!(
+                "time of a deformation field: expected a finite number, found {time}"
+            )));
         }
         let want = want & self.config.active;
         if let Some(head) = self.heads.iter().find(|head| {
             head.column.is_some_and(|c| want.contains(c) && out.delta.column(c).width() != head.output.outputs)
         }) {
             let name = head.column.map_or("mask", Columns::name);
-            return Err(Error::internal(format!("the field deforms {} values of {name}", head.output.outputs)));
+            return Err(Error::internal(format!(
+                "the deformation field has {} values of {name}, and the output another number",
+                head.output.outputs
+            )));
         }
         out.begin(prepared.rows, want, self.config.apply_rotation);
         let masked = !want.difference(Columns::ROTATION).is_empty();
@@ -223,13 +230,13 @@ impl Field {
         if let (None, PreparedInput::Planes(_)) | (Some(_), PreparedInput::Position(_)) =
             (&self.planes, &prepared.input)
         {
-            return Err(Error::internal("a block prepared by another field was given"));
+            return Err(Error::internal("the block was prepared by another deformation field"));
         }
         let time = time as f32;
         let lines = self.planes.as_ref().map_or(Vec::new(), |planes| planes.lines(time));
         #[cfg(target_arch = "x86_64")]
         if std::arch::is_x86_feature_detected!("avx2") && std::arch::is_x86_feature_detected!("fma") {
-            // SAFETY: the line above saw that this processor has AVX2 and FMA.
+            // SAFETY: AVX2 and FMA were detected on the line above.
             unsafe { self.evaluate_fma(prepared, time, &lines, scratch, out) };
             return Ok(());
         }
@@ -251,7 +258,8 @@ impl Field {
         self.evaluate::<true>(prepared, time, lines, scratch, out);
     }
 
-    /// Fills what `out` has begun; inlined, with all it calls, into each instruction set's copy.
+    /// Evaluates the field group by group of [`LANES`] Gaussians into `out`. Inlined with all callees into one copy per
+    /// instruction set.
     #[inline(always)]
     fn evaluate<const FMA: bool>(
         &self,
@@ -272,8 +280,8 @@ impl Field {
                     }
                 }
                 (_, PreparedInput::Position(position)) => {
-                    let places = [0, 1, 2].map(|axis| &position.plane(axis)[start..start + lanes]);
-                    place_features(places, time, features);
+                    let positions = [0, 1, 2].map(|axis| &position.plane(axis)[start..start + lanes]);
+                    position_time_features(positions, time, features);
                 }
                 (None, PreparedInput::Planes(_)) => {}
             }
@@ -295,17 +303,17 @@ impl Field {
     }
 }
 
-/// What the trunk reads where it reads `[x, y, z, t]`; `places` are by axis.
+/// Writes the input `[x, y, z, t]` of the trunk of a field without planes. `positions` holds one slice per axis.
 #[inline(always)]
-pub(super) fn place_features(places: [&[f32]; 3], time: f32, features: &mut Vec<CacheLine>) {
+pub(super) fn position_time_features(positions: [&[f32]; 3], time: f32, features: &mut Vec<CacheLine>) {
     features.clear();
     features.resize(4, CacheLine([time; LANES]));
-    for (out, place) in features.iter_mut().zip(places) {
-        out.0[..place.len()].copy_from_slice(place);
+    for (out, position) in features.iter_mut().zip(positions) {
+        out.0[..position.len()].copy_from_slice(position);
     }
 }
 
-/// Runs the trunk on `input`; gives its ReLU-ed output, as every head wants it.
+/// Runs the trunk on `input` and returns its output after ReLU, the input of every head.
 #[inline(always)]
 fn run_trunk<'a, const FMA: bool>(
     layers: &[Linear],
@@ -319,10 +327,10 @@ fn run_trunk<'a, const FMA: bool>(
     last
 }
 
-/// `[f, sin(p·f), cos(p·f)]` of features f.
+/// Appends sin(p·f) and cos(p·f) to features f.
 pub(super) fn add_frequencies(features: &mut Vec<CacheLine>, p: f32) {
     let plain = features.clone();
-    for of in [f32::sin, f32::cos] {
-        features.extend(plain.iter().map(|f| CacheLine(f.0.map(|f| of(p * f)))));
+    for function in [f32::sin, f32::cos] {
+        features.extend(plain.iter().map(|f| CacheLine(f.0.map(|f| function(p * f)))));
     }
 }

@@ -1,51 +1,55 @@
-//! The field's derivative: how the state changes with raw parameters.
+//! Derivative of the state with respect to raw parameters.
 //!
-//! state = raw + delta(position, time), so a position's state changes as it does and, through its own delta, by ∂delta/
-//! ∂position: for each of its three components head and trunk transposed, with the masks of their ReLUs, then the planes.
-//! Through the deltas of other columns nothing changes: that is worth less than 0.1 dB of a refinement and costs most of
-//! the field's time. Data in: raw positions and rotations. Data out: a [`Jacobian`]. Memory: that, and one group of
-//! [`LANES`] Gaussians. Derived in method.md, section 8.2.
+//! state = raw + delta(position, time), so ∂state/∂raw of a position is the identity plus ∂delta/∂position. The latter
+//! is computed for each of the three components by a backward pass through head and trunk, with the masks of their
+//! ReLUs, and then through the planes. Derivatives through the deltas of other attributes are neglected: they are worth
+//! less than 0.1 dB of a refinement and cost most of the time of the field. Input: raw positions and rotations. Output:
+//! a [`Jacobian`]. Memory: the Jacobian and one group of [`LANES`] Gaussians. Derived in src/method.md, section 8.2.
 
 use super::deltas::{Deltas, finite};
-use super::field::{Field, Head, Mask, Scratch, add_frequencies, place_features};
+use super::field::{Field, Head, Mask, Scratch, add_frequencies, position_time_features};
 use super::linear::{CacheLine, LANES, Linear};
 use splat_core::error::{Error, Result};
 use splat_core::{Column, Columns, Gaussians, Jacobian};
 
-/// Derivatives and activations of one group of Gaussians.
+/// Activations and derivatives of one group of Gaussians.
 #[derive(Default)]
 struct JacobianGroup {
     features: Vec<CacheLine>,
-    /// Derivatives of the planes' features by position, by axis.
+    /// Derivatives of the plane features with respect to position, by axis.
     slopes: [Vec<CacheLine>; 3],
-    /// Of every layer, as ReLU left them.
+    /// Activations of every trunk layer after ReLU.
     trunk: Vec<Vec<CacheLine>>,
     hidden: Vec<CacheLine>,
-    /// By what the last step reads.
-    by: Vec<CacheLine>,
+    /// Derivatives with respect to the input of the layer that the backward pass has reached.
+    gradient: Vec<CacheLine>,
     spare: Vec<CacheLine>,
 }
 
 impl Field {
-    /// How the columns `want` of the state at `time` of a block of Gaussians change with their raw parameters. `raw` has
-    /// rows in position, and in rotation where `want` has it. A value that would not be finite is 0, of a position that of no
-    /// delta.
+    /// Computes the derivative of the state at `time` with respect to raw parameters, for the attributes `want` of a
+    /// block of Gaussians.
     ///
-    /// Under a mask (`static_mlp`, `empty_voxel`) masks and deltas count as constant: a position's state changes by the
-    /// mask times its change.
+    /// `raw` has rows in position, and in rotation if `want` contains it. A value that is not finite becomes 0; for a
+    /// position only its part through the delta becomes 0.
+    ///
+    /// Under a mask (`static_mlp`, `empty_voxel`) masks and deltas count as constant: the state of a position changes
+    /// by the mask times the change of the raw position.
     ///
     /// # Errors
-    /// A time that is not finite.
+    /// `time` is not finite.
     pub fn jacobian(&self, raw: &Gaussians, time: f64, want: Columns) -> Result<Jacobian> {
         if !time.is_finite() {
-            return Err(Error::internal(format!("a deformation field has no state at time {time}")));
+            return Err(Error::internal(format!(
+                "time of a deformation field: expected a finite number, found {time}"
+            )));
         }
         let want = self.config.active & want;
         let mut found = Jacobian::default();
         if let Mask::None = self.mask {
             let head = self.heads.iter().find(|head| head.column == Some(Columns::POSITION));
             if let Some(head) = head.filter(|_| want.contains(Columns::POSITION)) {
-                *found.column_mut(Columns::POSITION) = self.of_position(head, &raw.position, time as f32);
+                *found.column_mut(Columns::POSITION) = self.position_jacobian(head, &raw.position, time as f32);
             }
         }
         let held = match self.mask {
@@ -61,37 +65,38 @@ impl Field {
         Ok(found)
     }
 
-    /// How positions change.
-    fn of_position(&self, head: &Head, position: &Column, time: f32) -> Column {
+    /// Computes ∂state/∂raw of positions, `[9, N]`.
+    fn position_jacobian(&self, head: &Head, position: &Column, time: f32) -> Column {
         let mut out = Column::zeros(9, position.len());
         #[cfg(target_arch = "x86_64")]
         if std::arch::is_x86_feature_detected!("avx2") && std::arch::is_x86_feature_detected!("fma") {
-            // SAFETY: the line above saw that this processor has AVX2 and FMA.
-            unsafe { self.of_groups_fma(head, position, time, &mut out) };
+            // SAFETY: AVX2 and FMA were detected on the line above.
+            unsafe { self.position_jacobian_by_group_fma(head, position, time, &mut out) };
             return out;
         }
-        self.of_groups::<false>(head, position, time, &mut out);
+        self.position_jacobian_by_group::<false>(head, position, time, &mut out);
         out
     }
 
-    /// [`Field::of_groups`] compiled for AVX2 and FMA.
+    /// [`Field::position_jacobian_by_group`] compiled for AVX2 and FMA.
     #[cfg(target_arch = "x86_64")]
     #[target_feature(enable = "avx2,fma")]
-    fn of_groups_fma(&self, head: &Head, position: &Column, time: f32, out: &mut Column) {
-        self.of_groups::<true>(head, position, time, out);
+    fn position_jacobian_by_group_fma(&self, head: &Head, position: &Column, time: f32, out: &mut Column) {
+        self.position_jacobian_by_group::<true>(head, position, time, out);
     }
 
-    /// Group by group; inlined, with all it calls, into each instruction set's copy.
+    /// Computes ∂state/∂raw of positions group by group into `out`. Inlined with all callees into one copy per
+    /// instruction set.
     #[inline(always)]
-    fn of_groups<const FMA: bool>(&self, head: &Head, position: &Column, time: f32, out: &mut Column) {
+    fn position_jacobian_by_group<const FMA: bool>(&self, head: &Head, position: &Column, time: f32, out: &mut Column) {
         let lines = self.planes.as_ref().map_or(Vec::new(), |planes| planes.lines(time));
         let mut group = JacobianGroup::default();
         for start in (0..position.len()).step_by(LANES) {
             let rows = start..position.len().min(start + LANES);
-            let places = [0, 1, 2].map(|axis| &position.plane(axis)[rows.clone()]);
+            let positions = [0, 1, 2].map(|axis| &position.plane(axis)[rows.clone()]);
             match &self.planes {
-                Some(planes) => planes.sloped(places, &lines, &mut group.features, &mut group.slopes),
-                None => place_features(places, time, &mut group.features),
+                Some(planes) => planes.features_with_slopes(positions, &lines, &mut group.features, &mut group.slopes),
+                None => position_time_features(positions, time, &mut group.features),
             }
             if self.planes.is_some() && self.config.grid_pe > 1 {
                 add_frequencies(&mut group.features, self.config.grid_pe as f32);
@@ -99,21 +104,21 @@ impl Field {
             group.forward::<FMA>(self, head);
 
             for component in 0..3 {
-                group.by.clear();
-                group.by.resize(head.output.padded_outputs(), CacheLine([0.0; LANES]));
-                group.by[component] = CacheLine([1.0; LANES]);
+                group.gradient.clear();
+                group.gradient.resize(head.output.padded_outputs(), CacheLine([0.0; LANES]));
+                group.gradient[component] = CacheLine([1.0; LANES]);
                 group.backward::<FMA>(self, head);
                 if self.planes.is_some() && self.config.grid_pe > 1 {
-                    pull_frequencies(&group.features, self.config.grid_pe as f32, &mut group.by);
+                    frequencies_backward(&group.features, self.config.grid_pe as f32, &mut group.gradient);
                 }
                 for axis in 0..3 {
-                    let parts = match &self.planes {
-                        Some(_) => group.along(axis),
-                        None => group.by[axis],
+                    let through_delta = match &self.planes {
+                        Some(_) => group.axis_derivative(axis),
+                        None => group.gradient[axis],
                     };
-                    let of_raw = f32::from(u8::from(component == axis));
+                    let identity = f32::from(u8::from(component == axis));
                     let out = &mut out.plane_mut(3 * component + axis)[rows.clone()];
-                    out.iter_mut().zip(parts.0).for_each(|(out, part)| *out = of_raw + finite(part));
+                    out.iter_mut().zip(through_delta.0).for_each(|(out, delta)| *out = identity + finite(delta));
                 }
             }
         }
@@ -121,7 +126,7 @@ impl Field {
 }
 
 impl JacobianGroup {
-    /// Activations from features.
+    /// Computes the activations of trunk and head from the features.
     #[inline(always)]
     fn forward<const FMA: bool>(&mut self, field: &Field, head: &Head) {
         self.trunk.resize(field.trunk.len(), Vec::new());
@@ -133,25 +138,25 @@ impl JacobianGroup {
         head.hidden.activate::<FMA>(input, &mut self.hidden);
     }
 
-    /// From derivatives by the planes' features to those by one axis.
+    /// Returns the derivative along one axis, given the derivatives with respect to the plane features.
     #[inline(always)]
-    fn along(&self, axis: usize) -> CacheLine {
+    fn axis_derivative(&self, axis: usize) -> CacheLine {
         let mut sums = CacheLine([0.0; LANES]);
-        for (by, slope) in self.by.iter().zip(&self.slopes[axis]) {
+        for (gradient, slope) in self.gradient.iter().zip(&self.slopes[axis]) {
             for lane in 0..LANES {
-                sums.0[lane] += by.0[lane] * slope.0[lane];
+                sums.0[lane] += gradient.0[lane] * slope.0[lane];
             }
         }
         sums
     }
 
-    /// From derivatives by the head's outputs to those by features.
+    /// Computes the derivatives with respect to the features, given those with respect to the outputs of the head.
     #[inline(always)]
     fn backward<const FMA: bool>(&mut self, field: &Field, head: &Head) {
-        let JacobianGroup { trunk, hidden, by, spare, .. } = self;
-        let mut step = |layer: &Linear, kept: Option<&[CacheLine]>| {
-            layer.pull::<FMA>(by, kept, spare);
-            std::mem::swap(by, spare);
+        let JacobianGroup { trunk, hidden, gradient, spare, .. } = self;
+        let mut step = |layer: &Linear, activations: Option<&[CacheLine]>| {
+            layer.backward::<FMA>(gradient, activations, spare);
+            std::mem::swap(gradient, spare);
         };
         step(&head.output, Some(hidden));
         step(&head.hidden, trunk.last().map(Vec::as_slice));
@@ -161,14 +166,15 @@ impl JacobianGroup {
     }
 }
 
-/// From derivatives by `[f, sin(p·f), cos(p·f)]`, which are `features`, to those by f, in the first third of `by`.
-fn pull_frequencies(features: &[CacheLine], p: f32, by: &mut [CacheLine]) {
+/// Computes the derivatives with respect to f, given those with respect to `features` = `[f, sin(p·f), cos(p·f)]`. The
+/// result is in the first third of `gradient`.
+fn frequencies_backward(features: &[CacheLine], p: f32, gradient: &mut [CacheLine]) {
     let n = features.len() / 3;
     for c in 0..n {
         for lane in 0..LANES {
             let (sine, cosine) = (features[n + c].0[lane], features[2 * n + c].0[lane]);
-            let turned = cosine * by[n + c].0[lane] - sine * by[2 * n + c].0[lane];
-            by[c].0[lane] += p * turned;
+            let term = cosine * gradient[n + c].0[lane] - sine * gradient[2 * n + c].0[lane];
+            gradient[c].0[lane] += p * term;
         }
     }
 }

@@ -1,9 +1,28 @@
 //! Deformation fields of dynamic Gaussian-splatting models, evaluated in blocks of Gaussians.
 //!
-//! [`Field`] is the field of a 4DGaussians model: HexPlane features followed by MLP heads. [`Network`] is the deep MLP of
-//! position and time that Deformable-3D-Gaussians trains. Both also give derivatives with respect to the stored Gaussians.
+//! [`Field`] is the field of a 4DGaussians model: HexPlane features followed by MLP heads. [`Network`] is the deep MLP
+//! of position and time that Deformable-3D-Gaussians trains. Both also compute derivatives with respect to the stored
+//! Gaussians.
 //!
-//! [`oracle`] evaluates a [`Field`] in f64, and [`synthetic`] makes fields of random weights to test with.
+//! [`oracle`] evaluates a [`Field`] in f64. [`synthetic`] makes fields with random weights for tests.
+//!
+//! ```
+//! use std::path::Path;
+//! use splat_core::{Columns, Gaussians};
+//! use splat_fields::{Deltas, Field, Scratch, synthetic};
+//!
+//! let config = synthetic::plain();
+//! let field = Field::new(&synthetic::tensors(&config, 1), config, 3, Path::new("deformation.pth"))?;
+//! let canonical = Gaussians::zeros(100, 3);
+//! let prepared = field.prepare(&canonical.position);
+//!
+//! let (mut deltas, mut scratch) = (Deltas::new(3), Scratch::default());
+//! field.deltas(&prepared, 0.25, Columns::all(), &mut scratch, &mut deltas)?;
+//! let mut state = Gaussians::zeros(0, 3);
+//! deltas.apply(&canonical, Columns::all(), &mut state);
+//! assert_eq!(state.len(), 100);
+//! # splat_core::error::Result::Ok(())
+//! ```
 
 #![cfg_attr(not(test), deny(clippy::print_stderr, clippy::print_stdout))]
 
@@ -26,3 +45,8 @@ pub use field::{Field, FieldConfig, Prepared, Scratch};
 pub use network::{Encoded, Network, PredictedMotion};
 pub use planes::{Box3, Tap, rows_before_zero, tap};
 pub use tensors::{Tensor, Tensors};
+
+/// Compiles the example of the README.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+mod readme {}

@@ -1,37 +1,38 @@
 //! Fully connected layers over [`LANES`] Gaussians side by side.
 //!
-//! Weights are packed once, on loading, into panels of four outputs. The sums of a panel are eight of the sixteen
-//! registers that AVX2 has, enough to hide the latency of its multiply-adds; the other operands are one input of all
-//! lanes and one weight, so few outputs cost no more than their share. A library that packs its operands in every call
-//! spends a seventh of its time on that with matrices as small as these.
+//! Weights are packed once, on loading, into panels of four outputs. The sums of a panel take eight of the sixteen AVX2
+//! registers, enough to hide the latency of the multiply-adds. The other operands are one input of all lanes and one
+//! weight, so layers with few outputs are not slower per output. A library that packs its operands in every call spends
+//! a seventh of its time on packing matrices as small as these.
 
 use splat_core::error::Result;
 
 use super::tensors::Lookup;
 
-/// Gaussians evaluated side by side.
+/// Number of Gaussians evaluated side by side.
 pub(super) const LANES: usize = 16;
-/// One value of each of them: a line of the cache, as a register that spans two is loaded at half the speed.
+/// One value per lane, aligned to a cache line: loading a register from two lines takes twice the time.
 #[derive(Debug, Clone, Copy)]
 #[repr(align(64))]
 pub(super) struct CacheLine(pub(super) [f32; LANES]);
 
-/// Outputs whose sums are made together.
+/// Number of outputs whose sums are computed together.
 const PANEL: usize = 4;
 
-/// `y = W·x + b`.
+/// Fully connected layer `y = W·x + b`.
 #[derive(Debug, Clone)]
 pub(super) struct Linear {
-    /// `[panels, inputs, PANEL]`, zero beyond the last output.
+    /// Weights `[panels, inputs, PANEL]`, zero beyond the last output.
     weight: Vec<[f32; PANEL]>,
-    /// `[panels, PANEL]`
+    /// Biases `[panels, PANEL]`.
     bias: Vec<[f32; PANEL]>,
     inputs: usize,
     pub(super) outputs: usize,
 }
 
 impl Linear {
-    /// Reads `{name}.weight` `[outputs, inputs]` and `{name}.bias` `[outputs]`; `None` accepts any extent.
+    /// Reads `{name}.weight` `[outputs, inputs]` and `{name}.bias` `[outputs]`. `None` for `outputs` accepts any
+    /// number.
     pub(super) fn load(
         lookup: Lookup<'_>,
         name: &str,
@@ -55,17 +56,17 @@ impl Linear {
         Ok(layer)
     }
 
-    /// Outputs in whole panels.
+    /// Returns the number of outputs, rounded up to whole panels.
     pub(super) fn padded_outputs(&self) -> usize {
         self.bias.len() * PANEL
     }
 
-    /// Multiplications by weights that a Gaussian takes.
+    /// Returns the number of multiplications by weights per Gaussian.
     pub(super) fn multiplications(&self) -> usize {
         self.weight.len() * PANEL
     }
 
-    /// ReLU(y) of `input` `[inputs, LANES]` into `out` `[outputs, LANES]`. NaN stays NaN, as it would not through
+    /// Computes ReLU(y) of `input` `[inputs, LANES]` into `out` `[outputs, LANES]`. NaN stays NaN, unlike with
     /// `f32::max`.
     #[inline(always)]
     pub(super) fn activate<const FMA: bool>(&self, input: &[CacheLine], out: &mut Vec<CacheLine>) {
@@ -81,37 +82,39 @@ impl Linear {
         }
     }
 
-    /// Derivatives by the inputs into `out`, given those by the outputs, both in whole panels that are 0 beyond the
-    /// last; 0 where `kept`, the inputs as ReLU left them, is not positive.
+    /// Computes the derivatives with respect to the inputs into `out`, given those with respect to the outputs.
+    ///
+    /// Both are in whole panels that are 0 beyond the last value. `activations` are the inputs if ReLU produced them;
+    /// the derivative is 0 where they are not positive.
     #[inline(always)]
-    pub(super) fn pull<const FMA: bool>(
+    pub(super) fn backward<const FMA: bool>(
         &self,
-        by_output: &[CacheLine],
-        kept: Option<&[CacheLine]>,
+        output_gradient: &[CacheLine],
+        activations: Option<&[CacheLine]>,
         out: &mut Vec<CacheLine>,
     ) {
         out.resize(self.inputs.next_multiple_of(PANEL), CacheLine([0.0; LANES]));
         for (first, out) in (0..self.inputs).step_by(PANEL).zip(out.chunks_exact_mut(PANEL)) {
             let mut sums = [CacheLine([0.0; LANES]); PANEL];
-            for (weight, by) in self.weight.chunks_exact(self.inputs).zip(by_output.chunks_exact(PANEL)) {
+            for (weight, gradient) in self.weight.chunks_exact(self.inputs).zip(output_gradient.chunks_exact(PANEL)) {
                 for (sum, weight) in sums.iter_mut().zip(&weight[first..]) {
-                    for (&w, by) in weight.iter().zip(by) {
-                        for (sum, &by) in sum.0.iter_mut().zip(&by.0) {
-                            *sum = if FMA { by.mul_add(w, *sum) } else { by * w + *sum };
+                    for (&w, gradient) in weight.iter().zip(gradient) {
+                        for (sum, &gradient) in sum.0.iter_mut().zip(&gradient.0) {
+                            *sum = if FMA { gradient.mul_add(w, *sum) } else { gradient * w + *sum };
                         }
                     }
                 }
             }
             out.copy_from_slice(&sums);
         }
-        for (out, kept) in out.iter_mut().zip(kept.unwrap_or_default()) {
-            for (out, &kept) in out.0.iter_mut().zip(&kept.0) {
-                *out = if kept > 0.0 { *out } else { 0.0 };
+        for (out, activations) in out.iter_mut().zip(activations.unwrap_or_default()) {
+            for (out, &activation) in out.0.iter_mut().zip(&activations.0) {
+                *out = if activation > 0.0 { *out } else { 0.0 };
             }
         }
     }
 
-    /// The first `lanes` values of output o into `planes[o·len + start ..]`.
+    /// Writes the first `lanes` values of output o into `planes[o·len + start ..]`, without ReLU.
     #[inline(always)]
     pub(super) fn write<const FMA: bool>(
         &self,
@@ -132,9 +135,9 @@ impl Linear {
     }
 }
 
-/// One panel's outputs. Each sum starts from its bias and adds the inputs in their order, so the result of a Gaussian
-/// does not depend on those beside it. Fused multiply-adds only where the processor has them: elsewhere each would be a
-/// call.
+/// Computes the outputs of one panel. Each sum starts from its bias and adds the inputs in their order, so the result
+/// of a Gaussian does not depend on the other lanes. Uses fused multiply-adds only if the processor has them: otherwise
+/// each one would be a function call.
 #[inline(always)]
 fn sums<const FMA: bool>(input: &[CacheLine], weight: &[[f32; PANEL]], bias: &[f32; PANEL]) -> [CacheLine; PANEL] {
     let mut sums = bias.map(|b| CacheLine([b; LANES]));

@@ -1,11 +1,14 @@
-//! A deep network that moves Gaussians: sines of position and time, fully connected layers, linear heads.
+//! Deep MLP that moves Gaussians: encoding of position and time, fully connected layers, linear heads.
 //!
-//! h = [e(x), e(t)] with e(v) = [v, sin(2⁰v), cos(2⁰v), sin(2¹v), cos(2¹v), …], every block all components, ten octaves of
-//! x; with a time network e(t) is its output. Layers are linear, then ReLU; some read [e(x), e(t), h] instead of h. Heads
-//! are linear in the last h. Data in: tensors of a state dict, canonical positions, a time. Data out: [`PredictedMotion`].
-//! Memory: the tensors twice, [`Network::BYTES_PER_GAUSSIAN`] per encoded Gaussian, and about 64 kB of activations per call.
-//! Sources: Yang et al., "Deformable 3D Gaussians for High-Fidelity Monocular Dynamic Scene Reconstruction", 2024; Huang et
-//! al., "SC-GS: Sparse-Controlled Gaussian Splatting for Editable Dynamic Scenes", 2024; and their public code.
+//! The input is h = [e(x), e(t)] with the encoding e(v) = [v, sin(2⁰v), cos(2⁰v), sin(2¹v), cos(2¹v), …]; every entry
+//! has all components of v. Positions have ten octaves. In models with a time network, e(t) is the output of that
+//! network. Layers are linear, then ReLU. Layers with a skip connection read [e(x), e(t), h] instead of h. Heads are
+//! linear in the last h.
+//!
+//! Input: tensors of a state dict, canonical positions, a time. Output: [`PredictedMotion`]. Memory: the tensors twice,
+//! [`Network::BYTES_PER_GAUSSIAN`] per encoded Gaussian, and about 64 kB of activations per call. Sources: Yang et al.,
+//! "Deformable 3D Gaussians for High-Fidelity Monocular Dynamic Scene Reconstruction", 2024; Huang et al., "SC-GS:
+//! Sparse-Controlled Gaussian Splatting for Editable Dynamic Scenes", 2024; and their public code.
 
 use std::path::Path;
 
@@ -14,70 +17,77 @@ use super::tensors::{Lookup, Tensors};
 use splat_core::error::{Error, Result};
 use splat_core::{Column, Columns};
 
-/// Octaves of a position's sines.
-const OCTAVES: usize = 10;
-/// Values that a position becomes.
-const PLACE: usize = 3 + 6 * OCTAVES;
+/// Number of octaves in the encoding of a position.
+const POSITION_OCTAVES: usize = 10;
+/// Number of values in the encoding of a position.
+const POSITION_INPUTS: usize = 3 + 6 * POSITION_OCTAVES;
 
-/// A network. The result of a Gaussian has the same bits whatever block it is evaluated in.
+/// Deep MLP of position and time. The result of a Gaussian has the same bits in every block.
 #[derive(Debug, Clone)]
 pub struct Network {
-    /// Of time's sines.
+    /// Number of octaves in the encoding of the time.
     octaves: usize,
-    /// Two layers between time's sines and what the others read.
+    /// Two layers of the time network, between the encoded time and the input of the first layer.
     time: Option<[Linear; 2]>,
     layers: Vec<NetworkLayer>,
     heads: Vec<NetworkHead>,
 }
 
+/// Fully connected layer with ReLU.
 #[derive(Debug, Clone)]
 struct NetworkLayer {
     linear: Linear,
-    /// Whether it reads the encodings before what the layer before it gives.
-    joins: bool,
+    /// Whether the layer reads the encodings of position and time before the output of the previous layer.
+    has_skip: bool,
 }
 
+/// Linear output layer of one attribute, or of three of its components.
 #[derive(Debug, Clone)]
 struct NetworkHead {
     column: Columns,
-    /// Of its first output in the column.
+    /// Component of the attribute that the first output belongs to.
     plane: usize,
     output: Linear,
 }
 
-/// Encoded positions of a block of Gaussians, for all times.
+/// Encoded positions of a block of Gaussians, valid for all times.
 #[derive(Debug, Clone, Default)]
 pub struct Encoded {
     rows: usize,
-    /// Groups of [`LANES`] Gaussians, zero beyond the last: [`PLACE`] values each.
+    /// Encodings in groups of [`LANES`] Gaussians with [`POSITION_INPUTS`] values each; zero beyond the last Gaussian.
     values: Vec<CacheLine>,
 }
 
-/// What heads say of a block of Gaussians; of no rows where there is no head, or where nobody asked.
+/// Outputs of the heads for a block of Gaussians. A column has no rows if there is no such head or it was not
+/// requested.
 #[derive(Debug, Clone, Default)]
 pub struct PredictedMotion {
-    /// `[3]` what is added to positions, scene units; of a network of screws `[6]`, w and then v.
+    /// Position offset `[3]`, scene units. For networks that predict screw motions `[6]`: the screw parameters w, then
+    /// v.
     pub warp: Column,
-    /// `[4]` what is added to quaternions, wxyz.
+    /// Quaternion offset `[4]`, wxyz.
     pub rotation: Column,
-    /// `[3]` what is added to scales, scene units.
+    /// Scale offset `[3]`, scene units.
     pub scaling: Column,
-    /// `[1]` what is added to opacities.
+    /// Opacity offset `[1]`.
     pub opacity: Column,
-    /// `[3]` what is added to harmonics of degree 0.
+    /// Offset of the SH coefficients of degree 0, `[3]`.
     pub color: Column,
 }
 
-/// Activations of one group.
+/// Activations of one group of Gaussians.
 #[derive(Default)]
 struct NetworkScratch {
-    /// Encodings, and behind them what a layer that joins reads.
+    /// Encodings of position and time, followed by the output of the previous layer for a layer with a skip connection.
     input: Vec<CacheLine>,
+    /// Output of the current layer.
     last: Vec<CacheLine>,
+    /// Output of the previous layer.
     spare: Vec<CacheLine>,
 }
 
 impl PredictedMotion {
+    /// Returns the outputs of the head of an attribute.
     fn column_mut(&mut self, which: Columns) -> &mut Column {
         match which {
             Columns::POSITION => &mut self.warp,
@@ -90,130 +100,136 @@ impl PredictedMotion {
 }
 
 impl Network {
-    /// Bytes that one Gaussian takes in [`Encoded`].
-    pub const BYTES_PER_GAUSSIAN: usize = 4 * PLACE;
+    /// Bytes per Gaussian in [`Encoded`].
+    pub const BYTES_PER_GAUSSIAN: usize = 4 * POSITION_INPUTS;
 
-    /// Builds the network from the tensors of `path` whose names begin with `prefix`. Depth, widths, octaves of time,
-    /// joins and heads follow from the tensors.
+    /// Builds the network from the tensors of `path` whose names begin with `prefix`. Depth, widths, octaves of the
+    /// time, skip connections and heads follow from the tensors.
     ///
     /// # Errors
-    /// A tensor that is missing, of the wrong shape, or not finite; the error names it.
+    /// A tensor is missing, has the wrong shape, or is not finite. The message names the tensor.
     pub fn new(tensors: &Tensors, prefix: &str, path: &Path) -> Result<Network> {
         let lookup = Lookup { tensors, path };
-        let name = |of: &str| format!("{prefix}{of}");
-        let has = |of: &str| lookup.has(&format!("{prefix}{of}.weight"));
-        let load = |of: &str, inputs: usize, outputs: Option<usize>, why: &str| {
-            Linear::load(lookup, &name(of), inputs, outputs, why)
+        let name = |layer: &str| format!("{prefix}{layer}");
+        let has = |layer: &str| lookup.has(&format!("{prefix}{layer}.weight"));
+        let load = |layer: &str, inputs: usize, outputs: Option<usize>, why: &str| {
+            Linear::load(lookup, &name(layer), inputs, outputs, why)
         };
-        let wide = |of: &str| lookup.matrix(&format!("{prefix}{of}.weight"), "the network's layers");
+        let weight_shape =
+            |layer: &str| lookup.matrix(&format!("{prefix}{layer}.weight"), "layer of the deformation network");
 
-        let [_, inputs] = wide("linear.0")?;
+        let [_, inputs] = weight_shape("linear.0")?;
         let time = match has("timenet.0") {
             true => {
-                let [_, inputs] = wide("timenet.0")?;
-                let first = load("timenet.0", inputs, None, "time's sines")?;
+                let [_, inputs] = weight_shape("timenet.0")?;
+                let first = load("timenet.0", inputs, None, "input layer of the time network")?;
                 let outputs = first.outputs;
-                Some((inputs, [first, load("timenet.2", outputs, None, "the hidden layer of the time network")?]))
+                Some((inputs, [first, load("timenet.2", outputs, None, "output layer of the time network")?]))
             }
             false => None,
         };
-        let of_time = inputs.checked_sub(PLACE).filter(|&width| width > 0);
-        let sines = time.as_ref().map_or(of_time, |(inputs, _)| Some(*inputs));
-        let Some((of_time, octaves)) = of_time.zip(sines.filter(|width| width % 2 == 1).map(|width| width / 2)) else {
-            let (of, expected) = match time {
-                Some(_) => {
-                    ("timenet.0", "an odd number of inputs, a time and its sines, after which linear.0 reads more")
-                }
-                None => ("linear.0", "63 inputs of a position and an odd number of a time"),
+        let time_inputs = inputs.checked_sub(POSITION_INPUTS).filter(|&width| width > 0);
+        let encoded_time = time.as_ref().map_or(time_inputs, |(inputs, _)| Some(*inputs));
+        let octaves = encoded_time.filter(|width| width % 2 == 1).map(|width| width / 2);
+        let Some((time_inputs, octaves)) = time_inputs.zip(octaves) else {
+            let (layer, expected) = match time {
+                Some(_) => (
+                    "timenet.0",
+                    "an odd number of inputs (time, sines and cosines), and more than 63 inputs of linear.0",
+                ),
+                None => ("linear.0", "63 inputs for the position and an odd number of inputs for the time"),
             };
             let found = format!(
-                "linear.0 reads {inputs}{}",
-                sines.map_or(String::new(), |width| format!(", {width} of a time"))
+                "linear.0 has {inputs} inputs{}",
+                encoded_time.map_or(String::new(), |width| format!(", the time is encoded in {width}"))
             );
-            return Err(lookup.mismatch(&name(&format!("{of}.weight")), expected, found));
+            return Err(lookup.mismatch(&name(&format!("{layer}.weight")), expected, found));
         };
         let time = time.map(|(_, layers)| layers);
         if let Some([_, last]) = &time
-            && last.outputs != of_time
+            && last.outputs != time_inputs
         {
-            let expected = format!("{of_time} outputs, which linear.0 reads after {PLACE} of a position");
+            let expected =
+                format!("{time_inputs} outputs, the inputs of linear.0 beyond {POSITION_INPUTS} for the position");
             return Err(lookup.mismatch(&name("timenet.2.weight"), expected, last.outputs.to_string()));
         }
 
         let mut layers: Vec<NetworkLayer> = Vec::new();
         let mut width = 0;
         while has(&format!("linear.{}", layers.len())) {
-            let of = format!("linear.{}", layers.len());
-            let joins = !layers.is_empty() && wide(&of)?[1] == width + inputs;
-            let reads = if layers.is_empty() || joins { width + inputs } else { width };
-            let linear = load(&of, reads, None, "the layer before it, with or without the encodings")?;
+            let layer = format!("linear.{}", layers.len());
+            let has_skip = !layers.is_empty() && weight_shape(&layer)?[1] == width + inputs;
+            let layer_inputs = if layers.is_empty() || has_skip { width + inputs } else { width };
+            let why = "outputs of the previous layer, with or without the encodings of position and time";
+            let linear = load(&layer, layer_inputs, None, why)?;
             width = linear.outputs;
-            layers.push(NetworkLayer { linear, joins });
+            layers.push(NetworkLayer { linear, has_skip });
         }
 
         let mut heads = Vec::new();
-        let mut add = |column: Columns, plane: usize, of: &str, outputs: usize, why: &str| -> Result<()> {
-            let output = load(of, width, Some(outputs), why)?;
+        let mut add = |column: Columns, plane: usize, layer: &str, outputs: usize, why: &str| -> Result<()> {
+            let output = load(layer, width, Some(outputs), why)?;
             heads.push(NetworkHead { column, plane, output });
             Ok(())
         };
         if has("branch_w") {
-            add(Columns::POSITION, 0, "branch_w", 3, "the axis of a screw")?;
-            add(Columns::POSITION, 3, "branch_v", 3, "the way along a screw")?;
+            add(Columns::POSITION, 0, "branch_w", 3, "rotation axis of a screw motion")?;
+            add(Columns::POSITION, 3, "branch_v", 3, "translation of a screw motion")?;
         } else {
-            add(Columns::POSITION, 0, "gaussian_warp", 3, "what is added to a position")?;
+            add(Columns::POSITION, 0, "gaussian_warp", 3, "position offset")?;
         }
-        add(Columns::ROTATION, 0, "gaussian_rotation", 4, "what is added to a rotation")?;
-        add(Columns::LOG_SCALE, 0, "gaussian_scaling", 3, "what is added to scales")?;
+        add(Columns::ROTATION, 0, "gaussian_rotation", 4, "rotation offset")?;
+        add(Columns::LOG_SCALE, 0, "gaussian_scaling", 3, "scale offset")?;
         if has("gaussian_opacity") {
-            add(Columns::OPACITY, 0, "gaussian_opacity", 1, "what is added to an opacity")?;
+            add(Columns::OPACITY, 0, "gaussian_opacity", 1, "opacity offset")?;
         }
         if has("gaussian_color") {
-            add(Columns::SH, 0, "gaussian_color", 3, "what is added to a colour")?;
+            add(Columns::SH, 0, "gaussian_color", 3, "color offset")?;
         }
         Ok(Network { octaves, time, layers, heads })
     }
 
-    /// Columns that have a head.
+    /// Returns the attributes that have a head.
     pub fn active(&self) -> Columns {
         self.heads.iter().map(|head| head.column).collect()
     }
 
-    /// Whether positions move by screws: [`PredictedMotion::warp`] is then w and v.
+    /// Returns whether positions move by screw motions. [`PredictedMotion::warp`] then holds w and v.
     pub fn has_screws(&self) -> bool {
         self.heads.iter().any(|head| head.plane > 0)
     }
 
-    /// Multiplications by weights that a Gaussian takes at one time.
+    /// Returns the number of multiplications by weights per Gaussian and time.
     pub fn multiplications(&self) -> usize {
         let layers = self.layers.iter().map(|layer| &layer.linear);
         layers.chain(self.heads.iter().map(|head| &head.output)).map(Linear::multiplications).sum()
     }
 
-    /// Encodes canonical positions `[N, 3]`.
+    /// Encodes canonical positions `[3, N]`.
     ///
-    /// Sine and cosine are exact to f32 of 2ᵏ times the f32 position: those of the position in f64, doubled. Each doubling
-    /// doubles an error of 1e-16, which is 1e-13 at the last.
+    /// Sines and cosines of 2ᵏ times the f32 position are exact to f32. They are computed in f64 for the position and
+    /// doubled by the double-angle formulas. Each doubling doubles an error of 1e-16, which gives 1e-13 at the last
+    /// octave.
     pub fn encode(&self, position: &Column) -> Encoded {
         let rows = position.len();
-        let mut values = vec![CacheLine([0.0; LANES]); rows.div_ceil(LANES) * PLACE];
+        let mut values = vec![CacheLine([0.0; LANES]); rows.div_ceil(LANES) * POSITION_INPUTS];
         for (axis, row) in (0..3).flat_map(|axis| (0..rows).map(move |row| (axis, row))) {
             let (group, lane) = (row / LANES, row % LANES);
-            let out = &mut values[group * PLACE..][..PLACE];
-            for (k, value) in sines(position.plane(axis)[row], OCTAVES).into_iter().enumerate() {
+            let out = &mut values[group * POSITION_INPUTS..][..POSITION_INPUTS];
+            for (k, value) in encode_scalar(position.plane(axis)[row], POSITION_OCTAVES).into_iter().enumerate() {
                 out[3 * k + axis].0[lane] = value;
             }
         }
         Encoded { rows, values }
     }
 
-    /// What the heads of the columns `want` say at `time`, which is rounded to f32 as the originals do; other columns of
-    /// `out` are left alone.
+    /// Computes the outputs of the heads of the attributes `want` at `time`. The time is rounded to f32 as in the
+    /// original code. Other columns of `out` stay unchanged.
     ///
     /// # Errors
-    /// A time that is not finite.
+    /// `time` is not finite.
     pub fn motion(&self, encoded: &Encoded, time: f64, want: Columns, out: &mut PredictedMotion) -> Result<()> {
-        let time = finite(time)?;
+        let time = checked_time(time)?;
         for head in self.heads.iter().filter(|head| want.contains(head.column)) {
             let column = out.column_mut(head.column);
             let width = head.plane + head.output.outputs;
@@ -224,7 +240,7 @@ impl Network {
         }
         #[cfg(target_arch = "x86_64")]
         if std::arch::is_x86_feature_detected!("avx2") && std::arch::is_x86_feature_detected!("fma") {
-            // SAFETY: the line above saw that this processor has AVX2 and FMA.
+            // SAFETY: AVX2 and FMA were detected on the line above.
             unsafe { self.evaluate_fma(encoded, time, want, out) };
             return Ok(());
         }
@@ -232,18 +248,19 @@ impl Network {
         Ok(())
     }
 
-    /// How [`PredictedMotion::warp`] at `time` changes with canonical `position` `[N, 3]`: output o along axis a in plane 3·o + a.
+    /// Computes the derivatives of [`PredictedMotion::warp`] at `time` with respect to canonical `position` `[3, N]`.
+    /// Plane 3·o + a is ∂ output o / ∂ axis a.
     ///
     /// # Errors
-    /// A time that is not finite.
+    /// `time` is not finite.
     pub fn slopes(&self, position: &Column, time: f64) -> Result<Column> {
-        let time = finite(time)?;
+        let time = checked_time(time)?;
         let encoded = self.encode(position);
         let outputs = if self.has_screws() { 6 } else { 3 };
         let mut out = Column::zeros(3 * outputs, encoded.rows);
         #[cfg(target_arch = "x86_64")]
         if std::arch::is_x86_feature_detected!("avx2") && std::arch::is_x86_feature_detected!("fma") {
-            // SAFETY: the line above saw that this processor has AVX2 and FMA.
+            // SAFETY: AVX2 and FMA were detected on the line above.
             unsafe { self.differentiate_fma(&encoded, time, &mut out) };
             return Ok(out);
         }
@@ -265,22 +282,22 @@ impl Network {
         self.differentiate::<true>(encoded, time, out);
     }
 
-    /// Fills the columns of `out`; inlined, with all it calls, into each instruction set's copy.
+    /// Evaluates the heads `want` into `out`. Inlined with all callees into one copy per instruction set.
     #[inline(always)]
     fn evaluate<const FMA: bool>(&self, encoded: &Encoded, time: f32, want: Columns, out: &mut PredictedMotion) {
-        let (of_time, mut scratch) = (self.of_time::<FMA>(time), NetworkScratch::default());
-        for (group, place) in encoded.values.chunks_exact(PLACE).enumerate() {
+        let (encoded_time, mut scratch) = (self.encode_time::<FMA>(time), NetworkScratch::default());
+        for (group, position_encoding) in encoded.values.chunks_exact(POSITION_INPUTS).enumerate() {
             let NetworkScratch { input, last, spare } = &mut scratch;
             input.clear();
-            input.extend_from_slice(place);
-            input.extend_from_slice(&of_time);
+            input.extend_from_slice(position_encoding);
+            input.extend_from_slice(&encoded_time);
             for (k, layer) in self.layers.iter().enumerate() {
                 std::mem::swap(last, spare);
-                if layer.joins {
-                    input.truncate(PLACE + of_time.len());
+                if layer.has_skip {
+                    input.truncate(POSITION_INPUTS + encoded_time.len());
                     input.extend_from_slice(&spare[..self.layers[k - 1].linear.outputs]);
                 }
-                layer.linear.activate::<FMA>(if k == 0 || layer.joins { input } else { spare }, last);
+                layer.linear.activate::<FMA>(if k == 0 || layer.has_skip { input } else { spare }, last);
             }
             let start = group * LANES;
             let lanes = LANES.min(encoded.rows - start);
@@ -291,11 +308,11 @@ impl Network {
         }
     }
 
-    /// What the layers read of a time.
+    /// Returns the encoded time that the layers read, equal in all lanes.
     #[inline(always)]
-    fn of_time<const FMA: bool>(&self, time: f32) -> Vec<CacheLine> {
+    fn encode_time<const FMA: bool>(&self, time: f32) -> Vec<CacheLine> {
         let mut now: Vec<CacheLine> =
-            sines(time, self.octaves).into_iter().map(|value| CacheLine([value; LANES])).collect();
+            encode_scalar(time, self.octaves).into_iter().map(|value| CacheLine([value; LANES])).collect();
         if let Some([first, last]) = &self.time {
             let (mut hidden, mut planes) = (Vec::new(), vec![0.0; last.outputs]);
             first.activate::<FMA>(&now, &mut hidden);
@@ -305,53 +322,54 @@ impl Network {
         now
     }
 
-    /// Forward once, and back for each output of the heads of positions.
+    /// Computes the derivatives of the position heads into `out`: one forward pass, and one backward pass per output.
     #[inline(always)]
     fn differentiate<const FMA: bool>(&self, encoded: &Encoded, time: f32, out: &mut Column) {
-        let of_time = self.of_time::<FMA>(time);
-        let encodings = PLACE + of_time.len();
-        let mut kept: Vec<Vec<CacheLine>> = vec![Vec::new(); self.layers.len()];
-        let (mut input, mut by, mut spare, mut of_place) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
-        for (group, place) in encoded.values.chunks_exact(PLACE).enumerate() {
+        let encoded_time = self.encode_time::<FMA>(time);
+        let encodings = POSITION_INPUTS + encoded_time.len();
+        let mut activations: Vec<Vec<CacheLine>> = vec![Vec::new(); self.layers.len()];
+        let (mut input, mut gradient, mut spare, mut position_gradient) =
+            (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+        for (group, position_encoding) in encoded.values.chunks_exact(POSITION_INPUTS).enumerate() {
             input.clear();
-            input.extend_from_slice(place);
-            input.extend_from_slice(&of_time);
+            input.extend_from_slice(position_encoding);
+            input.extend_from_slice(&encoded_time);
             for (k, layer) in self.layers.iter().enumerate() {
-                let (before, now) = kept.split_at_mut(k);
+                let (before, now) = activations.split_at_mut(k);
                 let before = before.last().map_or(&[][..], |before| &before[..]);
-                if layer.joins {
+                if layer.has_skip {
                     input.truncate(encodings);
                     input.extend_from_slice(&before[..self.layers[k - 1].linear.outputs]);
                 }
-                layer.linear.activate::<FMA>(if k == 0 || layer.joins { &input } else { before }, &mut now[0]);
+                layer.linear.activate::<FMA>(if k == 0 || layer.has_skip { &input } else { before }, &mut now[0]);
             }
             let start = group * LANES;
             let lanes = LANES.min(encoded.rows - start);
             let heads = self.heads.iter().filter(|head| head.column == Columns::POSITION);
             for (head, component) in heads.flat_map(|head| (0..head.output.outputs).map(move |o| (head, o))) {
-                by.clear();
-                by.resize(head.output.padded_outputs(), CacheLine([0.0; LANES]));
-                by[component] = CacheLine([1.0; LANES]);
-                of_place.clear();
-                of_place.resize(PLACE, CacheLine([0.0; LANES]));
-                head.output.pull::<FMA>(&by, kept.last().map(Vec::as_slice), &mut spare);
-                std::mem::swap(&mut by, &mut spare);
+                gradient.clear();
+                gradient.resize(head.output.padded_outputs(), CacheLine([0.0; LANES]));
+                gradient[component] = CacheLine([1.0; LANES]);
+                position_gradient.clear();
+                position_gradient.resize(POSITION_INPUTS, CacheLine([0.0; LANES]));
+                head.output.backward::<FMA>(&gradient, activations.last().map(Vec::as_slice), &mut spare);
+                std::mem::swap(&mut gradient, &mut spare);
                 for (k, layer) in self.layers.iter().enumerate().rev() {
-                    // What a layer that joins reads first is no output of a ReLU.
-                    let before = k.checked_sub(1).map(|before| &kept[before][..]);
-                    layer.linear.pull::<FMA>(&by, before.filter(|_| !layer.joins), &mut spare);
-                    std::mem::swap(&mut by, &mut spare);
-                    if k == 0 || layer.joins {
-                        add(&by[..PLACE], &mut of_place);
+                    // The encodings that a layer with a skip connection reads first are not outputs of a ReLU.
+                    let before = k.checked_sub(1).map(|before| &activations[before][..]);
+                    layer.linear.backward::<FMA>(&gradient, before.filter(|_| !layer.has_skip), &mut spare);
+                    std::mem::swap(&mut gradient, &mut spare);
+                    if k == 0 || layer.has_skip {
+                        add(&gradient[..POSITION_INPUTS], &mut position_gradient);
                     }
-                    if let Some(before) = before.filter(|_| layer.joins) {
-                        by.drain(..encodings);
-                        by.resize(before.len(), CacheLine([0.0; LANES]));
-                        by.iter_mut().zip(before).for_each(|(by, kept)| keep_positive(by, kept));
+                    if let Some(before) = before.filter(|_| layer.has_skip) {
+                        gradient.drain(..encodings);
+                        gradient.resize(before.len(), CacheLine([0.0; LANES]));
+                        relu_gradient(&mut gradient, before);
                     }
                 }
                 for axis in 0..3 {
-                    let slope = along(axis, place, &of_place);
+                    let slope = axis_derivative(axis, position_encoding, &position_gradient);
                     let plane = out.plane_mut(3 * (head.plane + component) + axis);
                     plane[start..][..lanes].copy_from_slice(&slope.0[..lanes]);
                 }
@@ -360,16 +378,16 @@ impl Network {
     }
 }
 
-/// A time as the network reads it.
-fn finite(time: f64) -> Result<f32> {
+/// Returns the time in f32, the precision of the network.
+fn checked_time(time: f64) -> Result<f32> {
     match time.is_finite() {
         true => Ok(time as f32),
-        false => Err(Error::internal(format!("a deformation network has no state at time {time}"))),
+        false => Err(Error::internal(format!("time of a deformation network: expected a finite number, found {time}"))),
     }
 }
 
-/// `[v, sin(v), cos(v), sin(2v), cos(2v), …]`.
-fn sines(value: f32, octaves: usize) -> Vec<f32> {
+/// Returns the encoding `[v, sin(v), cos(v), sin(2v), cos(2v), …]` of a number.
+fn encode_scalar(value: f32, octaves: usize) -> Vec<f32> {
     let mut all = Vec::with_capacity(1 + 2 * octaves);
     all.push(value);
     let (mut sine, mut cosine) = f64::from(value).sin_cos();
@@ -380,28 +398,35 @@ fn sines(value: f32, octaves: usize) -> Vec<f32> {
     all
 }
 
+/// Adds `terms` to `sums`.
 #[inline(always)]
-fn add(of: &[CacheLine], to: &mut [CacheLine]) {
-    for (to, of) in to.iter_mut().zip(of) {
-        to.0.iter_mut().zip(&of.0).for_each(|(to, of)| *to += of);
+fn add(terms: &[CacheLine], sums: &mut [CacheLine]) {
+    for (sums, terms) in sums.iter_mut().zip(terms) {
+        sums.0.iter_mut().zip(&terms.0).for_each(|(sum, term)| *sum += term);
     }
 }
 
+/// Sets the gradient to 0 where the activation is not positive, the derivative of ReLU.
 #[inline(always)]
-fn keep_positive(by: &mut CacheLine, kept: &CacheLine) {
-    by.0.iter_mut().zip(&kept.0).for_each(|(by, &kept)| *by = if kept > 0.0 { *by } else { 0.0 });
+fn relu_gradient(gradient: &mut [CacheLine], activations: &[CacheLine]) {
+    for (gradient, activations) in gradient.iter_mut().zip(activations) {
+        for (gradient, &activation) in gradient.0.iter_mut().zip(&activations.0) {
+            *gradient = if activation > 0.0 { *gradient } else { 0.0 };
+        }
+    }
 }
 
-/// From derivatives by encoded values, which are `place`, to those along one axis.
+/// Returns the derivative along one axis, given the derivatives with respect to the encoded position.
 #[inline(always)]
-fn along(axis: usize, place: &[CacheLine], by: &[CacheLine]) -> CacheLine {
-    let mut sum = by[axis];
-    for k in 0..OCTAVES {
+fn axis_derivative(axis: usize, position_encoding: &[CacheLine], gradient: &[CacheLine]) -> CacheLine {
+    let mut sum = gradient[axis];
+    for k in 0..POSITION_OCTAVES {
         let (sine, cosine) = (3 * (2 * k + 1) + axis, 3 * (2 * k + 2) + axis);
-        let times = (1 << k) as f32;
+        let frequency = (1 << k) as f32;
         for lane in 0..LANES {
-            let turned = place[cosine].0[lane] * by[sine].0[lane] - place[sine].0[lane] * by[cosine].0[lane];
-            sum.0[lane] += times * turned;
+            let term = position_encoding[cosine].0[lane] * gradient[sine].0[lane]
+                - position_encoding[sine].0[lane] * gradient[cosine].0[lane];
+            sum.0[lane] += frequency * term;
         }
     }
     sum

@@ -1,4 +1,4 @@
-//! A slow, independent evaluation of the field in f64, one Gaussian at a time, straight from the definition.
+//! Slow, independent evaluation of a field in f64, one Gaussian at a time, directly from the definition.
 
 use crate::{FieldConfig, Tensors};
 use splat_core::{Column, Columns, Gaussians};
@@ -6,15 +6,15 @@ use splat_core::{Column, Columns, Gaussians};
 /// Raw or deformed parameters of one Gaussian.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Parameters {
-    /// Position, 3 values.
+    /// Position, 3 values, scene units.
     pub position: Vec<f64>,
     /// Quaternion, 4 values in the order w, x, y, z.
     pub rotation: Vec<f64>,
-    /// Natural logarithms of the standard deviations, 3 values.
+    /// Natural logarithm of the scales, 3 values.
     pub log_scale: Vec<f64>,
     /// Logit of the opacity, 1 value.
     pub opacity_logit: Vec<f64>,
-    /// Spherical harmonics, 3·(degree + 1)² values.
+    /// SH coefficients, 3·(degree + 1)² values.
     pub sh: Vec<f64>,
 }
 
@@ -37,33 +37,36 @@ impl Parameters {
     }
 }
 
-/// A field as its definition is written, from its state dict.
+/// Reference evaluation of the deformation field that a state dict defines.
 #[derive(Debug)]
 pub struct Oracle<'a> {
     /// State dict of the field.
     pub tensors: &'a Tensors,
-    /// Options that the field was trained with.
+    /// Hyper-parameters that the field was trained with.
     pub config: &'a FieldConfig,
 }
 
 impl Oracle<'_> {
+    /// Returns shape and values of the tensor `deformation_net.{name}`.
     fn tensor(&self, name: &str) -> (&[usize], Vec<f64>) {
         let tensor = &self.tensors[&format!("deformation_net.{name}")];
         (&tensor.shape, tensor.data.iter().map(|&x| f64::from(x)).collect())
     }
 
+    /// Returns W·x + b of the layer `name`.
     fn linear(&self, name: &str, x: &[f64]) -> Vec<f64> {
         let (shape, weight) = self.tensor(&format!("{name}.weight"));
         let (_, bias) = self.tensor(&format!("{name}.bias"));
         (0..shape[0]).map(|o| bias[o] + (0..shape[1]).map(|i| weight[o * shape[1] + i] * x[i]).sum::<f64>()).collect()
     }
 
-    /// ReLU, linear, ReLU, linear.
+    /// Returns the output of the head `name`: ReLU, linear layer, ReLU, linear layer.
     fn head(&self, name: &str, x: &[f64]) -> Vec<f64> {
         let hidden = self.linear(&format!("{name}.1"), &relu(x));
         self.linear(&format!("{name}.3"), &relu(&hidden))
     }
 
+    /// Returns the HexPlane features at position `p` and `time`.
     fn plane_features(&self, p: &[f64], time: f64) -> Vec<f64> {
         let (_, aabb) = self.tensor("grid.aabb");
         let mut u: Vec<f64> = (0..3).map(|a| (p[a] - aabb[a]) * 2.0 / (aabb[3 + a] - aabb[a]) - 1.0).collect();
@@ -97,6 +100,7 @@ impl Oracle<'_> {
         unreachable!("the loop ends at the first absent level")
     }
 
+    /// Returns the mask of `empty_voxel` at position `p`.
     fn voxel_mask(&self, p: &[f64]) -> f64 {
         let (shape, grid) = self.tensor("empty_voxel.grid");
         let (_, low) = self.tensor("empty_voxel.xyz_min");
@@ -115,7 +119,7 @@ impl Oracle<'_> {
         sum
     }
 
-    /// Returns the Gaussian `raw` as the field deforms it at `time`.
+    /// Returns the state of the Gaussian `raw` at `time`.
     pub fn state(&self, raw: &Parameters, time: f64) -> Parameters {
         let config = self.config;
         let mut features = if config.no_grid {
@@ -169,6 +173,7 @@ impl Oracle<'_> {
     }
 }
 
+/// Returns the positive part of every value.
 fn relu(x: &[f64]) -> Vec<f64> {
     x.iter().map(|x| x.max(0.0)).collect()
 }

@@ -1,12 +1,12 @@
 //! HexPlane features: six bilinear samples per level, multiplied elementwise.
 //!
-//! Data in: canonical positions `[N, 3]`, a time. Data out: features `[Σ channels, LANES]`.
-//! Memory: 4·Σ channels + 36·levels bytes per prepared Gaussian.
-//! Source: Cao & Johnson, "HexPlane", 2023; Wu et al., "4D Gaussian Splatting", 2024, section 4.2.
+//! Input: canonical positions `[3, N]`, a time. Output: features `[Σ channels, LANES]`. Memory: 4·Σ channels +
+//! 36·levels bytes per prepared Gaussian. Source: Cao & Johnson, "HexPlane", 2023; Wu et al., "4D Gaussian Splatting",
+//! 2024, section 4.2.
 //!
-//! The three spatial samples do not depend on time: their product is prepared once per block. All
-//! Gaussians share the time of a frame, so each time plane is first interpolated along time into a
-//! line; a Gaussian then interpolates between two of its points.
+//! The three spatial samples do not depend on time, so their product is prepared once per block. All Gaussians share
+//! the time of a frame, so each time plane is first interpolated along time into a line. A Gaussian then interpolates
+//! between two points of that line.
 
 use splat_core::Column;
 use splat_core::error::Result;
@@ -17,14 +17,14 @@ use super::tensors::Lookup;
 const X: usize = 0;
 const Y: usize = 1;
 const Z: usize = 2;
-/// What the names of all planes begin with in the state dict; level and place follow.
+/// Prefix of the names of all planes in the state dict. Level and plane number follow.
 const GRIDS: &str = "deformation_net.grid.grids.";
-/// Axis pairs of the planes without time, as (place in the state dict, a, b).
+/// Axis pairs of the planes without time, as (plane number in the state dict, a, b).
 pub(super) const SPATIAL: [(usize, usize, usize); 3] = [(0, X, Y), (1, X, Z), (3, Y, Z)];
-/// Places in the state dict of the planes (x,t), (y,t), (z,t).
+/// Plane numbers of (x,t), (y,t), (z,t) in the state dict.
 const TEMPORAL: [usize; 3] = [2, 4, 5];
 
-/// A plane over axes (a, b), `[size_b, size_a, channels]`: one sample is contiguous.
+/// Plane over the axes (a, b), stored as `[size_b, size_a, channels]` so that one sample is contiguous.
 #[derive(Debug, Clone)]
 pub(super) struct FeaturePlane {
     pub(super) size_a: usize,
@@ -32,6 +32,7 @@ pub(super) struct FeaturePlane {
     texels: Vec<f32>,
 }
 
+/// Six planes of one resolution level.
 #[derive(Debug, Clone)]
 pub(super) struct Level {
     pub(super) channels: usize,
@@ -39,20 +40,21 @@ pub(super) struct Level {
     pub(super) temporal: [FeaturePlane; 3],
 }
 
-/// The time planes of a level at one time, by axis: `[size_a, channels]` each.
+/// Time planes of a level interpolated at one time, by axis: `[size_a, channels]` each.
 pub(super) type TimeLines = [Vec<f32>; 3];
 
-/// The box that planes cover.
+/// Box that the planes cover.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Box3 {
-    /// Corner mapped to −1, by axis; the model stores the MAX corner here.
+    /// Corner mapped to −1. The model stores the MAX corner here.
     pub(super) origin: [f32; 3],
-    /// 2 / (other corner − origin).
+    /// Scale per axis: 2 / (other corner − origin).
     pub(super) factor: [f32; 3],
 }
 
 impl Box3 {
-    /// Between two corners, of the values of `deformation_net.grid.aabb`; none unless they differ along every axis.
+    /// Creates the box between two corners, given as the values of `deformation_net.grid.aabb`. Returns `None` unless
+    /// the corners differ along every axis.
     pub fn new(corners: &[f32]) -> Option<Box3> {
         let &[x0, y0, z0, x1, y1, z1] = corners else { return None };
         let origin = [x0, y0, z0];
@@ -60,41 +62,42 @@ impl Box3 {
         factor.iter().all(|f: &f32| f.is_finite()).then_some(Box3 { origin, factor })
     }
 
-    /// Where `p` lies, −1 to 1 inside the box.
+    /// Maps `p` to normalized coordinates, −1 to 1 inside the box.
     #[inline(always)]
     pub fn normalized(&self, p: [f32; 3]) -> [f32; 3] {
         std::array::from_fn(|axis| (p[axis] - self.origin[axis]) * self.factor[axis] - 1.0)
     }
 }
 
-/// The planes of all levels and the box they cover.
+/// Planes of all levels and the box they cover.
 #[derive(Debug, Clone)]
 pub(super) struct Planes {
     pub(super) space: Box3,
     pub(super) levels: Vec<Level>,
 }
 
-/// Where a coordinate falls between texels `low` and `high`; `fraction` is the weight of `high`.
+/// Interpolation between the texels `low` and `high` that a coordinate falls between.
 #[derive(Debug, Clone, Copy)]
 pub struct Tap {
-    /// The texel at or below.
+    /// Texel at or below the coordinate.
     pub low: u32,
-    /// The one above it, or itself if it is the last.
+    /// Next texel, or `low` if that is the last one.
     pub high: u32,
     /// Weight of `high`.
     pub fraction: f32,
 }
 
-/// What of the features of a block does not depend on time.
+/// Time-independent part of the features of a block.
 #[derive(Debug, Clone)]
 pub(super) struct PreparedPlanes {
     /// Product of the spatial samples, `[rows, width]`.
     product: Vec<f32>,
-    /// Where x, y, z fall on the time lines of each level, `[rows, levels, 3]`.
+    /// Interpolation of x, y, z on the time lines of each level, `[rows, levels, 3]`.
     taps: Vec<Tap>,
 }
 
 impl FeaturePlane {
+    /// Reads a plane. Returns it with its number of channels.
     fn load(lookup: Lookup<'_>, name: &str, channels: Option<usize>) -> Result<(Self, usize)> {
         let tensor = lookup.get_shaped(name, &[Some(1), channels, None, None], "1, channels, size_b, size_a")?;
         let [channels, size_b, size_a] = [tensor.shape[1], tensor.shape[2], tensor.shape[3]];
@@ -108,12 +111,13 @@ impl FeaturePlane {
         Ok((FeaturePlane { size_a, size_b, texels }, channels))
     }
 
+    /// Returns the channels of one texel.
     pub(super) fn texel(&self, a: u32, b: u32, channels: usize) -> &[f32] {
         let start = (b as usize * self.size_a + a as usize) * channels;
         &self.texels[start..start + channels]
     }
 
-    /// Bilinear sample at taps `a`, `b`; one value per channel into `out`.
+    /// Computes the bilinear sample at taps `a`, `b` into `out`, one value per channel.
     fn sample(&self, a: Tap, b: Tap, out: &mut [f32]) {
         let channels = out.len();
         let corner = |ia, ib| self.texel(ia, ib, channels);
@@ -131,8 +135,8 @@ impl FeaturePlane {
     }
 }
 
-/// The tap of normalized coordinate `u` on `size` texels: align_corners, border padding.
-/// A NaN coordinate gives a NaN fraction, hence NaN features.
+/// Returns the interpolation of normalized coordinate `u` on `size` texels, with `align_corners` and border padding. A
+/// NaN coordinate gives a NaN fraction, hence NaN features.
 pub fn tap(u: f32, size: usize) -> Tap {
     let last = (size - 1) as f32;
     let x = ((u + 1.0) / 2.0 * last).clamp(0.0, last);
@@ -140,8 +144,10 @@ pub fn tap(u: f32, size: usize) -> Tap {
     Tap { low: low as u32, high: (low as u32 + 1).min(size as u32 - 1), fraction: x - low }
 }
 
-/// How many of the first rows, along its third extent, of a tensor of that name and `shape` no time from 0 on reads;
-/// 0 of what is no plane of time. Time is not mapped to [−1, 1], so about half of each such plane is never read.
+/// Returns the number of leading rows of a time plane that no time ≥ 0 reads.
+///
+/// Rows are counted along the third extent of the tensor `name` of shape `shape`. Returns 0 for tensors that are not
+/// time planes. Time is not mapped to [−1, 1], so about half of each time plane is never read.
 pub fn rows_before_zero(name: &str, shape: &[usize]) -> usize {
     let place = name.strip_prefix(GRIDS).and_then(|rest| rest.split_once('.')?.1.parse().ok());
     match (place, shape) {
@@ -150,7 +156,7 @@ pub fn rows_before_zero(name: &str, shape: &[usize]) -> usize {
     }
 }
 
-/// The two texels of a line that a tap lies between, and its fraction.
+/// Returns the two texels of a line that a tap lies between, and the weight of the second one.
 #[inline(always)]
 pub(super) fn texels(line: &[f32], tap: Tap, channels: usize) -> ([&[f32]; 2], f32) {
     let texel = |at: u32| &line[at as usize * channels..][..channels];
@@ -180,22 +186,23 @@ impl Planes {
         Ok(Planes { space, levels })
     }
 
-    /// Features per Gaussian: the channels of all levels.
+    /// Returns the number of features per Gaussian: the channels of all levels.
     pub(super) fn width(&self) -> usize {
         self.levels.iter().map(|level| level.channels).sum()
     }
 
-    /// Bytes one Gaussian takes in [`PreparedPlanes`].
+    /// Returns the bytes per Gaussian in [`PreparedPlanes`].
     pub(super) fn bytes_per_gaussian(&self) -> usize {
         4 * self.width() + 3 * self.levels.len() * size_of::<Tap>()
     }
 
-    /// The box, as (corner mapped to −1, corner mapped to +1).
+    /// Returns the corners of the box: (corner mapped to −1, corner mapped to +1).
     pub(super) fn corners(&self) -> ([f32; 3], [f32; 3]) {
         let Box3 { origin, factor } = self.space;
         (origin, std::array::from_fn(|axis| origin[axis] + 2.0 / factor[axis]))
     }
 
+    /// Computes the time-independent part for Gaussians at canonical `position` `[3, N]`.
     pub(super) fn prepare(&self, position: &Column) -> PreparedPlanes {
         let rows = position.len();
         let width = self.width();
@@ -219,7 +226,7 @@ impl Planes {
         prepared
     }
 
-    /// The time planes of every level interpolated at `time`.
+    /// Interpolates the time planes of every level at `time`.
     pub(super) fn lines(&self, time: f32) -> Vec<TimeLines> {
         let line = |level: &Level, plane: &FeaturePlane| {
             let Tap { low, high, fraction } = tap(time, plane.size_b);
@@ -230,8 +237,8 @@ impl Planes {
         self.levels.iter().map(|level| std::array::from_fn(|axis| line(level, &level.temporal[axis]))).collect()
     }
 
-    /// The features of `lanes` Gaussians of the prepared block from `start` on into `out` `[width, LANES]`; lanes
-    /// beyond them are 0.
+    /// Writes the features of `lanes` Gaussians of the prepared block, from `start` on, into `out` `[width, LANES]`.
+    /// Other lanes are 0.
     #[inline(always)]
     pub(super) fn features(
         &self,
@@ -255,7 +262,7 @@ impl Planes {
                 let ([x0, x1], x) = texels(x, taps[0], n);
                 let ([y0, y1], y) = texels(y, taps[1], n);
                 let ([z0, z1], z) = texels(z, taps[2], n);
-                // All three in one pass: each on its own would read and write the row again.
+                // Multiplies all three samples in one pass: separate passes would read and write the row three times.
                 for c in 0..n {
                     let along_x = x0[c] * (1.0 - x) + x1[c] * x;
                     let along_y = y0[c] * (1.0 - y) + y1[c] * y;

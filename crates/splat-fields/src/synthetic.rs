@@ -1,4 +1,4 @@
-//! Fields of random weights, the same on every run, to test with.
+//! Fields with random weights for tests, the same on every run.
 
 pub mod deep;
 
@@ -17,11 +17,12 @@ impl Noise {
     }
 }
 
-/// No multiple of the outputs that are summed together.
+/// Width of the hidden layers. Not a multiple of the number of outputs that are summed together.
 const WIDTH: usize = 22;
+/// Number of feature channels per plane.
 const CHANNELS: usize = 5;
 
-/// Every column deforms, and nothing else is on.
+/// Returns a configuration in which every attribute deforms and all options are off.
 pub fn plain() -> FieldConfig {
     FieldConfig {
         active: Columns::all(),
@@ -33,8 +34,8 @@ pub fn plain() -> FieldConfig {
     }
 }
 
-/// A random state dict for `config` with `depth` trunk layers and harmonics of degree 3. Resolutions differ along every
-/// axis, so that swapped axes cannot pass.
+/// Returns a random state dict for `config` with `depth` trunk layers and SH degree 3. Resolutions differ along every
+/// axis, so that a test fails if axes are swapped.
 pub fn tensors(config: &FieldConfig, depth: usize) -> Tensors {
     let mut noise = Noise(7);
     let mut tensors = Tensors::new();

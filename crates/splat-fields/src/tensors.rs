@@ -1,23 +1,23 @@
-//! Named tensors of a state dict, taken out one by one against an expected shape.
+//! Named tensors of a state dict, looked up one by one with an expected shape.
 
 use std::collections::BTreeMap;
 use std::path::Path;
 
 use splat_core::error::{Error, Result};
 
-/// A dense tensor, row-major (last index fastest).
+/// Dense tensor, row-major (last index fastest).
 #[derive(Debug, Clone, PartialEq)]
 pub struct Tensor {
-    /// Extents, outermost first; empty for a scalar.
+    /// Extents, outermost first. Empty for a scalar.
     pub shape: Vec<usize>,
-    /// Product-of-`shape` values.
+    /// Values; their number is the product of `shape`.
     pub data: Vec<f32>,
 }
 
-/// A state dict: tensors by dotted name.
+/// State dict: tensors by dotted name.
 pub type Tensors = BTreeMap<String, Tensor>;
 
-/// Looks tensors up in the state dict of `path`; every failure names the tensor.
+/// Access to the state dict of the file `path`. Every error names the tensor.
 #[derive(Clone, Copy)]
 pub(super) struct Lookup<'a> {
     pub(super) tensors: &'a Tensors,
@@ -25,7 +25,7 @@ pub(super) struct Lookup<'a> {
 }
 
 impl<'a> Lookup<'a> {
-    /// The tensor `name`, all of whose values must be finite. `why` says what asks for it.
+    /// Returns the tensor `name`, whose values must be finite. `why` is shown in errors: the use of the tensor.
     pub(super) fn get(&self, name: &str, why: &str) -> Result<&'a Tensor> {
         let tensor = self.tensors.get(name).ok_or_else(|| {
             Error::input(self.path, format!("tensor {name}"), format!("a tensor of this name ({why})"), "none")
@@ -37,7 +37,7 @@ impl<'a> Lookup<'a> {
         Ok(tensor)
     }
 
-    /// The tensor `name`, which must be finite and of `shape`; `None` in `shape` accepts any extent.
+    /// Returns the tensor `name`, which must be finite and of shape `shape`. `None` in `shape` accepts any extent.
     pub(super) fn get_shaped(&self, name: &str, shape: &[Option<usize>], why: &str) -> Result<&'a Tensor> {
         let tensor = self.get(name, why)?;
         let fits = tensor.shape.len() == shape.len()
@@ -49,16 +49,18 @@ impl<'a> Lookup<'a> {
         Err(self.mismatch(name, format!("shape [{}] ({why})", want.join(", ")), format!("{:?}", tensor.shape)))
     }
 
-    /// Outputs and inputs of the matrix `name`. `why` says what asks for it.
+    /// Returns the number of outputs and inputs of the matrix `name`. `why` is shown in errors: the use of the matrix.
     pub(super) fn matrix(&self, name: &str, why: &str) -> Result<[usize; 2]> {
         let shape = &self.get_shaped(name, &[None, None], why)?.shape;
         Ok([shape[0], shape[1]])
     }
 
+    /// Returns whether the state dict has a tensor `name`.
     pub(super) fn has(&self, name: &str) -> bool {
         self.tensors.contains_key(name)
     }
 
+    /// Returns the error of a tensor with unexpected content.
     pub(super) fn mismatch(&self, name: &str, expected: impl Into<String>, found: impl Into<String>) -> Error {
         Error::input(self.path, format!("tensor {name}"), expected, found)
     }

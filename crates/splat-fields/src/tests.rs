@@ -5,16 +5,17 @@ use crate::oracle::{Oracle, Parameters};
 use crate::synthetic::{Noise, plain, tensors};
 use splat_core::{Column, Columns, Gaussians, Gradients};
 
-/// Random raw Gaussians; some lie outside the field's box.
-fn cloud(len: usize) -> Gaussians {
+/// Returns random raw Gaussians, some of them outside the box of the field.
+fn random_gaussians(len: usize) -> Gaussians {
     let mut noise = Noise(99);
-    let mut cloud = Gaussians::zeros(len, 3);
+    let mut gaussians = Gaussians::zeros(len, 3);
     for column in Columns::all().iter() {
-        cloud.column_mut(column).planes_mut().iter_mut().for_each(|x| *x = 2.0 * noise.next());
+        gaussians.column_mut(column).planes_mut().iter_mut().for_each(|x| *x = 2.0 * noise.next());
     }
-    cloud
+    gaussians
 }
 
+/// Returns state and deltas of `raw` at `time` in the attributes `want`.
 fn states(field: &Field, raw: &Gaussians, time: f64, want: Columns) -> (Gaussians, Deltas) {
     let mut deltas = Deltas::new(3);
     field.deltas(&field.prepare(&raw.position), time, want, &mut Scratch::default(), &mut deltas).unwrap();
@@ -23,19 +24,22 @@ fn states(field: &Field, raw: &Gaussians, time: f64, want: Columns) -> (Gaussian
     (state, deltas)
 }
 
+/// Builds a field with random weights.
 fn build(config: &FieldConfig, depth: usize) -> Field {
     Field::new(&tensors(config, depth), config.clone(), 3, Path::new("synthetic.pth")).unwrap()
 }
 
+/// Returns all components of Gaussian `i`.
 fn values(column: &Column, i: usize) -> Vec<f64> {
     (0..column.width()).map(|c| f64::from(column.plane(c)[i])).collect()
 }
 
-fn agrees_with_oracle(what: &str, config: FieldConfig, depth: usize) {
+/// Asserts that states of random Gaussians match the f64 oracle. `what` names the case in failures.
+fn assert_matches_oracle(what: &str, config: FieldConfig, depth: usize) {
     let tensors = tensors(&config, depth);
     let oracle = Oracle { tensors: &tensors, config: &config };
     let field = build(&config, depth);
-    let raw = cloud(40);
+    let raw = random_gaussians(40);
     for time in [0.0, 0.37, 1.0] {
         let (state, _) = states(&field, &raw, time, Columns::all());
         for i in 0..raw.len() {
@@ -48,7 +52,7 @@ fn agrees_with_oracle(what: &str, config: FieldConfig, depth: usize) {
                 (&state.sh, &expected.sh),
             ] {
                 for (got, expected) in values(column, i).into_iter().zip(expected) {
-                    // 60 f32 roundings of numbers of this size; a wrong axis or order is off by 0.1.
+                    // About 60 f32 roundings of numbers of this size. A wrong axis or order causes an error of 0.1.
                     let tolerance = 2e-5 * (1.0 + expected.abs());
                     assert!(
                         (got - expected).abs() <= tolerance,
@@ -61,43 +65,47 @@ fn agrees_with_oracle(what: &str, config: FieldConfig, depth: usize) {
 }
 
 #[test]
-fn every_flag_agrees_with_the_f64_oracle() {
-    agrees_with_oracle("plain", plain(), 1);
-    agrees_with_oracle("static_mlp", FieldConfig { static_mlp: true, ..plain() }, 1);
-    agrees_with_oracle("empty_voxel", FieldConfig { empty_voxel: true, ..plain() }, 1);
-    agrees_with_oracle(
+fn every_flag_matches_the_f64_oracle() {
+    assert_matches_oracle("plain", plain(), 1);
+    assert_matches_oracle("static_mlp", FieldConfig { static_mlp: true, ..plain() }, 1);
+    assert_matches_oracle("empty_voxel", FieldConfig { empty_voxel: true, ..plain() }, 1);
+    assert_matches_oracle(
         "static_mlp over empty_voxel",
         FieldConfig { static_mlp: true, empty_voxel: true, ..plain() },
         1,
     );
-    agrees_with_oracle("grid_pe", FieldConfig { grid_pe: 3, ..plain() }, 1);
-    agrees_with_oracle("grid_pe of 1 is none", FieldConfig { grid_pe: 1, ..plain() }, 1);
-    agrees_with_oracle("no_grid", FieldConfig { no_grid: true, ..plain() }, 1);
-    agrees_with_oracle("apply_rotation", FieldConfig { apply_rotation: true, static_mlp: true, ..plain() }, 1);
-    agrees_with_oracle("everything", FieldConfig { apply_rotation: true, static_mlp: true, grid_pe: 2, ..plain() }, 3);
+    assert_matches_oracle("grid_pe", FieldConfig { grid_pe: 3, ..plain() }, 1);
+    assert_matches_oracle("grid_pe of 1 has no effect", FieldConfig { grid_pe: 1, ..plain() }, 1);
+    assert_matches_oracle("no_grid", FieldConfig { no_grid: true, ..plain() }, 1);
+    assert_matches_oracle("apply_rotation", FieldConfig { apply_rotation: true, static_mlp: true, ..plain() }, 1);
+    assert_matches_oracle(
+        "everything",
+        FieldConfig { apply_rotation: true, static_mlp: true, grid_pe: 2, ..plain() },
+        3,
+    );
 }
 
 #[test]
-fn every_trunk_depth_agrees_with_the_f64_oracle() {
+fn every_trunk_depth_matches_the_f64_oracle() {
     for depth in [1, 2, 4] {
-        agrees_with_oracle(&format!("depth {depth}"), plain(), depth);
+        assert_matches_oracle(&format!("depth {depth}"), plain(), depth);
     }
 }
 
 #[test]
-fn every_head_can_be_off_and_its_column_is_then_raw_and_unmasked() {
+fn attributes_without_a_head_are_raw_and_unmasked() {
     for column in Columns::all().iter() {
         let config = FieldConfig { active: Columns::all().difference(column), static_mlp: true, ..plain() };
-        agrees_with_oracle(&format!("without {}", column.name()), config, 1);
+        assert_matches_oracle(&format!("without {}", column.name()), config, 1);
     }
-    agrees_with_oracle("no head at all", FieldConfig { active: Columns::empty(), ..plain() }, 1);
+    assert_matches_oracle("no head at all", FieldConfig { active: Columns::empty(), ..plain() }, 1);
 }
 
 #[test]
-fn a_gaussian_has_the_same_bits_in_every_block_and_for_every_choice_of_columns() {
+fn states_do_not_depend_on_block_or_requested_attributes() {
     let config = FieldConfig { static_mlp: true, ..plain() };
     let field = build(&config, 2);
-    let raw = cloud(1100);
+    let raw = random_gaussians(1100);
     let (all, _) = states(&field, &raw, 0.6, Columns::all());
     for (start, len) in [(0, 1), (3, 7), (255, 2), (250, 513), (1099, 1)] {
         let mut part = Gaussians::zeros(len, 3);
@@ -128,10 +136,10 @@ fn a_gaussian_has_the_same_bits_in_every_block_and_for_every_choice_of_columns()
 }
 
 #[test]
-fn raw_parameters_solved_from_a_state_lead_back_to_it() {
+fn solve_inverts_apply() {
     for apply_rotation in [false, true] {
         let field = build(&FieldConfig { static_mlp: true, apply_rotation, ..plain() }, 1);
-        let raw = cloud(50);
+        let raw = random_gaussians(50);
         let (state, deltas) = states(&field, &raw, 0.4, Columns::all());
         let mask = deltas.mask.as_ref().unwrap();
         let mut solved = Gaussians::zeros(0, 3);
@@ -156,9 +164,9 @@ fn raw_parameters_solved_from_a_state_lead_back_to_it() {
 }
 
 #[test]
-fn a_position_that_is_nan_gives_nan_and_touches_no_other_gaussian() {
+fn nan_position_affects_no_other_gaussian() {
     let field = build(&FieldConfig { empty_voxel: true, ..plain() }, 1);
-    let raw = cloud(20);
+    let raw = random_gaussians(20);
     let (clean, _) = states(&field, &raw, 0.5, Columns::all());
     let mut broken = raw.clone();
     for (i, value) in [(4, f32::NAN), (5, f32::INFINITY), (6, f32::NEG_INFINITY), (7, f32::MAX)] {
@@ -174,7 +182,7 @@ fn a_position_that_is_nan_gives_nan_and_touches_no_other_gaussian() {
 #[test]
 fn a_zero_quaternion_product_stays_zero() {
     let field = build(&FieldConfig { apply_rotation: true, ..plain() }, 1);
-    let mut raw = cloud(3);
+    let mut raw = random_gaussians(3);
     raw.rotation.set_row(1, [0.0; 4]);
     assert_eq!(states(&field, &raw, 0.5, Columns::all()).0.rotation.row::<4>(1), [0.0; 4]);
 }
@@ -185,56 +193,61 @@ fn an_empty_block_is_empty() {
     assert!(states(&field, &Gaussians::zeros(0, 3), 0.5, Columns::all()).0.is_empty());
 }
 
-fn refusal(config: FieldConfig, change: impl FnOnce(&mut Tensors)) -> String {
+/// Returns the error message of a field built from changed tensors.
+fn field_error(config: FieldConfig, change: impl FnOnce(&mut Tensors)) -> String {
     let mut tensors = tensors(&config, 1);
     change(&mut tensors);
     Field::new(&tensors, config, 3, Path::new("synthetic.pth")).expect_err("must be refused").to_string()
 }
 
-fn assert_says(message: &str, parts: &[&str]) {
+/// Asserts that a message contains all `parts`.
+fn assert_contains(message: &str, parts: &[&str]) {
     for part in parts {
         assert!(message.contains(part), "expected {part:?} in: {message}");
     }
 }
 
 #[test]
-fn a_missing_tensor_is_named_with_the_flag_that_asks_for_it() {
+fn missing_tensor_is_named_with_its_flag() {
     let name = "deformation_net.opacity_deform.3.bias";
-    let message = refusal(plain(), |tensors| drop(tensors.remove(name)));
-    assert_says(&message, &["synthetic.pth", name, "no_do=False", "none"]);
-    let message = refusal(FieldConfig { empty_voxel: true, ..plain() }, |tensors| {
+    let message = field_error(plain(), |tensors| drop(tensors.remove(name)));
+    assert_contains(&message, &["synthetic.pth", name, "no_do=False", "none"]);
+    let message = field_error(FieldConfig { empty_voxel: true, ..plain() }, |tensors| {
         drop(tensors.remove("deformation_net.empty_voxel.grid"));
     });
-    assert_says(&message, &["empty_voxel.grid", "empty_voxel=True"]);
-    assert_says(&refusal(plain(), Tensors::clear), &["deformation_net.grid.aabb"]);
+    assert_contains(&message, &["empty_voxel.grid", "empty_voxel=True"]);
+    assert_contains(&field_error(plain(), Tensors::clear), &["deformation_net.grid.aabb"]);
 }
 
 #[test]
-fn a_tensor_of_the_wrong_shape_is_named_with_both_shapes() {
+fn wrong_tensor_shape_is_named_with_both_shapes() {
     let reshape = |name: &'static str, shape: Vec<usize>| {
-        refusal(plain(), move |tensors| {
+        field_error(plain(), move |tensors| {
             let data = vec![0.0; shape.iter().product()];
             tensors.insert(format!("deformation_net.{name}"), Tensor { shape, data });
         })
     };
-    assert_says(&reshape("pos_deform.3.weight", vec![4, 22]), &["pos_deform.3.weight", "[3, 22]", "[4, 22]"]);
-    assert_says(&reshape("feature_out.0.weight", vec![22, 11]), &["feature_out.0.weight", "[any, 10]", "[22, 11]"]);
-    assert_says(&reshape("feature_out.2.weight", vec![22, 25]), &["feature_out.2.weight", "[22, 22]", "[22, 25]"]);
-    assert_says(&reshape("grid.grids.1.3", vec![1, 6, 4, 4]), &["grid.grids.1.3", "[1, 5, any, any]", "[1, 6, 4, 4]"]);
-    assert_says(&reshape("grid.grids.0.0", vec![1, 5, 0, 4]), &["grid.grids.0.0", "[1, 5, 0, 4]"]);
-    assert_says(&reshape("grid.aabb", vec![2, 3]), &["grid.aabb", "corners that differ"]);
+    assert_contains(&reshape("pos_deform.3.weight", vec![4, 22]), &["pos_deform.3.weight", "[3, 22]", "[4, 22]"]);
+    assert_contains(&reshape("feature_out.0.weight", vec![22, 11]), &["feature_out.0.weight", "[any, 10]", "[22, 11]"]);
+    assert_contains(&reshape("feature_out.2.weight", vec![22, 25]), &["feature_out.2.weight", "[22, 22]", "[22, 25]"]);
+    assert_contains(
+        &reshape("grid.grids.1.3", vec![1, 6, 4, 4]),
+        &["grid.grids.1.3", "[1, 5, any, any]", "[1, 6, 4, 4]"],
+    );
+    assert_contains(&reshape("grid.grids.0.0", vec![1, 5, 0, 4]), &["grid.grids.0.0", "[1, 5, 0, 4]"]);
+    assert_contains(&reshape("grid.aabb", vec![2, 3]), &["grid.aabb", "corners that differ"]);
 }
 
 #[test]
-fn a_weight_that_is_not_finite_is_refused() {
-    let message = refusal(plain(), |tensors| {
+fn weights_that_are_not_finite_are_refused() {
+    let message = field_error(plain(), |tensors| {
         tensors.get_mut("deformation_net.feature_out.0.weight").unwrap().data[17] = f32::NAN;
     });
-    assert_says(&message, &["feature_out.0.weight", "finite", "NaN at element 17"]);
+    assert_contains(&message, &["feature_out.0.weight", "finite", "NaN at element 17"]);
 }
 
 #[test]
-fn tensors_the_evaluation_does_not_use_may_hold_anything() {
+fn unused_tensors_may_have_any_content() {
     let config = FieldConfig { active: Columns::POSITION, ..plain() };
     let mut tensors = tensors(&config, 1);
     tensors.insert("timenet.0.weight".into(), Tensor { shape: vec![1], data: vec![f32::NAN] });
@@ -243,16 +256,17 @@ fn tensors_the_evaluation_does_not_use_may_hold_anything() {
 }
 
 #[test]
-fn a_time_that_is_not_finite_is_refused() {
+fn times_that_are_not_finite_are_refused() {
     let field = build(&plain(), 1);
-    let prepared = field.prepare(&cloud(1).position);
+    let prepared = field.prepare(&random_gaussians(1).position);
     let error = field
         .deltas(&prepared, f64::NAN, Columns::all(), &mut Scratch::default(), &mut Deltas::new(3))
         .expect_err("must be refused");
-    assert_says(&error.to_string(), &["NaN"]);
+    assert_contains(&error.to_string(), &["NaN"]);
 }
 
-fn column_of(parameters: &mut Parameters, column: Columns) -> &mut Vec<f64> {
+/// Returns the values of an attribute for writing.
+fn column_mut(parameters: &mut Parameters, column: Columns) -> &mut Vec<f64> {
     match column {
         Columns::POSITION => &mut parameters.position,
         Columns::ROTATION => &mut parameters.rotation,
@@ -262,28 +276,29 @@ fn column_of(parameters: &mut Parameters, column: Columns) -> &mut Vec<f64> {
     }
 }
 
-/// Derivatives by the state that are noise in the columns `of`.
-fn noisy_gradients(len: usize, of: Columns) -> Gradients {
+/// Returns derivatives with respect to the state that are random in `columns` and 0 in other attributes.
+fn noisy_gradients(len: usize, columns: Columns) -> Gradients {
     let mut noise = Noise(5);
     let mut gradients = Gradients::new(len, Columns::all(), 3);
-    for column in of.iter() {
+    for column in columns.iter() {
         gradients.column_mut(column).planes_mut().iter_mut().for_each(|x| *x = noise.next());
     }
     gradients
 }
 
-/// Derivatives by raw parameters, given those by the state.
+/// Returns derivatives with respect to raw parameters, given those with respect to the state.
 fn pulled_back(field: &Field, raw: &Gaussians, time: f64, gradients: &Gradients) -> Gradients {
     let mut pulled = gradients.clone();
     field.jacobian(raw, time, gradients.columns()).unwrap().pull_back(&mut pulled);
     pulled
 }
 
-/// Holds the derivatives of one column's states by that column of raw parameters to differences of the oracle.
-fn derivatives_agree(what: &str, config: FieldConfig, depth: usize, columns: Columns) {
+/// Asserts that the derivatives of each attribute's state with respect to its own raw values match finite differences
+/// of the oracle.
+fn assert_derivatives_match_oracle(what: &str, config: FieldConfig, depth: usize, columns: Columns) {
     let tensors = tensors(&config, depth);
     let oracle = Oracle { tensors: &tensors, config: &config };
-    let (field, raw) = (build(&config, depth), cloud(40));
+    let (field, raw) = (build(&config, depth), random_gaussians(40));
     let mut clipped = 0;
     for (column, time) in columns.iter().flat_map(|column| [(column, 0.0), (column, 0.37)]) {
         let by_state = noisy_gradients(raw.len(), column);
@@ -293,15 +308,15 @@ fn derivatives_agree(what: &str, config: FieldConfig, depth: usize, columns: Col
             for c in 0..raw.column(column).width() {
                 let value = |step: f64| -> f64 {
                     let mut nudged = Parameters::from_row(&raw, i);
-                    column_of(&mut nudged, column)[c] += step;
+                    column_mut(&mut nudged, column)[c] += step;
                     let mut state = oracle.state(&nudged, time);
-                    column_of(&mut state, column).iter().zip(&weights).map(|(x, w)| x * w).sum()
+                    column_mut(&mut state, column).iter().zip(&weights).map(|(x, w)| x * w).sum()
                 };
                 let step = 1e-7;
                 let expected = (value(step) - value(-step)) / (2.0 * step);
                 let got = f64::from(by_raw.column(column).plane(c)[i]);
-                // f32 over a hundred sums; a wrong axis, mask or order is off by 0.1. A kink within the step would
-                // show, and none lies there.
+                // f32 rounding over about a hundred sums. A wrong axis, mask or order causes an error of 0.1. A kink of
+                // a ReLU or plane within the step would also fail; the fixed random data has none.
                 let tolerance = 1e-4 * (1.0 + expected.abs());
                 assert!(
                     (got - expected).abs() <= tolerance,
@@ -317,25 +332,30 @@ fn derivatives_agree(what: &str, config: FieldConfig, depth: usize, columns: Col
 }
 
 #[test]
-fn derivatives_agree_with_differences_of_the_oracle_for_every_flag() {
+fn derivatives_match_finite_differences_for_every_flag() {
     let all = Columns::all();
-    derivatives_agree("plain", plain(), 1, all);
-    derivatives_agree("depth 3", plain(), 3, Columns::POSITION);
-    derivatives_agree("grid_pe", FieldConfig { grid_pe: 3, ..plain() }, 2, Columns::POSITION);
-    derivatives_agree("no_grid", FieldConfig { no_grid: true, ..plain() }, 2, Columns::POSITION);
-    derivatives_agree("apply_rotation", FieldConfig { apply_rotation: true, ..plain() }, 1, all);
+    assert_derivatives_match_oracle("plain", plain(), 1, all);
+    assert_derivatives_match_oracle("depth 3", plain(), 3, Columns::POSITION);
+    assert_derivatives_match_oracle("grid_pe", FieldConfig { grid_pe: 3, ..plain() }, 2, Columns::POSITION);
+    assert_derivatives_match_oracle("no_grid", FieldConfig { no_grid: true, ..plain() }, 2, Columns::POSITION);
+    assert_derivatives_match_oracle("apply_rotation", FieldConfig { apply_rotation: true, ..plain() }, 1, all);
     let fixed = FieldConfig { active: all.difference(Columns::POSITION | Columns::SH), ..plain() };
-    derivatives_agree("without two heads", fixed, 1, all);
-    // Under a mask positions do not follow the field.
+    assert_derivatives_match_oracle("without two heads", fixed, 1, all);
+    // Under a mask the Jacobian of positions neglects the field.
     let masked = all.difference(Columns::POSITION);
-    derivatives_agree("static_mlp", FieldConfig { static_mlp: true, apply_rotation: true, ..plain() }, 1, masked);
-    derivatives_agree("empty_voxel", FieldConfig { empty_voxel: true, ..plain() }, 1, masked);
+    assert_derivatives_match_oracle(
+        "static_mlp",
+        FieldConfig { static_mlp: true, apply_rotation: true, ..plain() },
+        1,
+        masked,
+    );
+    assert_derivatives_match_oracle("empty_voxel", FieldConfig { empty_voxel: true, ..plain() }, 1, masked);
 }
 
 #[test]
-fn masked_positions_take_what_their_state_takes_times_the_mask() {
+fn derivative_of_masked_positions_is_the_mask() {
     let field = build(&FieldConfig { empty_voxel: true, ..plain() }, 1);
-    let raw = cloud(40);
+    let raw = random_gaussians(40);
     let (_, deltas) = states(&field, &raw, 0.3, Columns::all());
     let by_state = noisy_gradients(raw.len(), Columns::POSITION);
     let by_raw = pulled_back(&field, &raw, 0.3, &by_state);
@@ -346,9 +366,9 @@ fn masked_positions_take_what_their_state_takes_times_the_mask() {
 }
 
 #[test]
-fn derivatives_have_the_same_bits_in_every_block_and_none_are_made_for_other_columns() {
+fn derivatives_do_not_depend_on_blocks() {
     let field = build(&FieldConfig { apply_rotation: true, ..plain() }, 2);
-    let raw = cloud(300);
+    let raw = random_gaussians(300);
     let whole = field.jacobian(&raw, 0.6, Columns::all()).unwrap();
     for block in [1, 16, 37] {
         let rows: Vec<u32> = (0..300).collect();
@@ -364,7 +384,7 @@ fn derivatives_have_the_same_bits_in_every_block_and_none_are_made_for_other_col
 fn derivatives_at_odd_positions_are_finite() {
     for config in [plain(), FieldConfig { apply_rotation: true, static_mlp: true, ..plain() }] {
         let field = build(&config, 1);
-        let mut raw = cloud(8);
+        let mut raw = random_gaussians(8);
         for (i, value) in [f32::NAN, f32::INFINITY, f32::MAX, 0.0].into_iter().enumerate() {
             raw.position.set_row(i, [value; 3]);
             raw.rotation.set_row(i, [0.0; 4]);

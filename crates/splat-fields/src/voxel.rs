@@ -1,22 +1,24 @@
-//! The `empty_voxel` mask: a scalar grid over the scene's box, sampled at canonical positions.
+//! Mask of `empty_voxel`: a scalar grid over the box of the scene, sampled at canonical positions.
 
 use splat_core::Column;
 use splat_core::error::{Error, Result};
 
 use super::tensors::Lookup;
 
-/// A grid `[1, 1, X, Y, Z]` between two corners.
+/// Grid of mask values `[1, 1, X, Y, Z]` between two corners.
 #[derive(Debug, Clone)]
 pub(super) struct VoxelMask {
+    /// Position of the first grid point, scene units.
     low: [f32; 3],
+    /// Position of the last grid point, scene units.
     high: [f32; 3],
     size: [usize; 3],
     values: Vec<f32>,
 }
 
 impl VoxelMask {
-    /// Reads `deformation_net.empty_voxel.*`. The corners are buffers that only some versions save;
-    /// without them `corners`, (max, min) of the planes' box, serve: training sets both to the same box.
+    /// Reads `deformation_net.empty_voxel.*`. Only some versions save the corners of the grid. Without them `corners`,
+    /// the (max, min) corners of the planes' box, are used, because training sets both to the same box.
     pub(super) fn load(lookup: Lookup<'_>, corners: Option<([f32; 3], [f32; 3])>) -> Result<Self> {
         let name = |part: &str| format!("deformation_net.empty_voxel.{part}");
         let grid = lookup.get_shaped(&name("grid"), &[Some(1), Some(1), None, None, None], "empty_voxel=True")?;
@@ -35,11 +37,12 @@ impl VoxelMask {
         Ok(VoxelMask { low, high, size: [grid.shape[2], grid.shape[3], grid.shape[4]], values: grid.data.clone() })
     }
 
-    /// The mask of every Gaussian: trilinear, corners aligned, zero outside the box.
+    /// Returns the mask of every Gaussian: trilinear interpolation, corners aligned, zero outside the box.
     pub(super) fn sample(&self, position: &Column) -> Vec<f32> {
         (0..position.len()).map(|i| self.sample_one(position.row(i))).collect()
     }
 
+    /// Returns the mask at position `p`.
     fn sample_one(&self, p: [f32; 3]) -> f32 {
         let at: [f32; 3] = std::array::from_fn(|axis| {
             let u = (p[axis] - self.low[axis]) / (self.high[axis] - self.low[axis]) * 2.0 - 1.0;

@@ -1,32 +1,47 @@
-//! Everything that differs between Linux, macOS and Windows: files, folders, signals and memory limits.
+//! Code that differs between Linux, macOS and Windows: files, folders, signals and memory limits.
 //!
 //! Other crates of the workspace contain no code for one operating system. Each function below exists on all three
 //! systems with the same signature. **Only Linux is tested.** The code for macOS and Windows is type-checked.
 //!
 //! | | Linux | macOS | Windows |
 //! |---|---|---|---|
-//! | [`read_exact_at`] | one position for each call | as on Linux | moves the file's own position, too |
+//! | [`read_exact_at`] | leaves the file position alone | as on Linux | moves the file position |
 //! | [`FileStatus`], [`FileIdentity`] | device and inode | as on Linux | volume and file index |
 //! | [`FileKind`] | all kinds | all kinds | file, folder, link, other |
-//! | [`open_without_waiting`] | `O_NONBLOCK` | as on Linux | a plain open: nothing that is opened waits |
-//! | [`open_stream`] | device or FIFO | as on Linux | refused: nothing is known as a stream |
+//! | [`open_without_waiting`] | `O_NONBLOCK` | as on Linux | plain open, which never waits |
+//! | [`open_stream`] | device or FIFO | as on Linux | refused: no path is recognized as a stream |
 //! | [`FolderHandle`] | relative to an open descriptor | as on Linux | by path, after a check of the identity |
-//! | [`FolderStatus::is_own`], [`FolderStatus::is_private`] | owner and mode | as on Linux | never: no folder is taken over |
+//! | [`FolderStatus::is_own`], [`FolderStatus::is_private`] | owner and mode | as on Linux | always false |
 //! | [`create_private_folder`] | mode 0700 | as on Linux | permissions of the parent |
 //! | [`sync_file`], [`sync_folder`] | both | both | files only |
 //! | [`is_cached`] | `preadv2` | unknown | unknown |
-//! | [`expect_pages`], [`release_pages`] | `madvise` | `madvise` | nothing: the system decides |
+//! | [`expect_pages`], [`release_pages`] | `madvise` | `madvise` | no effect: the system decides |
 //! | [`end_on_signals`] | SIGINT, SIGTERM, SIGHUP | as on Linux | Ctrl+C, Ctrl+Break, closed console |
-//! | [`report_cut_short_maps`] | SIGBUS handler | nothing | nothing: a mapped file cannot be cut short |
+//! | [`report_cut_short_maps`] | SIGBUS handler | no effect | no effect: a mapped file cannot be truncated |
 //! | [`memory_limits`] | machine, control groups, process | machine, process | machine, job object |
 //! | [`peak_memory_bytes`] | `VmHWM` | `ru_maxrss` | peak working set |
 //! | [`reset_peak_memory`] | `clear_refs` | not possible | not possible |
 //!
 //! File locks are those of [`std::fs::File`]: `flock` on Linux and macOS, `LockFileEx` on Windows.
 //!
-//! The crate `sysinfo` was considered for memory limits. It reads the limit at the root of the control groups only. The
-//! limits of the process's own group and of the groups around it, `memory.high`, and groups that are mounted elsewhere
-//! would be missed, so this crate reads them itself ([`memory_limits`]).
+//! The crate `sysinfo` was considered for memory limits. It reads only the limit at the root of the control groups. It
+//! misses the limits of the process's own group and of its parent groups, `memory.high`, and groups that are mounted
+//! elsewhere. This crate therefore reads the limits itself ([`memory_limits`]).
+//!
+//! ```
+//! use std::fs::File;
+//! use splat_platform::{FileStatus, read_exact_at};
+//!
+//! let path = std::env::temp_dir().join(format!("splat-platform-example-{}", std::process::id()));
+//! std::fs::write(&path, b"0123456789")?;
+//! let file = File::open(&path)?;
+//! let mut bytes = [0; 4];
+//! read_exact_at(&file, &mut bytes, 3)?;
+//! assert_eq!(&bytes, b"3456");
+//! assert_eq!(FileStatus::from_file(&file)?, FileStatus::from_path(&path)?);
+//! std::fs::remove_file(&path)?;
+//! # Ok::<(), std::io::Error>(())
+//! ```
 
 #![cfg_attr(not(test), deny(clippy::print_stderr, clippy::print_stdout))]
 
@@ -61,9 +76,9 @@ pub use windows::{
     release_pages, report_cut_short_maps, reset_peak_memory, sync_file, sync_folder,
 };
 
-/// Identity of a file or folder: equal for two paths exactly if both lead to the same file or folder.
+/// Identity of a file or folder. Two paths have equal identities exactly if both lead to the same file or folder.
 ///
-/// Device and inode on Linux and macOS, serial number of the volume and index of the file on Windows.
+/// The identity consists of device and inode on Linux and macOS, and of volume serial number and file index on Windows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct FileIdentity {
     volume: u64,
@@ -72,10 +87,10 @@ pub struct FileIdentity {
 
 /// Identity and length of a file.
 ///
-/// The constructors are `from_file` for an open file and `from_path`, which follows links.
+/// Constructors: `from_file` for an open file, and `from_path`, which follows links.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct FileStatus {
-    /// Tells the file from another one that took its name.
+    /// Identity, which differs if another file takes the name of this one.
     pub identity: FileIdentity,
     /// Length in bytes.
     pub length: u64,
@@ -84,37 +99,38 @@ pub struct FileStatus {
 /// Identity, owner and permissions of a folder.
 #[derive(Debug, Clone, Copy)]
 pub struct FolderStatus {
-    /// Tells the folder from another one that took its name.
+    /// Identity, which differs if another folder takes the name of this one.
     pub identity: FileIdentity,
-    /// Whether the folder belongs to the user of this process. False where the system does not tell, as on Windows.
+    /// Whether the folder belongs to the user of this process. False if the system does not tell, as on Windows.
     pub is_own: bool,
-    /// Whether group and others may neither read nor write. False where the system does not tell, as on Windows.
+    /// Whether group and others may neither read nor write the folder. False if the system does not tell, as on
+    /// Windows.
     pub is_private: bool,
 }
 
-/// Kind of an entry of a folder. Windows knows only files, folders, links and others.
+/// Kind of a folder entry. Windows distinguishes only files, folders, links and others.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum FileKind {
-    /// A regular file.
+    /// Regular file.
     File,
-    /// A folder.
+    /// Folder.
     Folder,
-    /// A symbolic link.
+    /// Symbolic link.
     Link,
-    /// A named pipe.
+    /// Named pipe.
     Fifo,
-    /// A socket.
+    /// Socket.
     Socket,
-    /// A device that is read or written as a sequence of bytes, such as a terminal.
+    /// Device that is read or written as a sequence of bytes, such as a terminal.
     CharacterDevice,
-    /// A device that is read or written in blocks, such as a disk.
+    /// Device that is read or written in blocks, such as a disk.
     BlockDevice,
-    /// Any other kind.
+    /// Kind that no other variant covers.
     Other,
 }
 
 impl FileKind {
-    /// Kind that the standard library found.
+    /// Returns the kind of a file type of the standard library.
     pub fn from_type(found: FileType) -> FileKind {
         match found {
             found if found.is_file() => FileKind::File,
@@ -128,10 +144,10 @@ impl FileKind {
     }
 }
 
-/// Limit of the memory that this process may take.
+/// Limit of the memory that this process may use.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct MemoryLimit {
-    /// The limit in bytes, as the system states it: 0 and numbers from [`UNLIMITED_BYTES`] on stand for no limit.
+    /// Limit in bytes, as the system states it: 0 and numbers from [`UNLIMITED_BYTES`] on mean no limit.
     pub bytes: u64,
     /// Part of the system that sets the limit.
     pub source: LimitSource,
@@ -142,36 +158,42 @@ pub struct MemoryLimit {
 pub enum LimitSource {
     /// Physical memory of the machine.
     Machine,
-    /// A Linux control group; the file that holds the limit.
+    /// Linux control group, with the file that holds the limit.
     ControlGroup(PathBuf),
-    /// A Windows job object.
+    /// Windows job object.
     JobObject,
-    /// The process's own limit of its address space (`ulimit -v`).
+    /// Limit of the address space of the process (`ulimit -v`).
     AddressSpace,
-    /// The process's own limit of its data (`ulimit -d`).
+    /// Limit of the data size of the process (`ulimit -d`).
     DataSize,
 }
 
-/// All limits of memory that the system states.
+/// Memory limits that the system states.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct MemoryLimits {
-    /// Limits around the process: of the machine, then of control groups or job objects.
+    /// Limits outside the process: of the machine, then of control groups or job objects.
     pub around: Vec<MemoryLimit>,
     /// Limits of the process itself.
     pub own: Vec<MemoryLimit>,
 }
 
-/// No memory is as large. Control groups of version 1 without a limit state some such number.
+/// Smallest number of bytes that means "no limit". Version 1 control groups without a limit state a number of this
+/// size.
 pub const UNLIMITED_BYTES: u64 = 1 << 62;
 
-/// Text that a process writes to standard error before it ends because a mapped file was cut short: `before`, the path,
-/// `after`.
+/// Text that the process writes to standard error before it ends because a mapped file was truncated: `before`, the
+/// path, `after`.
 #[derive(Debug, Clone, Copy)]
 pub struct CutShortMessage {
     /// Text before the path.
     pub before: &'static str,
-    /// Text in place of a path that is not known.
+    /// Text in place of a path that is unknown.
     pub unknown_path: &'static str,
-    /// Text after the path, with its line break.
+    /// Text after the path, including its line break.
     pub after: &'static str,
 }
+
+/// Compiles the example of the README.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+mod readme {}

@@ -1,4 +1,4 @@
-//! Memory of macOS, and what macOS does not offer. Type-checked only.
+//! macOS: memory limits, and functions without a macOS equivalent. Type-checked only.
 
 use std::fs::File;
 use std::mem::{MaybeUninit, size_of};
@@ -7,15 +7,15 @@ use rustix::process::{Resource, getrlimit};
 
 use crate::{CutShortMessage, LimitSource, MemoryLimit, MemoryLimits};
 
-/// Whether reading the byte at `offset` would not wait for the disk: not known on macOS.
+/// Returns `None`: macOS does not tell whether reading the byte at `offset` needs disk access.
 pub fn is_cached(_file: &File, _offset: u64) -> Option<bool> {
     None
 }
 
-/// Without effect on macOS, which does not tell a process which file a page belongs to: SIGBUS ends the process.
+/// Does nothing. macOS does not tell a process which file a page belongs to, so SIGBUS ends the process.
 pub fn report_cut_short_maps(_message: CutShortMessage) {}
 
-/// Physical memory of the machine and the limits that `ulimit` sets for the process.
+/// Returns the physical memory of the machine and the limits that `ulimit` sets for the process.
 pub fn memory_limits() -> MemoryLimits {
     let machine = machine_bytes().map(|bytes| MemoryLimit { bytes, source: LimitSource::Machine });
     let own = [(Resource::As, LimitSource::AddressSpace), (Resource::Data, LimitSource::DataSize)];
@@ -26,25 +26,27 @@ pub fn memory_limits() -> MemoryLimits {
     MemoryLimits { around: machine.into_iter().collect(), own: own.collect() }
 }
 
+/// Returns the physical memory of the machine in bytes.
 fn machine_bytes() -> Option<u64> {
     let mut bytes = 0u64;
     let mut size = size_of::<u64>();
-    // SAFETY: the name ends with a zero byte; the pointer and the size are those of `bytes`, and nothing is set.
+    // SAFETY: the name ends with a zero byte; the pointer and the size are those of `bytes`; no new value is set.
     let code = unsafe {
         libc::sysctlbyname(c"hw.memsize".as_ptr(), (&raw mut bytes).cast(), &raw mut size, std::ptr::null_mut(), 0)
     };
     (code == 0 && size == size_of::<u64>()).then_some(bytes)
 }
 
-/// Largest resident memory of this process so far in bytes, mapped pages included.
+/// Returns the largest resident memory of this process so far in bytes, including mapped pages.
 pub fn peak_memory_bytes() -> Option<u64> {
     let mut usage = MaybeUninit::<libc::rusage>::uninit();
-    // SAFETY: the call writes to `usage`, which has the size and alignment it expects, and says whether it did.
+    // SAFETY: the call writes to `usage`, which has the expected size and alignment. `usage` is read only if the call
+    // reports success.
     let usage = unsafe { (libc::getrusage(libc::RUSAGE_SELF, usage.as_mut_ptr()) == 0).then(|| usage.assume_init()) }?;
     u64::try_from(usage.ru_maxrss).ok()
 }
 
-/// Makes [`peak_memory_bytes`] start again from the present memory: not possible on macOS, returns false.
+/// Returns false: macOS cannot reset [`peak_memory_bytes`].
 pub fn reset_peak_memory() -> bool {
     false
 }

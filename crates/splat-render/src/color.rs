@@ -1,7 +1,7 @@
-//! Color of Gaussians seen from a point: real spherical harmonics up to degree 3.
+//! View-dependent color of Gaussians: real spherical harmonics up to degree 3.
 //!
-//! Data in: SH planes of a block and the camera's center. Data out: rgb, unclamped above. The basis is
-//! the field's (signs of Kerbl et al. 2023; constants as in Sloan, "Stupid Spherical Harmonics Tricks", 2008).
+//! Input: SH planes of a block and the camera center. Output: rgb, not clamped above. The basis has the signs of Kerbl
+//! et al. 2023 and the constants of Sloan, "Stupid Spherical Harmonics Tricks", 2008.
 
 use std::ops::Range;
 
@@ -11,8 +11,8 @@ use splat_core::{Gaussians, HIGHEST_DEGREE, SH_C0, sh_coefficients};
 /// Red, green and blue of one block.
 pub(super) type Colors = [[f32; BLOCK]; 3];
 
-/// Writes the colors of the Gaussians `ids`, at most [`BLOCK`], seen from `center`: `0.5 + Σ Y_k c_k`
-/// clamped at 0 (NaN becomes 0). Coefficients beyond degree 3, or short of a whole degree, are not read.
+/// Computes the colors of the Gaussians `ids`, at most [`BLOCK`], seen from `center`: `0.5 + Σ Y_k c_k`, at least 0
+/// (NaN becomes 0). SH coefficients above degree 3, or of an incomplete degree, are not read.
 #[inline(always)]
 pub(super) fn evaluate(gaussians: &Gaussians, ids: Range<usize>, center: [f64; 3], out: &mut Colors) {
     let n = ids.len().min(BLOCK);
@@ -42,28 +42,30 @@ pub(super) fn evaluate(gaussians: &Gaussians, ids: Range<usize>, center: [f64; 3
     }
 }
 
-/// Coefficients per channel that are read.
+/// Returns the number of SH coefficients per channel that are read.
 pub(super) fn coefficients(gaussians: &Gaussians) -> usize {
     let fits = |&degree: &usize| 3 * sh_coefficients(degree) <= gaussians.sh.width();
     (0..=HIGHEST_DEGREE).rev().find(fits).map_or(0, sh_coefficients)
 }
 
-/// Unit vector from `center` to `position`, and one over their distance.
+/// Returns the unit vector from `center` to `position`, and one over their distance.
 #[inline(always)]
 pub(super) fn direction(position: [f32; 3], center: [f64; 3]) -> ([f32; 3], f64) {
-    // Differences in f64: far from the origin the direction would otherwise be rounded away.
+    // Differences in f64: with f32, rounding would destroy the direction far from the origin.
     let d =
         [f64::from(position[0]) - center[0], f64::from(position[1]) - center[1], f64::from(position[2]) - center[2]];
     let inverse = 1.0 / (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]).sqrt();
     ([(d[0] * inverse) as f32, (d[1] * inverse) as f32, (d[2] * inverse) as f32], inverse)
 }
 
-/// Constants of the polynomials, several of which share one.
+/// Constant of the polynomials of degree 1.
 const C1: f32 = 0.488_602_5;
+/// Constants of the polynomials of degree 2. Several polynomials share one.
 const C2: [f32; 3] = [1.092_548_5, 0.315_391_57, 0.546_274_2];
+/// Constants of the polynomials of degree 3. Several polynomials share one.
 const C3: [f32; 5] = [0.590_043_6, 2.890_611_4, 0.457_045_8, 0.373_176_34, 1.445_305_7];
 
-/// Y_k of a unit vector.
+/// Returns the SH basis functions Y_k of a unit vector.
 #[inline(always)]
 pub(super) fn basis([x, y, z]: [f32; 3]) -> [f32; sh_coefficients(3)] {
     let (xx, yy, zz) = (x * x, y * y, z * z);
@@ -87,7 +89,7 @@ pub(super) fn basis([x, y, z]: [f32; 3]) -> [f32; sh_coefficients(3)] {
     ]
 }
 
-/// Derivatives of the polynomials of [`basis`] by x, y and z.
+/// Returns the derivatives of the polynomials of [`basis`] with respect to x, y and z.
 #[inline(always)]
 pub(super) fn basis_gradient([x, y, z]: [f32; 3]) -> [[f32; 3]; sh_coefficients(3)] {
     let (xx, yy, zz) = (x * x, y * y, z * z);

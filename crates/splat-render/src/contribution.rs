@@ -1,54 +1,52 @@
-//! How much of the pictures each Gaussian is.
+//! Visible contribution of every Gaussian to renders.
 
 use serde::{Deserialize, Serialize};
 
-/// Visible contribution of N Gaussians over any number of pictures (method.md, section 1: C `visible`, and W).
+/// Visible contribution of N Gaussians over any number of views (src/method.md, section 1: C `visible`, and W).
 ///
-/// Both figures are the same whatever the order of pictures and the number of threads. Memory: 12 bytes
-/// per Gaussian.
+/// Both figures do not depend on the order of views or the number of threads. Memory: 12 bytes per Gaussian.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct Contribution {
-    /// `[N]`, Σ over pixels of alpha · transmittance, in units of 2⁻²⁸ pixel ([`Contribution::UNIT`]).
+    /// Contribution `[N]`: Σ over pixels of alpha · transmittance, in units of 2⁻²⁸ pixel ([`Contribution::UNIT`]).
     ///
-    /// A picture's part is summed per 16×16 tile in f32, in a fixed order, and rounded to a unit: relative
-    /// error below 3e-6 and absolute below 2e-9 per tile. A sum that would pass 2⁶⁴ (7e10 fully covered
-    /// pixels) stays there.
+    /// The part of a view is summed per 16×16 tile in f32, in a fixed order, and rounded to a unit: relative error
+    /// below 3e-6 and absolute error below 2e-9 per tile. A sum saturates at 2⁶⁴ units (7e10 fully covered pixels).
     pub sum: Vec<u64>,
-    /// `[N]`, largest alpha · transmittance of any pixel, in [0, 0.99].
+    /// Largest alpha · transmittance of any pixel `[N]`, in [0, 0.99].
     pub max: Vec<f32>,
 }
 
 impl Contribution {
-    /// Pixels per unit of [`Contribution::sum`]: 2⁻²⁸. The least weight a pixel can have, 1e-4 / 255, is
-    /// 105 units; 800,000 fully covered pictures of 320×256 fit.
+    /// Pixels per unit of [`Contribution::sum`]: 2⁻²⁸. The smallest weight of a pixel, 1e-4 / 255, is 105 units. The
+    /// sum can hold 800,000 fully covered images of 320×256.
     pub const UNIT: f64 = 1.0 / (1u64 << 28) as f64;
 
-    /// Nothing seen of `len` Gaussians.
+    /// Creates zero contributions of `len` Gaussians.
     pub fn new(len: usize) -> Self {
         Contribution { sum: vec![0; len], max: vec![0.0; len] }
     }
 
-    /// Number of Gaussians.
+    /// Returns the number of Gaussians.
     pub fn len(&self) -> usize {
         self.sum.len()
     }
 
-    /// Whether there are none.
+    /// Returns whether there are no Gaussians.
     pub fn is_empty(&self) -> bool {
         self.sum.is_empty()
     }
 
-    /// Σ alpha · transmittance of Gaussian `i`, pixels.
+    /// Returns Σ alpha · transmittance of Gaussian `i`, in pixels.
     pub fn pixels(&self, i: usize) -> f64 {
         self.sum[i] as f64 * Self::UNIT
     }
 
-    /// Adds what `other` saw of the same Gaussians, in other pictures.
+    /// Adds the contributions of the same Gaussians in other views.
     ///
     /// # Panics
     /// If the lengths differ.
     pub fn merge(&mut self, other: &Contribution) {
-        assert_eq!(self.len(), other.len(), "contributions of different models");
+        assert_eq!(self.len(), other.len(), "expected contributions of equally many Gaussians");
         for (sum, other) in self.sum.iter_mut().zip(&other.sum) {
             *sum = sum.saturating_add(*other);
         }
@@ -57,7 +55,7 @@ impl Contribution {
         }
     }
 
-    /// Adds one tile's weight of Gaussian `i`.
+    /// Adds the sum and the largest weight of Gaussian `i` in one tile.
     pub(super) fn add(&mut self, i: usize, sum: f32, max: f32) {
         let units = (f64::from(sum) * (1.0 / Self::UNIT) + 0.5) as u64;
         self.sum[i] = self.sum[i].saturating_add(units);
@@ -70,7 +68,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn sums_stay_at_the_top_instead_of_wrapping() {
+    fn sums_saturate() {
         let mut near = Contribution::new(1);
         near.sum[0] = u64::MAX - 5;
         near.add(0, 1.0, 0.5);

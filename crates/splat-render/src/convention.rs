@@ -1,12 +1,12 @@
-//! Numbers that decide a picture, those of the original rasteriser, and the width of its loops.
+//! Constants of the original rasterizer that decide pixel values, and the block size of the projection.
 
-/// Side of a tile in pixels; part of the result, for a Gaussian reaches whole tiles.
+/// Side of a tile in pixels. Part of the result, because a Gaussian affects whole tiles.
 pub(super) const TILE: u32 = 16;
-/// Alphas below this are skipped.
+/// Smallest alpha that is blended.
 pub(super) const MIN_ALPHA: f32 = 1.0 / 255.0;
-/// Alphas are cut to this.
+/// Largest alpha. Larger values are clamped to it.
 pub(super) const MAX_ALPHA: f32 = 0.99;
-/// A Gaussian that would leave less transmittance than this ends the pixel, unblended.
+/// Smallest transmittance of a pixel. A Gaussian that would leave less ends the pixel and is not blended.
 pub(super) const MIN_TRANSMITTANCE: f32 = 1e-4;
-/// Gaussians projected together: the arrays of one block stay in the first-level cache.
+/// Number of Gaussians projected together. The arrays of one block stay in the first-level cache.
 pub(super) const BLOCK: usize = 128;

@@ -1,20 +1,22 @@
-//! Features of Gaussians in the place of colors, blended as colors are.
+//! Blending of feature vectors of Gaussians in place of colors.
 //!
-//! In: a state, planes of features of any sign. Out: per pixel what is blended of each. A blend is linear, so three features
-//! at a time are pictures of colors: moved and scaled to 0 … 1, for colors are cut at 0, and back by the opacity that a picture
-//! of ones has.
+//! Input: a frame state, planes of features of any sign. Output: blended features per pixel. Blending is linear, so
+//! three features at a time are rendered as colors. Features are shifted and scaled to 0 … 1, because colors are
+//! clamped at 0. The shift is undone with the opacity, which is the render of constant 1.
 
 use super::render;
 use splat_core::{Camera, Column, Gaussians, harmonic};
 
-/// Σ w·f over the Gaussians of each pixel, w the weights with which colors are blended: `[height, width, planes]` of the
-/// planes of `features`. Accuracy: about 1e-6 of the span of a feature's values. What is not finite counts as the least that is.
+/// Computes Σ w·f over the Gaussians of each pixel, where w is the weight with which colors are blended.
+///
+/// Returns `[height, width, planes]` for the planes of `features`. Accuracy: about 1e-6 of the range of values of a
+/// feature. A feature value that is not finite counts as the smallest finite one.
 ///
 /// # Panics
-/// If there are not as many features as Gaussians.
+/// If the numbers of features and Gaussians differ.
 pub fn blend_features(gaussians: &Gaussians, features: &Column, camera: &Camera) -> Vec<f32> {
     let (planes, pixels) = (features.width(), camera.width as usize * camera.height as usize);
-    assert_eq!(features.len(), gaussians.len(), "as many features as Gaussians");
+    assert_eq!(features.len(), gaussians.len(), "expected as many features as Gaussians");
     let mut state = Gaussians { sh: Column::zeros(3, gaussians.len()), ..gaussians.clone() };
     state.sh.planes_mut().fill(harmonic(1.0));
     let opacity = render(&state, camera, [0.0; 3]).data;
@@ -29,19 +31,20 @@ pub fn blend_features(gaussians: &Gaussians, features: &Column, camera: &Camera)
                 *to = harmonic((value - least) / span);
             }
         }
-        let picture = render(&state, camera, [0.0; 3]).data;
+        let image = render(&state, camera, [0.0; 3]).data;
         for (pixel, to) in blended.chunks_exact_mut(planes).enumerate() {
             for (c, plane) in some.clone().enumerate() {
                 let [least, span] = spans[c];
-                let [value, seen] = [&picture, &opacity].map(|of| f64::from(of[3 * pixel + c]));
-                to[plane] = (span * value + least * seen) as f32;
+                let [value, opacity] = [&image, &opacity].map(|values| f64::from(values[3 * pixel + c]));
+                to[plane] = (span * value + least * opacity) as f32;
             }
         }
     }
     blended
 }
 
-/// Least finite value, and how much larger the largest is; 1 where none is.
+/// Returns the smallest finite value, and the difference of the largest and the smallest one (1 if there is no positive
+/// difference).
 fn span(values: &[f32]) -> [f64; 2] {
     let finite = || values.iter().copied().filter(|x| x.is_finite()).map(f64::from);
     let (least, most) = (finite().fold(f64::INFINITY, f64::min), finite().fold(f64::NEG_INFINITY, f64::max));
@@ -57,31 +60,33 @@ mod tests {
 
     use super::*;
 
-    /// Overlapping Gaussians, half of them see-through, before a camera.
+    /// Returns overlapping Gaussians, half of them translucent, and a camera that sees them.
     fn scene() -> (Gaussians, Camera) {
-        let mut made = Gaussians::zeros(40, 0);
+        let mut filled = Gaussians::zeros(40, 0);
         let noise = |k: usize, step: f64| ((k as f64 * step).fract() - 0.5) as f32;
         for i in 0..40 {
-            made.position.set_row(i, [noise(i, 0.618), noise(i, 0.7549), noise(i, 0.5698)]);
-            made.rotation.set_row(i, [1.0, noise(i, 0.3), noise(i, 0.4), 0.0]);
-            made.log_scale.set_row(i, [-2.0, -2.5, -1.5]);
-            made.opacity_logit.set_row(i, [4.0 * noise(i, 0.9)]);
+            filled.position.set_row(i, [noise(i, 0.618), noise(i, 0.7549), noise(i, 0.5698)]);
+            filled.rotation.set_row(i, [1.0, noise(i, 0.3), noise(i, 0.4), 0.0]);
+            filled.log_scale.set_row(i, [-2.0, -2.5, -1.5]);
+            filled.opacity_logit.set_row(i, [4.0 * noise(i, 0.9)]);
         }
-        (made, Camera::look_at(DVec3::new(0.3, -2.0, 0.4), DVec3::ZERO, 0.8, (33, 20)))
+        (filled, Camera::look_at(DVec3::new(0.3, -2.0, 0.4), DVec3::ZERO, 0.8, (33, 20)))
     }
 
+    /// Returns feature planes with values in [−3, 3).
     fn features(planes: usize) -> Column {
-        let mut made = Column::zeros(planes, 40);
-        made.planes_mut().iter_mut().enumerate().for_each(|(k, x)| *x = 6.0 * ((k as f32 * 0.618_034).fract() - 0.5));
-        made
+        let mut filled = Column::zeros(planes, 40);
+        filled.planes_mut().iter_mut().enumerate().for_each(|(k, x)| *x = 6.0 * ((k as f32 * 0.618_034).fract() - 0.5));
+        filled
     }
 
-    fn furthest(a: &[f32], b: impl Iterator<Item = f32>) -> f32 {
+    /// Returns the largest absolute difference.
+    fn largest_difference(a: &[f32], b: impl Iterator<Item = f32>) -> f32 {
         a.iter().zip(b).fold(0.0, |most, (a, b)| most.max((a - b).abs()))
     }
 
     #[test]
-    fn features_that_are_colors_are_blended_as_these() {
+    fn color_features_are_blended_like_colors() {
         let (mut state, camera) = scene();
         let mut colors = features(3);
         colors.planes_mut().iter_mut().for_each(|x| *x = x.abs());
@@ -89,27 +94,27 @@ mod tests {
         state.sh = Column::from_planes(3, harmonics);
         let expected = render(&state, &camera, [0.0; 3]).data;
         assert!(expected.iter().any(|&x| x > 0.5));
-        let off = furthest(&blend_features(&state, &colors, &camera), expected.iter().copied());
+        let off = largest_difference(&blend_features(&state, &colors, &camera), expected.iter().copied());
         assert!(off < 1e-5, "{off}");
     }
 
     #[test]
-    fn blends_are_linear_in_features_of_either_sign() {
+    fn blending_is_linear_in_features_of_either_sign() {
         let (state, camera) = scene();
-        let of = |features: &Column| blend_features(&state, features, &camera);
+        let blend = |features: &Column| blend_features(&state, features, &camera);
         let (plain, mut other) = (features(7), features(7));
-        let blended = of(&plain);
+        let blended = blend(&plain);
         assert_eq!(blended.len(), 7 * 33 * 20);
         assert!(blended.iter().any(|&x| x > 0.5) && blended.iter().any(|&x| x < -0.5));
         other.planes_mut().iter_mut().for_each(|x| *x *= -2.0);
-        let off = furthest(&of(&other), blended.iter().map(|x| -2.0 * x));
+        let off = largest_difference(&blend(&other), blended.iter().map(|x| -2.0 * x));
         assert!(off < 2e-5, "{off}");
-        // One more everywhere is as much more as is there to be seen.
+        // Adding 1 to all features adds the opacity of the pixel.
         let mut ones = features(1);
         ones.planes_mut().fill(1.0);
-        let seen = of(&ones);
+        let opacity = blend(&ones);
         other.planes_mut().iter_mut().zip(plain.planes()).for_each(|(to, x)| *to = x + 1.0);
-        let off = furthest(&of(&other), blended.iter().enumerate().map(|(k, x)| x + seen[k / 7]));
+        let off = largest_difference(&blend(&other), blended.iter().enumerate().map(|(k, x)| x + opacity[k / 7]));
         assert!(off < 2e-5, "{off}");
     }
 }

@@ -1,16 +1,46 @@
-//! What a camera sees of one frame's Gaussians: EWA splatting on the CPU.
+//! Rasterizer: renders the Gaussians of one frame from one camera by EWA splatting on the CPU.
 //!
-//! Reads as a pipeline: `project` (footprints, with `color`), `bin` (tiles, front to back), `blend` (pixels), and
-//! `backward` from there. Data in: [`Gaussians`](splat_core::Gaussians) in stored encoding and a
-//! [`Camera`](splat_core::Camera). Data out: an [`Image`], or the [`Contribution`] or [`RemovalError`] of every
-//! Gaussian, or the [`Gradients`](splat_core::Gradients) of a loss. Memory: [`BYTES_PER_VISIBLE`], and up to
-//! [`STRIP_BYTES`] for pairs of a Gaussian and a 16×16 tile it can change, which are made for as many tiles at a time as
-//! that takes; a tile that more Gaussians than that reach takes 12 bytes for each.
+//! The modules form a pipeline: `project` (footprints, with `color`), `bin` (tiles, front to back), `blend` (pixels),
+//! and `backward` (gradients). Input: [`Gaussians`](splat_core::Gaussians) in stored encoding and a
+//! [`Camera`](splat_core::Camera). Output: an [`Image`], or the [`Contribution`] or [`RemovalError`] of every Gaussian,
+//! or the [`Gradients`](splat_core::Gradients) of a loss.
 //!
-//! Every convention is that of the original CUDA rasteriser (Kerbl et al., "3D Gaussian Splatting", 2023),
-//! decided to the sentence because each costs tens of dB; what the reach of alpha ≥ 1/255 lets us skip
-//! changes no pixel. Pixels are the same bits for any number of threads and any instruction set.
-//! Gaussians with a NaN or infinite value among position, rotation, scale or opacity are not drawn.
+//! Memory: [`BYTES_PER_VISIBLE`] per visible Gaussian, and up to [`STRIP_BYTES`] for the pairs of a Gaussian and a
+//! 16×16 tile that it can change. Tiles are processed in strips whose pairs fit this limit. A single tile with more
+//! pairs than the limit takes 12 bytes per pair.
+//!
+//! All conventions are those of the original CUDA rasterizer (Kerbl et al., "3D Gaussian Splatting", 2023), in every
+//! detail, because each deviation costs tens of dB. Skipping Gaussians by the bound alpha ≥ 1/255 changes no pixel.
+//! Pixels have the same bits for any number of threads and any instruction set. Gaussians with a NaN or infinite
+//! position, rotation, scale or opacity are not drawn.
+//!
+//! ```
+//! use splat_core::{Camera, Gaussians, harmonic};
+//! use splat_render::{metrics::psnr, render};
+//!
+//! let mut gaussians = Gaussians::zeros(1, 0);
+//! gaussians.position.set_row(0, [0.0, 0.0, 3.0]);
+//! gaussians.rotation.set_row(0, [1.0, 0.0, 0.0, 0.0]);
+//! gaussians.log_scale.set_row(0, [-2.0; 3]);
+//! gaussians.opacity_logit.set_row(0, [4.0]);
+//! gaussians.sh.set_row(0, [harmonic(1.0), harmonic(0.0), harmonic(0.0)]);
+//! let camera = Camera {
+//!     width: 64,
+//!     height: 48,
+//!     fx: 60.0,
+//!     fy: 60.0,
+//!     cx: 32.0,
+//!     cy: 24.0,
+//!     rotation: glam::DMat3::IDENTITY,
+//!     translation: glam::DVec3::ZERO,
+//!     near: Camera::NEAR,
+//! };
+//!
+//! let image = render(&gaussians, &camera, [0.0; 3]);
+//! let center = 3 * (24 * 64 + 32);
+//! assert!(image.data[center] > 0.9 && image.data[center + 1] < 0.01);
+//! assert_eq!(psnr(&image, &image), splat_render::metrics::PSNR_CAP_DB);
+//! ```
 
 #![cfg_attr(not(test), deny(clippy::print_stderr, clippy::print_stdout))]
 
@@ -33,7 +63,12 @@ pub use features::blend_features;
 pub use removal::RemovalError;
 pub use renderer::{BYTES_PER_VISIBLE, Image, Renderer, STRIP_BYTES, contribution, render};
 
-/// The instruction set that pictures are made with on this machine.
+/// Returns the name of the instruction set that renders on this machine.
 pub fn instructions() -> &'static str {
-    blend::Blend::fastest().name()
+    blend::BlendKernel::fastest().name()
 }
+
+/// Compiles the example of the README.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+mod readme {}

@@ -1,10 +1,9 @@
-//! From Gaussians to footprints in the picture: EWA projection of one block, in f64.
+//! Projection of Gaussians to image footprints: EWA splatting of one block, in f64.
 //!
-//! In f64 because a radius is rounded up to whole pixels and decides which tiles a Gaussian reaches, and
-//! because the 2-D covariance of a needle cancels in f32. Data in: planes of one frame's states and a
-//! camera. Data out: one [`Splat`] for every Gaussian that can change a pixel. Memory: a few stack arrays
-//! of [`BLOCK`] entries. Source: Zwicker et al., "EWA Splatting", 2002, with the constants of Kerbl et al.,
-//! "3D Gaussian Splatting", 2023.
+//! f64 is needed for two reasons. A radius is rounded up to whole pixels and decides which tiles a Gaussian affects.
+//! The 2-D covariance of a long, thin Gaussian cancels in f32. Input: planes of one frame's states and a camera.
+//! Output: one [`Splat`] for every Gaussian that can change a pixel. Memory: a few stack arrays of [`BLOCK`] entries.
+//! Source: Zwicker et al., "EWA Splatting", 2002, with the constants of Kerbl et al., "3D Gaussian Splatting", 2023.
 
 use std::f64::consts::{LN_2, LOG2_E};
 use std::ops::Range;
@@ -16,33 +15,40 @@ use splat_core::{Camera, Gaussians};
 
 /// Variance added to the diagonal of every 2-D covariance, pixels².
 const DILATION: f64 = 0.3;
-/// The Jacobian is taken at directions no further out than this many half fields of view.
-const FIELD_MARGIN: f64 = 1.3;
-/// Logarithms of scales and logits are cut to ± this: squares of squares of scales stay finite in f64.
+/// Limit of the directions at which the Jacobian is evaluated, in half fields of view. Directions further out are
+/// clamped.
+const FOV_MARGIN: f64 = 1.3;
+/// Limit of |log scale| and |logit|. Values are clamped, so that fourth powers of scales stay finite in f64.
 pub(super) const LOGARITHM_LIMIT: f64 = 80.0;
-/// Below this logit an opacity, .0025, is less than [`MIN_ALPHA`].
-const LEAST_LOGIT: f32 = -6.0;
-/// Slack of the alpha bound in powers of two: thousands of times the rounding of the blend's exponent.
-const REACH_SLACK: f64 = 1e-3;
+/// Logit below which the opacity, 0.0025, is less than [`MIN_ALPHA`].
+const MIN_LOGIT: f32 = -6.0;
+/// Slack of the alpha bound in powers of two: thousands of times the rounding error of the exponent in the blend.
+const CUTOFF_SLACK: f64 = 1e-3;
 
-/// What of a camera the projection needs.
+/// Camera parameters in the form that the projection needs.
 pub(super) struct CameraTerms {
     /// Rows of the rotation from world to camera.
     pub(super) rotation: [[f64; 3]; 3],
+    /// Translation from world to camera, scene units.
     translation: [f64; 3],
+    /// Focal lengths along x and y, pixels.
     pub(super) focal: [f64; 2],
-    /// Where the optical axis lands when pixel centers are integers.
+    /// Principal point if pixel centers lie at integers.
     principal: [f64; 2],
+    /// Limits of |x / depth| and |y / depth| at which the Jacobian is evaluated.
     pub(super) slope_limit: [f64; 2],
+    /// Position of the camera in the world.
     pub(super) center: [f64; 3],
+    /// Image width and height, pixels.
     pub(super) size: [u32; 2],
-    /// Tiles across and down.
+    /// Number of tiles across and down.
     pub(super) tiles: [u32; 2],
-    /// View depths up to this are not drawn; an f32 in the reference kernel.
+    /// Largest view depth that is not drawn; rounded to f32 as in the reference kernel.
     near: f64,
 }
 
 impl CameraTerms {
+    /// Converts a camera.
     pub(super) fn new(camera: &Camera) -> Self {
         let rows = camera.rotation.transpose();
         CameraTerms {
@@ -51,8 +57,8 @@ impl CameraTerms {
             focal: [camera.fx, camera.fy],
             principal: [camera.cx - 0.5, camera.cy - 0.5],
             slope_limit: [
-                FIELD_MARGIN * f64::from(camera.width) / (2.0 * camera.fx),
-                FIELD_MARGIN * f64::from(camera.height) / (2.0 * camera.fy),
+                FOV_MARGIN * f64::from(camera.width) / (2.0 * camera.fx),
+                FOV_MARGIN * f64::from(camera.height) / (2.0 * camera.fy),
             ],
             center: camera.center().to_array(),
             size: [camera.width, camera.height],
@@ -62,29 +68,36 @@ impl CameraTerms {
     }
 }
 
-/// The footprint of one Gaussian in one picture.
+/// Footprint of one Gaussian in one view.
 ///
-/// With pixel offset (dx, dy) from the center, the exponent of its alpha is, in powers of two,
-/// `−narrow·(dx − slope·dy)² − fall·dy²`: the quadratic form of the inverse covariance with the square
-/// completed over x, which neither cancels nor goes positive.
-/// Alone in its line of the cache, for splats are read in another order than they lie.
+/// At pixel offset (dx, dy) from the center, the exponent of alpha in powers of two is `−falloff_x·(dx − shear·dy)² −
+/// falloff_y·dy²`: the quadratic form of the inverse covariance with the square completed over x. This form has no
+/// cancellation and is never positive.
+///
+/// Aligned to a cache line, because splats are not read in the order of memory.
 #[derive(Debug, Clone, Copy)]
 #[repr(align(64))]
 pub(super) struct Splat {
-    /// Center in pixels, pixel centers at integers.
+    /// Center along x in pixels; pixel centers lie at integers.
     pub(super) u: f64,
+    /// Center along y in pixels.
     pub(super) v: f64,
-    pub(super) narrow: f32,
-    pub(super) slope: f32,
-    pub(super) fall: f32,
-    /// Exponents below `−reach` give an alpha that is skipped.
-    pub(super) reach: f32,
+    /// Coefficient of (dx − shear·dy)², 1/pixels².
+    pub(super) falloff_x: f32,
+    /// Shift in x of the row maximum per row.
+    pub(super) shear: f32,
+    /// Coefficient of dy², 1/pixels².
+    pub(super) falloff_y: f32,
+    /// Exponents below `−cutoff` give an alpha that is skipped.
+    pub(super) cutoff: f32,
+    /// Opacity in [0, 1].
     pub(super) opacity: f32,
-    /// View depth, scene units, added up in f32 as the reference kernel does: where Gaussians nearly tie
-    /// its rounding decides which is in front (81 against 116 dB on one reference render).
-    pub(super) order: f32,
+    /// View depth in scene units, summed in f32 like in the reference kernel. Its rounding decides which of two almost
+    /// equally deep Gaussians is in front (81 instead of 116 dB on one reference render).
+    pub(super) sort_depth: f32,
+    /// Color, red, green and blue.
     pub(super) color: [f32; 3],
-    /// Index among the Gaussians.
+    /// Index of the Gaussian.
     pub(super) id: u32,
 }
 
@@ -97,7 +110,7 @@ pub(super) struct TileRect {
     pub(super) y1: u32,
 }
 
-/// The visible part of some Gaussians: entry i of both belongs together, in increasing id.
+/// Footprints of the visible Gaussians of a range, by increasing id. Entry i of both lists belongs to one Gaussian.
 #[derive(Debug, Default)]
 pub(super) struct Splats {
     pub(super) splats: Vec<Splat>,
@@ -105,24 +118,27 @@ pub(super) struct Splats {
 }
 
 impl Splats {
+    /// Removes all footprints.
     pub(super) fn clear(&mut self) {
         self.splats.clear();
         self.rects.clear();
     }
 
+    /// Appends the footprints of Gaussians with higher ids.
     pub(super) fn append(&mut self, mut next: Splats) {
         self.splats.append(&mut next.splats);
         self.rects.append(&mut next.rects);
     }
 }
 
-/// Appends the visible Gaussians of `ids` to `out`; with `colored`, their colors too (else black).
+/// Appends the footprints of the visible Gaussians of `ids` to `out`. Computes their colors if `colored`; otherwise the
+/// colors are black.
 ///
 /// A Gaussian with a value that is not finite is not visible.
 pub(super) fn project(gaussians: &Gaussians, ids: Range<usize>, view: &CameraTerms, colored: bool, out: &mut Splats) {
     #[cfg(target_arch = "x86_64")]
     {
-        /// The same loops, compiled for wider registers; no fused arithmetic, so the same bits.
+        /// Runs [`project_blocks`] compiled for AVX2. Arithmetic is not fused, so results have the same bits.
         #[target_feature(enable = "avx2")]
         fn project_avx2(gaussians: &Gaussians, ids: Range<usize>, view: &CameraTerms, colored: bool, out: &mut Splats) {
             project_blocks(gaussians, ids, view, colored, out);
@@ -135,9 +151,10 @@ pub(super) fn project(gaussians: &Gaussians, ids: Range<usize>, view: &CameraTer
     project_blocks(gaussians, ids, view, colored, out);
 }
 
+/// Projects `ids` in blocks of [`BLOCK`] Gaussians.
 #[inline(always)]
 fn project_blocks(gaussians: &Gaussians, ids: Range<usize>, view: &CameraTerms, colored: bool, out: &mut Splats) {
-    // Room for all at once: growing would copy, and room that is never written takes no memory.
+    // Reserves the maximum at once: growing would copy, and reserved memory that is never written is not used.
     out.splats.reserve_exact(ids.len());
     out.rects.reserve_exact(ids.len());
     let mut footprints = ProjectedSplats::default();
@@ -145,7 +162,7 @@ fn project_blocks(gaussians: &Gaussians, ids: Range<usize>, view: &CameraTerms, 
     for start in ids.clone().step_by(BLOCK) {
         let block = start..(start + BLOCK).min(ids.end);
         let logits = &gaussians.opacity_logit.plane(0)[block.clone()];
-        if logits.iter().all(|&logit| logit < LEAST_LOGIT) {
+        if logits.iter().all(|&logit| logit < MIN_LOGIT) {
             continue;
         }
         let before = out.splats.len();
@@ -169,17 +186,18 @@ fn project_blocks(gaussians: &Gaussians, ids: Range<usize>, view: &CameraTerms, 
 /// Projected quantities of one block.
 struct ProjectedSplats {
     depth: [f64; BLOCK],
-    order: [f32; BLOCK],
+    sort_depth: [f32; BLOCK],
     u: [f64; BLOCK],
     v: [f64; BLOCK],
-    /// The exponent of alpha, see [`Splat`].
-    narrow: [f64; BLOCK],
-    slope: [f64; BLOCK],
-    fall: [f64; BLOCK],
-    /// Half the width and height of the ellipse where alpha has halved once, pixels.
+    /// Coefficients of the exponent of alpha, see [`Splat`].
+    falloff_x: [f64; BLOCK],
+    shear: [f64; BLOCK],
+    falloff_y: [f64; BLOCK],
+    /// Half the width of the ellipse on which alpha is half its maximum, pixels.
     half_u: [f64; BLOCK],
+    /// Half the height of that ellipse, pixels.
     half_v: [f64; BLOCK],
-    /// 3σ of the longest axis rounded up, pixels.
+    /// Three standard deviations of the longest axis, rounded up, pixels.
     radius: [f64; BLOCK],
     opacity: [f64; BLOCK],
 }
@@ -189,12 +207,12 @@ impl Default for ProjectedSplats {
         let zero = [0.0; BLOCK];
         ProjectedSplats {
             depth: zero,
-            order: [0.0; BLOCK],
+            sort_depth: [0.0; BLOCK],
             u: zero,
             v: zero,
-            narrow: zero,
-            slope: zero,
-            fall: zero,
+            falloff_x: zero,
+            shear: zero,
+            falloff_y: zero,
             half_u: zero,
             half_v: zero,
             radius: zero,
@@ -204,7 +222,7 @@ impl Default for ProjectedSplats {
 }
 
 impl ProjectedSplats {
-    /// Projects every Gaussian of the block, visible or not: without branches the loop runs in vectors.
+    /// Projects every Gaussian of the block, visible or not. Without branches the loop is vectorized.
     #[inline(always)]
     fn fill(&mut self, gaussians: &Gaussians, block: Range<usize>, view: &CameraTerms) {
         let n = block.len().min(BLOCK);
@@ -224,12 +242,12 @@ impl ProjectedSplats {
             let spread = 0.25 * (xx - yy) * (xx - yy) + xy * xy;
             let largest = 0.5 * (xx + yy) + (if spread < 0.1 { 0.1 } else { spread }).sqrt();
             self.depth[i] = shape.depth;
-            self.order[i] = (w0 * position[0][i] + w1 * position[1][i]) + (w2 * position[2][i] + w3);
+            self.sort_depth[i] = (w0 * position[0][i] + w1 * position[1][i]) + (w2 * position[2][i] + w3);
             self.u[i] = view.focal[0] * shape.slopes[0] + view.principal[0];
             self.v[i] = view.focal[1] * shape.slopes[1] + view.principal[1];
-            self.narrow[i] = 0.5 * LOG2_E * yy / det;
-            self.slope[i] = xy / yy;
-            self.fall[i] = 0.5 * LOG2_E / yy;
+            self.falloff_x[i] = 0.5 * LOG2_E * yy / det;
+            self.shear[i] = xy / yy;
+            self.falloff_y[i] = 0.5 * LOG2_E / yy;
             self.half_u[i] = (2.0 * LN_2 * xx).sqrt();
             self.half_v[i] = (2.0 * LN_2 * yy).sqrt();
             self.radius[i] = (3.0 * largest.sqrt()).ceil();
@@ -237,17 +255,17 @@ impl ProjectedSplats {
         }
     }
 
-    /// The footprint of Gaussian `i` of the block, or none when it cannot change any pixel.
+    /// Returns the footprint of Gaussian `i` of the block, or `None` if it cannot change any pixel.
     #[inline(always)]
     fn splat(&self, i: usize, id: u32, view: &CameraTerms) -> Option<(Splat, TileRect)> {
         let (depth, u, v, opacity) = (self.depth[i], self.u[i], self.v[i], self.opacity[i]);
-        let finite = depth.is_finite() && u.is_finite() && v.is_finite() && self.narrow[i].is_finite();
+        let finite = depth.is_finite() && u.is_finite() && v.is_finite() && self.falloff_x[i].is_finite();
         if !(depth > view.near && finite && opacity >= f64::from(MIN_ALPHA)) {
             return None;
         }
-        let reach = log2_bound(opacity / f64::from(MIN_ALPHA)) + REACH_SLACK;
-        // The reference kernel's square of tiles, then what of it the ellipse alpha ≥ 1/255 can touch.
-        let root = reach.sqrt();
+        let cutoff = log2_bound(opacity / f64::from(MIN_ALPHA)) + CUTOFF_SLACK;
+        // The square of tiles of the reference kernel, reduced to the tiles that the ellipse alpha ≥ 1/255 can touch.
+        let root = cutoff.sqrt();
         let (x0, x1) = tile_range(u, self.radius[i], root * self.half_u[i], view.tiles[0]);
         let (y0, y1) = tile_range(v, self.radius[i], root * self.half_v[i], view.tiles[1]);
         if x0 >= x1 || y0 >= y1 {
@@ -256,12 +274,12 @@ impl ProjectedSplats {
         let splat = Splat {
             u,
             v,
-            narrow: self.narrow[i] as f32,
-            slope: self.slope[i] as f32,
-            fall: self.fall[i] as f32,
-            reach: reach as f32,
+            falloff_x: self.falloff_x[i] as f32,
+            shear: self.shear[i] as f32,
+            falloff_y: self.falloff_y[i] as f32,
+            cutoff: cutoff as f32,
             opacity: opacity as f32,
-            order: self.order[i],
+            sort_depth: self.sort_depth[i],
             color: [0.0; 3],
             id,
         };
@@ -269,22 +287,24 @@ impl ProjectedSplats {
     }
 }
 
-/// How a camera sees the axes of one Gaussian.
+/// Axes of one Gaussian, projected to the image.
 pub(super) struct ProjectedShape {
     /// View depth, scene units.
     pub(super) depth: f64,
     /// x / depth and y / depth in camera axes.
     pub(super) slopes: [f64; 2],
-    /// World directions that move u and v, pixels per scene unit: rows of the Jacobian times the camera's rotation.
-    pub(super) to: [[f64; 3]; 2],
+    /// Derivatives of u and v with respect to the world position, pixels per scene unit: rows of the Jacobian times the
+    /// rotation of the camera.
+    pub(super) to_pixels: [[f64; 3]; 2],
     /// Columns of the Gaussian's rotation.
     pub(super) axes: [[f64; 3]; 3],
+    /// Scales, scene units.
     pub(super) scale: [f64; 3],
-    /// Standard deviations along the axes as seen in u and v, pixels: `to` · axes · scale.
+    /// Standard deviations of the axes in u and v, pixels: `to_pixels` · axes · scale.
     pub(super) spread: [[f64; 3]; 2],
 }
 
-/// The widened 2-D covariance, pixels², and its determinant.
+/// Dilated 2-D covariance, pixels², and its determinant.
 pub(super) struct Covariance {
     pub(super) xx: f64,
     pub(super) xy: f64,
@@ -293,7 +313,7 @@ pub(super) struct Covariance {
 }
 
 impl ProjectedShape {
-    /// Of a Gaussian at `p` with wxyz quaternion `q`.
+    /// Projects a Gaussian at `p` with wxyz quaternion `q`.
     #[inline(always)]
     pub(super) fn new(p: [f64; 3], q: [f64; 4], log_scale: [f32; 3], view: &CameraTerms) -> Self {
         let [r0, r1, r2] = view.rotation;
@@ -302,22 +322,24 @@ impl ProjectedShape {
         let slopes = [(dot(r0, p) + t0) / z, (dot(r1, p) + t1) / z];
         let axes = rotation_matrix(q);
         let s = [
-            exp(limit(log_scale[0].into(), LOGARITHM_LIMIT)),
-            exp(limit(log_scale[1].into(), LOGARITHM_LIMIT)),
-            exp(limit(log_scale[2].into(), LOGARITHM_LIMIT)),
+            exp(clamp_to(log_scale[0].into(), LOGARITHM_LIMIT)),
+            exp(clamp_to(log_scale[1].into(), LOGARITHM_LIMIT)),
+            exp(clamp_to(log_scale[2].into(), LOGARITHM_LIMIT)),
         ];
         let (jx, jy) = (view.focal[0] / z, view.focal[1] / z);
-        let (kx, ky) = (limit(slopes[0], view.slope_limit[0]), limit(slopes[1], view.slope_limit[1]));
+        let (kx, ky) = (clamp_to(slopes[0], view.slope_limit[0]), clamp_to(slopes[1], view.slope_limit[1]));
         let to_u = [jx * (r0[0] - kx * r2[0]), jx * (r0[1] - kx * r2[1]), jx * (r0[2] - kx * r2[2])];
         let to_v = [jy * (r1[0] - ky * r2[0]), jy * (r1[1] - ky * r2[1]), jy * (r1[2] - ky * r2[2])];
-        // Not `array::map`: it may be compiled apart, and a loop that calls it does not run in vectors.
+        // Not `array::map`: it may be compiled as a separate function, which would keep the calling loop from being
+        // vectorized.
         let spread = [
             [dot(to_u, axes[0]) * s[0], dot(to_u, axes[1]) * s[1], dot(to_u, axes[2]) * s[2]],
             [dot(to_v, axes[0]) * s[0], dot(to_v, axes[1]) * s[1], dot(to_v, axes[2]) * s[2]],
         ];
-        ProjectedShape { depth: z, slopes, to: [to_u, to_v], axes, scale: s, spread }
+        ProjectedShape { depth: z, slopes, to_pixels: [to_u, to_v], axes, scale: s, spread }
     }
 
+    /// Returns the dilated 2-D covariance.
     #[inline(always)]
     pub(super) fn covariance(&self) -> Covariance {
         let [a, b] = self.spread;
@@ -332,52 +354,55 @@ impl ProjectedShape {
     }
 }
 
-/// Opacity in [0, 1] of a stored logit.
+/// Returns the opacity in [0, 1] of a stored logit.
 #[inline(always)]
 pub(super) fn opacity(logit: f32) -> f64 {
-    1.0 / (1.0 + exp(limit(-f64::from(logit), LOGARITHM_LIMIT)))
+    1.0 / (1.0 + exp(clamp_to(-f64::from(logit), LOGARITHM_LIMIT)))
 }
 
-/// Tiles along one axis: those touched by `at ± radius` as the reference kernel counts them, without
-/// those whose pixels all lie further than `half` from `at`.
+/// Returns the range of tiles along one axis: those that the reference kernel counts for `at ± radius`, without those
+/// whose pixels all lie further than `half` from `at`.
 #[inline(always)]
 fn tile_range(at: f64, radius: f64, half: f64, tiles: u32) -> (u32, u32) {
     let tile = f64::from(TILE);
     let start = ((at - radius) / tile).floor().max(((at - half - (tile - 1.0)) / tile).ceil());
     let end = ((at + radius + tile - 1.0) / tile).floor().min(((at + half) / tile).floor() + 1.0);
-    // A float-to-integer cast saturates: below the image it becomes 0.
+    // A float-to-integer cast saturates: values below 0 become 0.
     ((start as u32).min(tiles), (end as u32).min(tiles))
 }
 
-/// An upper bound of log₂ x, at most 0.087 above it, for normal positive x: the bits of a float read as an
-/// integer are its logarithm but for the mantissa, and log₂(1 + m) ≤ m + 0.0861.
+/// Returns an upper bound of log₂ x for normal positive x, at most 0.087 above it.
+///
+/// The bits of a float read as an integer are its logarithm except for the mantissa, and log₂(1 + m) ≤ m + 0.0861.
 #[inline(always)]
 fn log2_bound(x: f64) -> f64 {
     x.to_bits() as i64 as f64 * (1.0 / (1u64 << 52) as f64) - (1023.0 - 0.0861)
 }
 
-/// `x` cut to ± `bound`; NaN stays, so that it is noticed. (`f64::clamp` may panic, which keeps a loop
-/// from running in vectors.)
+/// Returns `x` clamped to ± `bound`. NaN stays NaN, so that it is noticed. (`f64::clamp` may panic, which keeps a loop
+/// from being vectorized.)
 #[inline(always)]
-fn limit(x: f64, bound: f64) -> f64 {
+fn clamp_to(x: f64, bound: f64) -> f64 {
     let x = if x > bound { bound } else { x };
     if x < -bound { -bound } else { x }
 }
 
+/// Returns the scalar product.
 #[inline(always)]
 pub(super) fn dot(a: [f64; 3], b: [f64; 3]) -> f64 {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 }
 
+/// Returns the cross product.
 #[inline(always)]
 pub(super) fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
     [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 }
 
-/// Columns of the rotation of a wxyz quaternion of any length; the identity for a zero one.
+/// Returns the columns of the rotation of a wxyz quaternion of any length; the identity for zero.
 #[inline(always)]
 fn rotation_matrix([w, x, y, z]: [f64; 4]) -> [[f64; 3]; 3] {
-    // 2/|q|² in place of normalizing; the floor keeps 0 · s = 0 for a zero quaternion.
+    // The factor 2/|q|² replaces normalization. Its floor keeps 0 · s = 0 for a zero quaternion.
     let norm = w * w + x * x + y * y + z * z;
     let s = 2.0 / if norm < f64::MIN_POSITIVE { f64::MIN_POSITIVE } else { norm };
     [
@@ -392,7 +417,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn log2_bound_is_above_by_less_than_0_087() {
+    fn log2_bound_exceeds_log2_by_less_than_0_087() {
         for step in 0..100_000 {
             let x = 1.0 + f64::from(step) * 2.54e-3;
             let excess = log2_bound(x) - x.log2();
@@ -401,12 +426,12 @@ mod tests {
     }
 
     #[test]
-    fn a_zero_quaternion_is_the_identity() {
+    fn zero_quaternion_is_the_identity() {
         assert_eq!(rotation_matrix([0.0; 4]), [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]);
     }
 
     #[test]
-    fn tile_ranges_are_the_reference_kernels_where_the_ellipse_does_not_cut() {
+    fn tile_ranges_match_the_reference_kernel_without_ellipse() {
         for step in -400..4000 {
             let at = f64::from(step) * 0.1;
             for radius in [1.0f64, 3.0, 17.0, 250.0] {

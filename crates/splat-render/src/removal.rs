@@ -1,9 +1,9 @@
-//! What a picture would lose with each of its Gaussians.
+//! Error that removing a Gaussian causes in a render.
 //!
-//! A Gaussian of color c and weight w = alpha · transmittance hides what lies behind it, of color b:
-//! without it the pixel changes by exactly w·(c − b), so one that looks like what it hides is worth
-//! nothing however much it covers. Of N removals at once the changes add up, with b changing too; hence
-//! the floor under c − b, and ranking in rounds.
+//! A Gaussian of color c and weight w = alpha · transmittance hides a background of color b. Without the Gaussian the
+//! pixel changes by exactly w·(c − b), so a Gaussian that looks like its background is worth nothing however large its
+//! contribution is. If N Gaussians are removed at once, the changes add up, and b changes too. Therefore c − b has a
+//! floor, and Gaussians are ranked in pruning rounds.
 
 use serde::{Deserialize, Serialize};
 
@@ -11,60 +11,61 @@ use super::blend::{BlendSink, Fragment, TilePlane};
 use super::lanes::{Lanes, Sums};
 use super::project::Splat;
 
-/// Removal error of N Gaussians over any number of pictures: Σ over pixels of w²·(‖c − b‖² + floor²).
+/// Removal error of N Gaussians over any number of views: Σ over pixels of w²·(‖c − b‖² + floor²).
 ///
-/// With a floor of 0, and but for alphas cut at 0.99 and pixels that end early, it is the squared error
-/// of the picture without that Gaussian. The same whatever the order of pictures and the number of threads.
-/// Memory: 8 bytes per Gaussian.
+/// With a floor of 0 it is the squared error of the render without that Gaussian, except for alphas clamped at 0.99 and
+/// pixels that end early. It does not depend on the order of views or the number of threads. Memory: 8 bytes per
+/// Gaussian.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct RemovalError {
-    /// `[N]`, in units of 2⁻³⁶ ([`RemovalError::UNIT`]); a picture's part is summed per 16×16 tile in f32,
-    /// in a fixed order. A sum that would pass 2⁶⁴ stays there.
+    /// Removal error `[N]` in units of 2⁻³⁶ ([`RemovalError::UNIT`]). The part of a view is summed per 16×16 tile in
+    /// f32, in a fixed order. A sum saturates at 2⁶⁴.
     pub sum: Vec<u64>,
-    /// Least difference of color that a Gaussian counts as having from what it hides, as a norm over RGB.
+    /// Minimum color difference between a Gaussian and its background that is counted, as a norm over RGB.
     pub contrast_floor: f32,
 }
 
 impl RemovalError {
-    /// Squared error per unit of [`RemovalError::sum`]: 2⁻³⁶. 3000 wholly changed pictures of 320×256 fit.
+    /// Squared error per unit of [`RemovalError::sum`]: 2⁻³⁶. The sum can hold 3000 completely changed renders of
+    /// 320×256.
     pub const UNIT: f64 = 1.0 / (1u64 << 36) as f64;
 
-    /// Nothing seen of `len` Gaussians.
+    /// Creates zero removal errors of `len` Gaussians.
     pub fn new(len: usize, contrast_floor: f32) -> Self {
         RemovalError { sum: vec![0; len], contrast_floor }
     }
 
-    /// Number of Gaussians.
+    /// Returns the number of Gaussians.
     pub fn len(&self) -> usize {
         self.sum.len()
     }
 
-    /// Whether there are none.
+    /// Returns whether there are no Gaussians.
     pub fn is_empty(&self) -> bool {
         self.sum.is_empty()
     }
 
-    /// The `count` Gaussians, increasing, that are `fixed` or else that pictures would lose most with; of equals the
-    /// first ones.
+    /// Returns the indices of `count` Gaussians, increasing: first those that are `fixed`, then those with the largest
+    /// removal error. Ties go to the lower index.
     pub fn most_missed(&self, count: usize, fixed: impl Fn(usize) -> bool) -> Vec<u32> {
-        let mut places: Vec<u32> = (0..self.len() as u32).collect();
-        // Stable: ties by place.
-        places.sort_by_key(|&place| std::cmp::Reverse((fixed(place as usize), self.sum[place as usize])));
-        places.truncate(count);
-        places.sort_unstable();
-        places
+        let mut ids: Vec<u32> = (0..self.len() as u32).collect();
+        // A stable sort keeps ties in index order.
+        ids.sort_by_key(|&id| std::cmp::Reverse((fixed(id as usize), self.sum[id as usize])));
+        ids.truncate(count);
+        ids.sort_unstable();
+        ids
     }
 
-    /// Adds what `other` found of the same Gaussians in other pictures.
+    /// Adds the removal errors of the same Gaussians in other views.
     ///
     /// # Panics
     /// If the lengths differ.
     pub fn merge(&mut self, other: &RemovalError) {
-        assert_eq!(self.len(), other.len(), "errors of different models");
+        assert_eq!(self.len(), other.len(), "expected removal errors of equally many Gaussians");
         self.sum.iter_mut().zip(&other.sum).for_each(|(sum, other)| *sum = sum.saturating_add(*other));
     }
 
-    /// Adds what `other` found of the Gaussians `rows` alone, in that order.
+    /// Adds the removal errors of `other`, whose Gaussian k is Gaussian `rows[k]` of `self`.
     pub fn merge_rows(&mut self, rows: &[u32], other: &RemovalError) {
         for (&row, other) in rows.iter().zip(&other.sum) {
             let sum = &mut self.sum[row as usize];
@@ -72,25 +73,26 @@ impl RemovalError {
         }
     }
 
-    /// Adds one tile's error of Gaussian `i`.
+    /// Adds the removal error of Gaussian `i` in one tile.
     pub(super) fn add(&mut self, i: usize, error: f32) {
         let units = (f64::from(error) * (1.0 / Self::UNIT) + 0.5) as u64;
         self.sum[i] = self.sum[i].saturating_add(units);
     }
 }
 
-/// Sums squared changes over the pixels of a tile.
-pub(super) struct Removal<'a> {
-    /// Colors of the pixels; of what is drawn so far, each takes its part away.
-    pub(super) rest: [TilePlane; 3],
+/// Sums squared pixel changes of every Gaussian in a tile.
+pub(super) struct RemovalSink<'a> {
+    /// Colors of the pixels without the contributions of the splats blended so far, by channel.
+    pub(super) behind: [TilePlane; 3],
+    /// Minimum color difference, as in [`RemovalError::contrast_floor`].
     pub(super) contrast_floor: f32,
-    /// One per pair of the tile.
+    /// Removal error per pair of the tile.
     pub(super) pairs: &'a mut [f32],
 }
 
-impl BlendSink for Removal<'_> {
-    /// Color and sum.
-    type Drop<V: Lanes> = ([V; 3], V::Sums);
+impl BlendSink for RemovalSink<'_> {
+    /// Color, and sum of squared changes.
+    type Accumulator<V: Lanes> = ([V; 3], V::Sums);
     #[inline(always)]
     fn begin<V: Lanes>(&self, splat: &Splat) -> ([V; 3], V::Sums) {
         (splat.color.map(V::splat), V::Sums::zero())
@@ -100,18 +102,18 @@ impl BlendSink for Removal<'_> {
         &mut self,
         (color, sum): ([V; 3], V::Sums),
         group: usize,
-        stroke: Fragment<V>,
+        fragment: Fragment<V>,
     ) -> ([V; 3], V::Sums) {
-        let Fragment { weight, left, .. } = stroke;
-        // What lies behind shows with transmittance `left`, and `weight` more without this splat.
-        let gain = weight.div(left);
+        let Fragment { weight, transmittance_after, .. } = fragment;
+        // The background has transmittance `transmittance_after`, and `weight` more without this splat.
+        let gain = weight.div(transmittance_after);
         let floor = weight.mul(V::splat(self.contrast_floor));
         let mut squares = floor.mul(floor);
-        for (plane, color) in self.rest.iter_mut().zip(color) {
+        for (plane, color) in self.behind.iter_mut().zip(color) {
             let own = color.mul(weight);
-            let behind = V::load(plane, group).sub(own);
-            behind.store(plane, group);
-            let change = own.sub(gain.mul(behind));
+            let background = V::load(plane, group).sub(own);
+            background.store(plane, group);
+            let change = own.sub(gain.mul(background));
             squares = squares.add(change.mul(change));
         }
         (color, squares.add_to(sum))
@@ -132,8 +134,8 @@ mod tests {
 
     const BACKGROUND: [f32; 3] = [0.2, 0.5, 0.9];
 
-    /// Translucent Gaussians of many colors before each other.
-    fn cloud(count: usize) -> Gaussians {
+    /// Returns translucent overlapping Gaussians of many colors.
+    fn scene(count: usize) -> Gaussians {
         let mut scene = Gaussians::zeros(count, 0);
         for i in 0..count {
             let step = |k: f64| (i as f64 * k).fract() as f32;
@@ -146,10 +148,12 @@ mod tests {
         scene
     }
 
+    /// Returns a camera in front of the scene.
     fn camera() -> Camera {
         Camera::look_at(DVec3::new(1.0, -3.0, 0.4), DVec3::ZERO, 0.6, (45, 37))
     }
 
+    /// Returns the removal errors of all Gaussians.
     fn errors(scene: &Gaussians, floor: f32) -> Vec<f64> {
         let mut found = RemovalError::new(scene.len(), floor);
         Renderer::new().removal_error(scene, &camera(), BACKGROUND, &mut found);
@@ -157,8 +161,8 @@ mod tests {
     }
 
     #[test]
-    fn the_error_is_that_of_the_picture_without_the_gaussian() {
-        let scene = cloud(40);
+    fn error_equals_that_of_a_render_without_the_gaussian() {
+        let scene = scene(40);
         let whole = render(&scene, &camera(), BACKGROUND);
         let found = errors(&scene, 0.0);
         let mut largest = 0.0f64;
@@ -168,21 +172,21 @@ mod tests {
             let change = whole.data.iter().zip(&without.data).map(|(a, b)| f64::from(a - b).powi(2));
             let expected: f64 = change.sum();
             largest = largest.max(expected);
-            // Pixels that nearly end may blend one splat more without this one.
+            // Pixels that almost end early may blend one splat more without this Gaussian.
             assert!((got - expected).abs() <= 1e-3 * expected + 1e-5, "{i}: got {got}, expected {expected}");
         }
-        assert!(largest > 1.0, "nothing in the scene matters: {largest}");
+        assert!(largest > 1.0, "largest expected error: {largest}, expected above 1");
     }
 
     #[test]
-    fn the_floor_adds_the_sum_of_squared_weights() {
-        let scene = cloud(40);
+    fn floor_adds_the_sum_of_squared_weights() {
+        let scene = scene(40);
         let (plain, raised) = (errors(&scene, 0.0), errors(&scene, 0.5));
         let white = (0.5 / splat_core::SH_C0) as f32;
         let mut lit = scene.clone();
         (0..40).for_each(|i| lit.sh.set_row(i, [-white; 3]));
         for i in 0..40 {
-            // One that is white among black ones shows its weight in every pixel.
+            // A white Gaussian among black ones shows its weight in every pixel.
             lit.sh.set_row(i, [white; 3]);
             let weights = render(&lit, &camera(), [0.0; 3]).data;
             lit.sh.set_row(i, [-white; 3]);
@@ -194,7 +198,7 @@ mod tests {
     }
 
     #[test]
-    fn sums_stay_at_the_top_instead_of_wrapping() {
+    fn sums_saturate() {
         let mut near = RemovalError::new(1, 0.1);
         near.sum[0] = u64::MAX - 5;
         near.add(0, 1.0);

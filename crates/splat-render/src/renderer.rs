@@ -1,4 +1,4 @@
-//! Pictures, contributions and removal errors of one frame seen by one camera: the parts of the rasteriser in order.
+//! Renders, contributions and removal errors of one frame from one camera: runs the parts of the rasterizer in order.
 
 use std::num::NonZeroU32;
 use std::ops::Range;
@@ -7,35 +7,35 @@ use rayon::prelude::*;
 
 use super::backward::sums::ImageGradientSums;
 use super::bin::{Bins, STRIP_PAIRS};
-use super::blend::{Blend, Color, SampledPixels, TilePlane, Weight, Weights};
+use super::blend::{BlendKernel, ColorSink, SampledPixels, TilePlane, Weight, WeightSink};
 use super::contribution::Contribution;
 use super::convention::{BLOCK, TILE};
 use super::lanes::LANES;
 use super::project::{CameraTerms, Splat, Splats, TileRect, project};
-use super::removal::{Removal, RemovalError};
+use super::removal::{RemovalError, RemovalSink};
 use splat_core::{Camera, Gaussians};
 
-/// Gaussians projected by one task: enough to outweigh handing it out.
+/// Number of Gaussians projected by one task: enough to outweigh the overhead of a task.
 const SPAN: usize = 32 * BLOCK;
 
-/// Memory of a picture in the making per Gaussian it shows: footprint, reach, and place in depth with room to sort it.
+/// Bytes per visible Gaussian during a render: footprint, tile rectangle, and depth sort key with the sort buffer.
 pub const BYTES_PER_VISIBLE: usize = size_of::<Splat>() + size_of::<TileRect>() + 2 * size_of::<u64>();
-/// Memory of a picture in the making for pairs of Gaussians and tiles, with what is summed for each.
+/// Bytes for the pairs of Gaussians and tiles of a strip, with the sums of each pair.
 pub const STRIP_BYTES: usize = STRIP_PAIRS * (size_of::<u32>() + size_of::<Weight>());
 
-/// A picture: red, green, blue per pixel, row by row from the top, 1 = white, not clamped.
+/// Image with red, green, blue per pixel, row by row from the top; 1 is white; values are not clamped.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Image {
-    /// Pixels across.
+    /// Width in pixels.
     pub width: u32,
-    /// Pixels down.
+    /// Height in pixels.
     pub height: u32,
-    /// `[height, width, 3]`.
+    /// Pixel values `[height, width, 3]`.
     pub data: Vec<f32>,
 }
 
 impl Image {
-    /// The pixels of one tile, row by row, 0 beyond the picture's edge.
+    /// Returns the pixels of one tile, row by row; 0 outside the image.
     pub(super) fn tile(&self, tile: [u32; 2]) -> [[[f32; 3]; TILE as usize]; TILE as usize] {
         let mut pixels = [[[0.0; 3]; TILE as usize]; TILE as usize];
         let [x, y] = tile.map(|t| (t * TILE) as usize);
@@ -48,41 +48,42 @@ impl Image {
     }
 }
 
-/// Renders `gaussians` before `background` as `camera` sees them, on all threads of the pool.
+/// Renders `gaussians` from `camera` over the color `background`, on all threads of the pool.
 ///
-/// A camera without pixels gives an empty image; no Gaussians give the background. Scales are taken
-/// within e^±80. A zero quaternion is the identity; a NaN color counts as 0.
+/// A camera without pixels gives an empty image. No Gaussians give the background. Scales are clamped to e^±80. A zero
+/// quaternion counts as the identity; a NaN color counts as 0.
 ///
 /// # Panics
-/// If the columns of `gaussians` differ in length.
+/// If the attributes of `gaussians` have different lengths.
 pub fn render(gaussians: &Gaussians, camera: &Camera, background: [f32; 3]) -> Image {
     Renderer::on_all_threads().render(gaussians, camera, background)
 }
 
-/// Adds what `camera` sees of each Gaussian to `seen`, on all threads of the pool; reads no color.
+/// Adds the visible contribution of each Gaussian in the view of `camera` to `seen`, on all threads of the pool. Reads
+/// no color.
 ///
-/// Only every `stride`-th pixel each way is looked at (those whose coordinates leave `stride / 2` when
-/// divided by it), with footprints at full resolution; the sums are over the looked-at pixels, so a
-/// stride of s gives about 1/s² of the full sums.
+/// Only every `stride`-th pixel in both directions is sampled (coordinates whose remainder modulo `stride` is `stride /
+/// 2`), with footprints at full resolution. The sums are over the sampled pixels, so a stride of s gives about 1/s² of
+/// the full sums.
 ///
 /// # Panics
-/// If `seen` is not of as many Gaussians, or the columns of `gaussians` differ in length.
+/// If `seen` has another number of Gaussians, or the attributes of `gaussians` have different lengths.
 pub fn contribution(gaussians: &Gaussians, camera: &Camera, stride: NonZeroU32, seen: &mut Contribution) {
     Renderer::on_all_threads().contribution(gaussians, camera, stride, seen);
 }
 
-/// Renders and keeps its buffers: one picture after the other.
+/// Renderer that keeps its buffers between views.
 ///
 /// Gives the same bits as [`render`] and [`contribution`].
 #[derive(Debug)]
 pub struct Renderer {
     pub(super) parallel: bool,
-    pub(super) blend: Blend,
+    pub(super) blend: BlendKernel,
     pub(super) splats: Splats,
     pub(super) bins: Bins,
     weights: Vec<Weight>,
-    pub(super) taken: ImageGradientSums,
-    /// Pairs of splats and tiles that lie ready at a time.
+    pub(super) gradient_sums: ImageGradientSums,
+    /// Maximum number of pairs of splats and tiles in memory.
     pub(super) strip_pairs: usize,
 }
 
@@ -93,50 +94,51 @@ impl Default for Renderer {
 }
 
 impl Renderer {
-    /// A renderer on the calling thread alone: for loops that run pictures in parallel.
+    /// Creates a renderer that uses only the calling thread, for loops that render views in parallel.
     pub fn new() -> Self {
-        Renderer::with(false)
+        Renderer::with_parallel(false)
     }
 
-    /// A renderer on all threads of the pool: for pictures that must follow one another.
+    /// Creates a renderer that uses all threads of the pool, for views that must be rendered one after another.
     pub fn on_all_threads() -> Self {
-        Renderer::with(true)
+        Renderer::with_parallel(true)
     }
 
-    fn with(parallel: bool) -> Self {
+    /// Creates a renderer that uses all threads of the pool if `parallel`.
+    fn with_parallel(parallel: bool) -> Self {
         Renderer {
             parallel,
-            blend: Blend::fastest(),
+            blend: BlendKernel::fastest(),
             splats: Splats::default(),
             bins: Bins::default(),
             weights: Vec::new(),
-            taken: ImageGradientSums::default(),
+            gradient_sums: ImageGradientSums::default(),
             strip_pairs: STRIP_PAIRS,
         }
     }
 
-    /// As the function [`render`].
+    /// Renders like the function [`render`].
     pub fn render(&mut self, gaussians: &Gaussians, camera: &Camera, background: [f32; 3]) -> Image {
         let view = CameraTerms::new(camera);
         self.prepare(gaussians, &view, true);
-        self.picture(&view, background)
+        self.render_prepared(&view, background)
     }
 
-    /// The picture of what is prepared.
-    pub(super) fn picture(&mut self, view: &CameraTerms, background: [f32; 3]) -> Image {
+    /// Blends the view that [`Renderer::prepare`] has projected.
+    pub(super) fn render_prepared(&mut self, view: &CameraTerms, background: [f32; 3]) -> Image {
         let [width, height] = view.size;
         let row_len = width as usize * 3;
         let mut data = vec![0.0; row_len * height as usize];
-        // Without pixels there are no rows, and chunks must not be empty.
+        // An image without pixels has no rows, and chunks must not be empty.
         let tile_row_len = (row_len * TILE as usize).max(1);
         while let Some(strip) = self.bins.next_strip(&self.splats, self.strip_pairs) {
             let (bins, splats, blend) = (&self.bins, &self.splats.splats, self.blend);
             let first = bins.rows(strip.clone()).next().map_or(0, |(y, _)| y);
-            let paint_row = |((y, tiles), rows): ((usize, Range<usize>), &mut [f32])| {
+            let render_row = |((y, tiles), rows): ((usize, Range<usize>), &mut [f32])| {
                 for x in tiles {
-                    let lattice = SampledPixels::new([x as u32, y as u32], view.size, 1);
-                    let pairs = bins.pairs_of(y, x..x + 1);
-                    let planes = paint(blend, splats, pairs, &lattice, background);
+                    let sampled = SampledPixels::new([x as u32, y as u32], view.size, 1);
+                    let pairs = bins.pairs_in_row(y, x..x + 1);
+                    let planes = blend_colors(blend, splats, pairs, &sampled, background);
                     for (v, row) in rows.chunks_exact_mut(row_len).enumerate() {
                         let start = x * TILE as usize;
                         let pixels = row[start * 3..].chunks_exact_mut(3).take(TILE as usize);
@@ -151,18 +153,18 @@ impl Renderer {
             };
             let rows = bins.rows(strip).zip(data[first * tile_row_len..].chunks_mut(tile_row_len));
             if self.parallel {
-                rows.collect::<Vec<_>>().into_par_iter().for_each(paint_row);
+                rows.collect::<Vec<_>>().into_par_iter().for_each(render_row);
             } else {
-                rows.for_each(paint_row);
+                rows.for_each(render_row);
             }
         }
         Image { width, height, data }
     }
 
-    /// As the function [`contribution`].
+    /// Adds contributions like the function [`contribution`].
     ///
     /// # Panics
-    /// If `seen` is not of as many Gaussians, or the columns of `gaussians` differ in length.
+    /// If `seen` has another number of Gaussians, or the attributes of `gaussians` have different lengths.
     pub fn contribution(
         &mut self,
         gaussians: &Gaussians,
@@ -170,14 +172,14 @@ impl Renderer {
         stride: NonZeroU32,
         seen: &mut Contribution,
     ) {
-        assert_eq!(seen.len(), gaussians.len(), "contribution of another model");
+        assert_eq!(seen.len(), gaussians.len(), "expected as many contributions as Gaussians");
         let view = CameraTerms::new(camera);
         self.prepare(gaussians, &view, false);
         while let Some(strip) = self.bins.next_strip(&self.splats, self.strip_pairs) {
             let (bins, splats, blend) = (&self.bins, &self.splats.splats, self.blend);
             fill_pairs(bins, strip.clone(), self.parallel, &mut self.weights, |tile, pairs, weights| {
-                let lattice = SampledPixels::new(tile, view.size, stride.get());
-                blend.tile(splats, pairs, &lattice, &mut Weights { pairs: weights });
+                let sampled = SampledPixels::new(tile, view.size, stride.get());
+                blend.tile(splats, pairs, &sampled, &mut WeightSink { pairs: weights });
             });
             for (&splat, weight) in bins.pairs(strip).iter().zip(&self.weights) {
                 if weight.max > 0.0 {
@@ -187,10 +189,10 @@ impl Renderer {
         }
     }
 
-    /// Adds what removing each Gaussian alone would change in `camera`'s picture to `errors`, on this thread.
+    /// Adds the removal error of each Gaussian in the view of `camera` to `errors`, on the calling thread.
     ///
     /// # Panics
-    /// If `errors` is not of as many Gaussians, or the columns of `gaussians` differ in length.
+    /// If `errors` has another number of Gaussians, or the attributes of `gaussians` have different lengths.
     pub fn removal_error(
         &mut self,
         gaussians: &Gaussians,
@@ -198,20 +200,20 @@ impl Renderer {
         background: [f32; 3],
         errors: &mut RemovalError,
     ) {
-        assert_eq!(errors.len(), gaussians.len(), "errors of another model");
+        assert_eq!(errors.len(), gaussians.len(), "expected as many removal errors as Gaussians");
         let view = CameraTerms::new(camera);
         self.prepare(gaussians, &view, true);
         let mut sums = Vec::new();
         while let Some(strip) = self.bins.next_strip(&self.splats, self.strip_pairs) {
             let (bins, splats) = (&self.bins, &self.splats.splats);
             for (y, x) in bins.rows(strip).flat_map(|(y, tiles)| tiles.map(move |x| (y, x))) {
-                let pairs = bins.pairs_of(y, x..x + 1);
-                let lattice = SampledPixels::new([x as u32, y as u32], view.size, 1);
-                let rest = paint(self.blend, splats, pairs, &lattice, background);
+                let pairs = bins.pairs_in_row(y, x..x + 1);
+                let sampled = SampledPixels::new([x as u32, y as u32], view.size, 1);
+                let behind = blend_colors(self.blend, splats, pairs, &sampled, background);
                 sums.clear();
                 sums.resize(pairs.len(), 0.0);
-                let mut ink = Removal { rest, contrast_floor: errors.contrast_floor, pairs: &mut sums };
-                self.blend.tile(splats, pairs, &lattice, &mut ink);
+                let mut sink = RemovalSink { behind, contrast_floor: errors.contrast_floor, pairs: &mut sums };
+                self.blend.tile(splats, pairs, &sampled, &mut sink);
                 for (&splat, &sum) in pairs.iter().zip(&sums) {
                     errors.add(splats[splat as usize].id as usize, sum);
                 }
@@ -219,7 +221,7 @@ impl Renderer {
         }
     }
 
-    /// Projects and sorts.
+    /// Projects the Gaussians and sorts their splats by depth. Computes colors if `colored`.
     pub(super) fn prepare(&mut self, gaussians: &Gaussians, view: &CameraTerms, colored: bool) {
         let count = gaussians.len();
         self.splats.clear();
@@ -240,29 +242,29 @@ impl Renderer {
     }
 }
 
-/// Makes `sums` one default value for every pair of `tiles` of the strip, and has `of_tile` change those of each tile, given its
-/// place and its pairs; tiles at once if `parallel`.
+/// Resets `sums` to one default value per pair of `tiles` of the strip, and calls `fill_tile` for each tile with its
+/// position, its pairs and their sums. Tiles run in parallel if `parallel`.
 pub(super) fn fill_pairs<T: Copy + Default + Send>(
     bins: &Bins,
     tiles: Range<usize>,
     parallel: bool,
     sums: &mut Vec<T>,
-    of_tile: impl Fn([u32; 2], &[u32], &mut [T]) + Sync,
+    fill_tile: impl Fn([u32; 2], &[u32], &mut [T]) + Sync,
 ) {
     sums.clear();
     sums.resize(bins.pairs(tiles.clone()).len(), T::default());
-    let mut rest = &mut sums[..];
+    let mut remaining = &mut sums[..];
     let mut rows = Vec::new();
     for (y, tiles) in bins.rows(tiles) {
-        let (row, after) = rest.split_at_mut(bins.pairs_of(y, tiles.clone()).len());
+        let (row, after) = remaining.split_at_mut(bins.pairs_in_row(y, tiles.clone()).len());
         rows.push((y, tiles, row));
-        rest = after;
+        remaining = after;
     }
     let fill_row = |(y, tiles, mut sums): (usize, Range<usize>, &mut [T])| {
         for x in tiles {
-            let pairs = bins.pairs_of(y, x..x + 1);
-            let (of_pairs, after) = sums.split_at_mut(pairs.len());
-            of_tile([x as u32, y as u32], pairs, of_pairs);
+            let pairs = bins.pairs_in_row(y, x..x + 1);
+            let (tile_sums, after) = sums.split_at_mut(pairs.len());
+            fill_tile([x as u32, y as u32], pairs, tile_sums);
             sums = after;
         }
     };
@@ -273,19 +275,19 @@ pub(super) fn fill_pairs<T: Copy + Default + Send>(
     }
 }
 
-/// The colors of one tile's sampled pixels.
-fn paint(
-    blend: Blend,
+/// Returns the colors of the sampled pixels of one tile.
+fn blend_colors(
+    blend: BlendKernel,
     splats: &[Splat],
     pairs: &[u32],
-    lattice: &SampledPixels,
+    sampled: &SampledPixels,
     background: [f32; 3],
 ) -> [TilePlane; 3] {
-    let mut color = Color { planes: [TilePlane::default(); 3] };
-    let left = blend.tile(splats, pairs, lattice, &mut color);
+    let mut color = ColorSink { planes: [TilePlane::default(); 3] };
+    let transmittance = blend.tile(splats, pairs, sampled, &mut color);
     for (plane, background) in color.planes.iter_mut().zip(background) {
-        for (pixel, left) in plane.as_flattened_mut().iter_mut().zip(left.as_flattened()) {
-            *pixel += left.abs() * background;
+        for (pixel, transmittance) in plane.as_flattened_mut().iter_mut().zip(transmittance.as_flattened()) {
+            *pixel += transmittance.abs() * background;
         }
     }
     color.planes
@@ -298,11 +300,11 @@ mod tests {
     use super::*;
     use splat_core::{Columns, Gradients};
 
-    /// 3000 Gaussians of all sizes, and a camera among them whose picture does not end at a tile's edge.
+    /// Returns 3000 Gaussians of all sizes, and a camera among them whose image does not end at a tile edge.
     fn scene() -> (Gaussians, Camera) {
         let mut scene = Gaussians::zeros(3000, 0);
         for i in 0..scene.len() {
-            // Low-discrepancy steps: every Gaussian elsewhere, of another size and opacity.
+            // Low-discrepancy steps give every Gaussian another position, size and opacity.
             let step = |k: f64| (i as f64 * k).fract() as f32;
             scene.position.set_row(i, [2.0 * step(0.618_034) - 1.0, 2.0 * step(0.754_878) - 1.0, 1.5 + step(0.569_84)]);
             scene.rotation.set_row(i, [1.0, step(0.819_173), step(0.671_044), step(0.549_701)]);
@@ -324,30 +326,30 @@ mod tests {
         (scene, camera)
     }
 
-    /// Everything a renderer can make of the scene.
-    fn made(mut renderer: Renderer) -> (Image, Contribution, RemovalError, Gradients) {
+    /// Returns all results that a renderer can compute for the scene.
+    fn all_results(mut renderer: Renderer) -> (Image, Contribution, RemovalError, Gradients) {
         let (scene, camera) = scene();
         let mut seen = Contribution::new(scene.len());
         renderer.contribution(&scene, &camera, NonZeroU32::MIN, &mut seen);
         let mut errors = RemovalError::new(scene.len(), 0.1);
         renderer.removal_error(&scene, &camera, [0.3; 3], &mut errors);
         let mut gradients = Gradients::new(scene.len(), Columns::all(), 0);
-        let loss = |picture: &Image| (0.0, picture.clone());
+        let loss = |image: &Image| (0.0, image.clone());
         renderer.gradient(&scene, &camera, [0.3; 3], loss, &mut gradients);
         (renderer.render(&scene, &camera, [0.3; 3]), seen, errors, gradients)
     }
 
     #[test]
-    fn every_instruction_set_gives_the_bits_of_the_portable_one() {
-        let portable = made(Renderer { blend: Blend::Portable, ..Renderer::new() });
-        for blend in Blend::all() {
-            assert!(made(Renderer { blend, ..Renderer::new() }) == portable, "{blend:?} differs");
+    fn instruction_sets_give_equal_bits() {
+        let portable = all_results(Renderer { blend: BlendKernel::Portable, ..Renderer::new() });
+        for blend in BlendKernel::all() {
+            assert!(all_results(Renderer { blend, ..Renderer::new() }) == portable, "{blend:?} differs");
         }
     }
 
     #[test]
-    fn pairs_of_as_few_tiles_at_a_time_as_one_give_the_same_bits() {
-        let whole = made(Renderer::new());
+    fn results_do_not_depend_on_the_strip_size() {
+        let whole = all_results(Renderer::new());
         let (scene, camera) = scene();
         let mut renderer = Renderer::new();
         renderer.prepare(&scene, &CameraTerms::new(&camera), true);
@@ -356,7 +358,10 @@ mod tests {
         assert_eq!(tiles, 0..7 * 5);
         for strip_pairs in [1, pairs / 20, pairs / 3, pairs] {
             for parallel in [false, true] {
-                assert!(made(Renderer { strip_pairs, ..Renderer::with(parallel) }) == whole, "{strip_pairs} at a time");
+                assert!(
+                    all_results(Renderer { strip_pairs, ..Renderer::with_parallel(parallel) }) == whole,
+                    "{strip_pairs} at a time"
+                );
             }
             renderer.bins.begin(&renderer.splats, [7, 5]);
             let mut at = 0;

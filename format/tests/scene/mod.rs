@@ -1,12 +1,12 @@
-//! A sequence held in memory as plain bits: what a container must give back.
+//! Test sequence held in memory as plain bits, to compare with what a container returns.
 
 use std::collections::BTreeMap;
 use std::path::Path;
 
 use gseq::{ColumnSpec, Compression, Layout, Reader, TileBuffer, TileFrames, TileId, Touched, Writer, encode_tile};
 
-/// A temporary folder, in memory where the system has one: thousands of files are synced in these tests,
-/// which costs milliseconds each on a disk.
+/// Creates a temporary folder, in memory if the system has one there: these tests sync thousands of files, which costs
+/// milliseconds each on a disk.
 pub(crate) fn folder() -> tempfile::TempDir {
     let memory = Path::new("/dev/shm");
     if memory.is_dir() { tempfile::tempdir_in(memory).unwrap() } else { tempfile::tempdir().unwrap() }
@@ -15,7 +15,7 @@ pub(crate) fn folder() -> tempfile::TempDir {
 pub(crate) struct Scene {
     pub(crate) layout: Layout,
     pub(crate) times: Vec<f64>,
-    /// Per column `[frame][component][gaussian]`.
+    /// Bits of each column, laid out as `[frame][component][gaussian]`.
     pub(crate) bits: Vec<Vec<u32>>,
 }
 
@@ -30,7 +30,8 @@ pub(crate) fn layout(gaussians: u64, gaussian_block: u32, frame_block: u32, widt
 }
 
 impl Scene {
-    /// Column 0 moves, column 1 is constant in time, the others hold any bits, NaN and −0 among them.
+    /// Builds a scene: column 0 moves, column 1 is constant in time, the others hold arbitrary bits, including NaN and
+    /// −0.
     pub(crate) fn new(layout: Layout, frames: usize, seed: u64) -> Scene {
         let mut state = seed;
         let mut random = move || {
@@ -90,7 +91,8 @@ impl Scene {
         (out, (frames.end - frames.start) as u32, width as u32, (gaussians.end - gaussians.start) as u32)
     }
 
-    /// This with a bound on every column but the last, and what comes back of that, written to `path`.
+    /// Sets a bound on every column but the last and writes the scene to `path`. Returns it together with the scene as
+    /// read back.
     #[allow(dead_code, reason = "not every test has bounds")]
     pub(crate) fn bounded(mut self, max_error: f64, path: &Path) -> (Scene, Scene) {
         let columns = self.layout.columns.len();
@@ -113,7 +115,8 @@ impl Scene {
         (self, back)
     }
 
-    /// Writes time stamps block by block, each followed by its tiles in the order that `shuffle` gives them.
+    /// Writes the time stamps block by block, each followed by its tiles in the order set by `shuffle`. Returns the
+    /// digest.
     pub(crate) fn write(&self, path: &Path, compression: Compression, shuffle: impl Fn(&mut Vec<TileId>)) -> u64 {
         let mut writer = Writer::create(path, self.layout.clone()).unwrap();
         self.fill(&mut writer, compression, shuffle);
@@ -145,7 +148,7 @@ impl Scene {
         }
     }
 
-    /// Compares the first `frames` frames through all ways of reading; an error of the reader is passed on.
+    /// Compares the first `frames` frames by every method of reading. Returns errors of the reader.
     pub(crate) fn compare(&self, reader: &Reader, frames: usize) -> gseq::Result<()> {
         assert_eq!(*reader.layout(), self.layout);
         assert_eq!(reader.times(), &self.times[..frames]);
@@ -162,10 +165,10 @@ impl Scene {
             for in_place in [true, false] {
                 let (mut one_by_one, mut touched) = (TileFrames::default(), Touched::default());
                 reader.load(id, &mut buffer, &mut one_by_one, in_place.then_some(&mut touched))?;
-                let (mut values, mut room) = (vec![0.0; (width * len) as usize], Vec::new());
+                let (mut values, mut frame_buffer) = (vec![0.0; (width * len) as usize], Vec::new());
                 for (frame, bits) in bits.chunks_exact(values.len()).enumerate() {
                     reader.read_frame(&mut one_by_one, frame, &mut values)?;
-                    let lent = reader.frame(&mut one_by_one, frame, &mut room)?;
+                    let lent = reader.frame(&mut one_by_one, frame, &mut frame_buffer)?;
                     for values in [&values, lent] {
                         let same = values.iter().map(|v| v.to_bits()).eq(bits.iter().copied());
                         assert!(same, "{id:?}, frame {frame}, in place {in_place}: wrong data");

@@ -1,4 +1,4 @@
-//! How close what is left comes to the whole, on pictures that nothing was ranked or fitted by.
+//! Quality of a selection of Gaussians against the whole model, on views that were not used for ranking or fitting.
 
 use rayon::prelude::*;
 
@@ -11,65 +11,68 @@ use crate::scene::Scene;
 use crate::scene::pictures::{PictureSet, pictures};
 use crate::source::Ids;
 
-/// Pictures to judge by at most.
+/// Maximum number of views to judge by.
 const PICTURES: usize = 24;
 
-/// Pictures of the whole.
+/// Renders of the whole model to compare with.
 ///
-/// Memory: 12 bytes for every pixel of at most 24 pictures.
+/// Memory: 12 bytes for every pixel of at most 24 views.
 pub(super) struct Judge {
     pictures: Vec<Picture>,
     originals: Vec<Image>,
 }
 
-/// How close something comes.
+/// Quality of a result against the whole model.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct JudgedQuality {
-    /// Root mean square error over all pixels, channels and pictures, of colors from 0 to 1.
+    /// Root mean square error over all pixels, channels and views, of colors from 0 to 1.
     pub(super) error: f64,
-    /// Mean PSNR, dB.
+    /// Mean PSNR in dB.
     pub(super) psnr: f64,
 }
 
 impl Judge {
-    /// The held-out pictures of `scene`, or some of them, evenly; where none are held out, of all.
+    /// Renders the held-out views of `scene`, or an even selection of them; if no views are held out, a selection of
+    /// all views.
     ///
     /// # Errors
-    /// Cameras without pictures; frames that cannot be read.
+    /// Fails if the cameras have no views or if a frame cannot be read.
     pub(super) fn new(scene: &Scene) -> Result<Judge> {
         let all = pictures(&scene.rig, &scene.source().info().times, PictureSet::HeldOut)?;
         let count = all.len().min(PICTURES);
         let pictures: Vec<Picture> = (0..count).map(|k| all[(2 * k + 1) * all.len() / (2 * count)]).collect();
         let mut originals = Vec::with_capacity(count);
-        made(scene, Subject::all(scene.source()), &pictures, |image| originals.push(image))?;
+        render_views(scene, Subject::all(scene.source()), &pictures, |image| originals.push(image))?;
         Ok(Judge { pictures, originals })
     }
 
-    /// Bytes that it holds of pictures of `pixels` pixels.
+    /// Returns the memory for views of `pixels` pixels, in bytes.
     pub(super) fn bytes(pixels: u64) -> u64 {
         12 * pixels * PICTURES as u64
     }
 
-    /// How many pictures there are.
+    /// Returns the number of views.
     pub(super) fn pictures(&self) -> usize {
         self.pictures.len()
     }
 
-    /// How close the Gaussians `kept` of `scene` come.
+    /// Returns the quality of the Gaussians `kept` of `scene`.
     ///
     /// # Errors
-    /// Frames that cannot be read.
-    pub(super) fn closeness(&self, scene: &Scene, kept: &[u32]) -> Result<JudgedQuality> {
+    /// Fails if a frame cannot be read.
+    pub(super) fn quality(&self, scene: &Scene, kept: &[u32]) -> Result<JudgedQuality> {
         let subject = Subject { source: scene.source(), ids: Some(Ids::List(kept)), columns: Columns::all() };
         let mut originals = self.originals.iter();
         let mut found = Vec::with_capacity(self.originals.len());
-        made(scene, subject, &self.pictures, |image| found.extend(originals.next().map(|of| psnr(&image, of))))?;
+        render_views(scene, subject, &self.pictures, |image| {
+            found.extend(originals.next().map(|of| psnr(&image, of)))
+        })?;
         Ok(JudgedQuality::from_psnr(&found))
     }
 }
 
 impl JudgedQuality {
-    /// Of the PSNR of pictures of one size.
+    /// Computes the quality from the PSNR of views of one size.
     pub(super) fn from_psnr(psnr: &[f64]) -> JudgedQuality {
         let count = psnr.len().max(1) as f64;
         let mean_square = psnr.iter().map(|psnr| 10f64.powf(-psnr / 10.0)).sum::<f64>() / count;
@@ -77,8 +80,8 @@ impl JudgedQuality {
     }
 }
 
-/// Renders `pictures` of `subject` and hands them on in order.
-fn made(scene: &Scene, subject: Subject<'_>, pictures: &[Picture], mut take: impl FnMut(Image)) -> Result<()> {
+/// Renders `pictures` of `subject` and passes the images to `take` in order.
+fn render_views(scene: &Scene, subject: Subject<'_>, pictures: &[Picture], mut take: impl FnMut(Image)) -> Result<()> {
     let cameras: &[Camera] = &scene.schedule.cameras;
     show([subject], cameras, pictures, Batch::of_frame(&scene.limits), |views| {
         let images: Vec<Image> =
@@ -93,8 +96,8 @@ mod tests {
     use super::*;
 
     #[test]
-    fn errors_of_pictures_add_up_in_squares_and_decibels_are_their_mean() {
-        // A tenth and a hundredth of the range.
+    fn squared_errors_and_decibels_are_averaged() {
+        // Errors of a tenth and a hundredth of the range.
         let JudgedQuality { error, psnr } = JudgedQuality::from_psnr(&[20.0, 40.0]);
         assert!((error - (0.5f64 * (0.01 + 0.0001)).sqrt()).abs() < 1e-15, "{error}");
         assert_eq!((psnr, JudgedQuality::from_psnr(&[f64::INFINITY]).error), (30.0, 0.0));

@@ -1,12 +1,12 @@
-//! Work-precision diagrams: what every knob of a run costs in time and memory, and what error it leaves, on a given model.
+//! Work-precision diagrams: time, memory and error of a run for several values of each parameter, on a given model.
 //!
-//! Errors of three sources are kept apart. *Discretization*: pictures, pixels, frames, rounds and buckets are samples; the
-//! error of each is measured against the finest of its kind, at an equal number of kept Gaussians. *Rounding*: sums in f32
-//! and in f64 against longer ones; threads and memory, which must change nothing. *Model*: fewer Gaussians stand for more,
-//! merged or refined.
+//! Errors have three sources, which are measured separately. *Discretization*: views, pixels, frames, rounds and
+//! buckets are samples; the error of each setting is measured against the finest one of its kind, at an equal number of
+//! kept Gaussians. *Rounding*: sums in f32 and in f64 are compared with more accurate ones; threads and memory must
+//! change nothing. *Model*: fewer Gaussians replace more, merged or refined.
 //!
-//! Memory: that of `compress`, and beside it the scene, [`HELD`] bytes a Gaussian, and 12 bytes for every pixel of the pictures
-//! that results are judged by; a budget for whole runs is what that leaves of it.
+//! Memory: that of `compress`, and in addition the scene, [`HELD_BYTES`] bytes per Gaussian, and 12 bytes for every
+//! pixel of the views that results are judged by. Whole runs get the rest of the memory limit.
 
 mod judge;
 mod ranking;
@@ -16,7 +16,7 @@ mod sums;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use super::whole_run::{result_name, trained};
+use super::whole_run::{result_name, with_training_views};
 use crate::TOOL;
 use crate::error::{Error, Result, ShowPath};
 use crate::evaluation::cost::Repeats;
@@ -40,27 +40,27 @@ use crate::statistics::score::Scores;
 use crate::statistics::score::sketch::MOST_BITS;
 use judge::Judge;
 
-/// Something to turn.
+/// Group of settings that is varied, called a knob.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Turned {
-    /// The first look: pictures, and strides of pixels, views and frames.
+    /// First pass over the views: number of views, and strides of pixels, views and frames.
     Look,
-    /// Rounds: pictures of each, and the part that each leaves.
+    /// Pruning rounds: views per round, and the fraction that a round leaves.
     Rounds,
-    /// Percentiles: bits of one look.
+    /// Percentiles: bits of a sketch made in one pass.
     Percentiles,
     /// Running sums: f32, compensated, f64.
     Sums,
     /// Merging: radius and passes.
     Merging,
-    /// Refining: steps and pictures.
+    /// Refinement: steps and target views.
     Refining,
     /// Threads and memory.
     Machine,
 }
 
 impl Turned {
-    /// Every one, in the order of the pipeline.
+    /// Knobs in the order of the pipeline.
     pub const ALL: [Turned; 7] = [
         Turned::Look,
         Turned::Rounds,
@@ -71,7 +71,7 @@ impl Turned {
         Turned::Machine,
     ];
 
-    /// As the command line and the results name it.
+    /// Returns the name on the command line and in the results.
     pub fn name(self) -> &'static str {
         match self {
             Turned::Look => "look",
@@ -84,85 +84,87 @@ impl Turned {
         }
     }
 
-    /// Why there may be nothing to turn.
+    /// Returns the reason why the scene or the recipe may have no settings for this knob.
     fn needs(self) -> &'static str {
         match self {
             Turned::Sums => "sums over frames need three frames",
             Turned::Refining => "the recipe refines nothing",
-            _ => "the recipe looks at no pictures",
+            _ => "the recipe ranks by no views",
         }
     }
 
-    /// Whether every one of its settings is a run from beginning to end.
-    fn is_of_whole_runs(self) -> bool {
+    /// Returns whether each setting of the knob is a whole run.
+    fn needs_whole_runs(self) -> bool {
         matches!(self, Turned::Merging | Turned::Refining | Turned::Machine)
     }
 }
 
-/// What to turn, and on what.
+/// Options of a work-precision diagram.
 #[derive(Debug, Clone)]
 pub struct PrecisionOptions {
-    /// What to read, and the cameras; of its split nothing is used.
+    /// Input and cameras; its split is ignored.
     pub input: InputOptions,
-    /// What every knob starts from.
+    /// Recipe from which every setting starts.
     pub recipe: Recipe,
-    /// What to turn; none: everything, but whole runs only of models that are not too long.
+    /// Knobs to vary; `None`: all, but knobs with whole runs only if the model is short enough.
     pub knobs: Option<Vec<Turned>>,
-    /// How many Gaussians every setting keeps.
+    /// Number of Gaussians that every setting keeps.
     pub target: Target,
-    /// Look at pictures of at most this many frames, evenly from first to last.
+    /// Maximum number of frames whose views are used for ranking, evenly from first to last.
     pub max_frames: usize,
-    /// Times to run every setting at most, at least 1: the median time counts.
+    /// Maximum number of runs of every setting, at least 1; the median time is reported.
     pub runs: usize,
     /// Folder for `precision.json`, `precision.csv` and the page.
     pub output: PathBuf,
-    /// Replace an earlier folder.
+    /// Policy if the folder exists.
     pub overwrite: Replace,
 }
 
-/// Seconds after which a setting is not run again.
-const ENOUGH: f64 = 10.0;
+/// Total seconds of a setting's runs after which it is not run again.
+const MAX_SETTING_SECONDS: f64 = 10.0;
 
-/// Gaussians times frames up to which whole runs are part of everything.
-const SHORT: u64 = 10_000_000;
+/// Maximum number of Gaussians times frames of a model for which whole runs are included by default.
+const MAX_STATES_OF_WHOLE_RUNS: u64 = 10_000_000;
 
-/// Bytes of a sketch of the most bits.
-const COUNTS: u64 = 4 << (9 + MOST_BITS);
+/// Size of a sketch with the most bits, in bytes.
+const SKETCH_BYTES: u64 = 4 << (9 + MOST_BITS);
 
-/// Bytes per Gaussian that are held between settings: statistics twice, two looks and two scores, and sets that were kept.
-const HELD: u64 =
+/// Bytes per Gaussian held between settings: statistics twice, two contributions and two scores, and sets of kept
+/// Gaussians.
+const HELD_BYTES: u64 =
     (2 * Rows::BYTES_PER_GAUSSIAN + 2 * 16 + 2 * Scores::BYTES_PER_GAUSSIAN + 12 * size_of::<u32>()) as u64;
 
-/// What all knobs are turned on.
+/// Data shared by all settings.
 struct Bench<'a> {
-    /// As the training cameras see it, at some of its frames.
+    /// Scene with the training cameras, at a selection of its frames.
     scene: &'a Scene,
     input: &'a InputOptions,
-    /// Of all pictures.
+    /// Workload with all views.
     work: Workload,
     recipe: &'a Recipe,
     scanned: Scanned,
     judge: Judge,
-    /// Gaussians that every setting keeps.
+    /// Number of Gaussians that every setting keeps.
     kept: usize,
     repeats: Repeats,
-    /// Folder for results of whole runs, and their name.
+    /// Path of the folder for results of whole runs; `name` is the name of a result in it.
     scratch: &'a Path,
     name: &'a str,
     progress: Progress,
 }
 
 impl Bench<'_> {
-    /// Another setting is done.
+    /// Reports that another setting is done.
     fn advance(&self) {
         self.progress.advance(1);
     }
 }
 
-/// Turns knobs of a run on a model and writes what it finds.
+/// Runs all settings of the knobs on a model and writes the results.
 ///
 /// # Errors
-/// Whatever is wrong with input, cameras, recipe, options or output. Nothing is left behind then.
+/// Fails if the input, the cameras, the recipe, the options or the output are invalid, or if a run fails. No files
+/// remain then.
 pub fn precision(options: &PrecisionOptions) -> Result<PrecisionDiagram> {
     if options.input.is_stream() {
         return Err(Error::usage("precision reads its input many times: pack the stream first, then give the .gseq"));
@@ -173,14 +175,8 @@ pub fn precision(options: &PrecisionOptions) -> Result<PrecisionDiagram> {
     check_target(&options.output, Kind::Folder, &inputs, options.overwrite)?;
     let staged = StagedFolder::new(&options.output, options.overwrite)?;
 
-    let input = trained(&options.input);
-    let mut scene = open_scene(&input)?;
-    if !scene.has_cameras {
-        return Err(Error::usage(format!(
-            "{}: precision looks at pictures, and no cameras were found\n  give --cameras",
-            scene.path.shown()
-        )));
-    }
+    let input = with_training_views(&options.input);
+    let mut scene = open_with_cameras(&input)?;
     let info = scene.source().info();
     let (gaussians, frames) = (info.count, info.times.len());
     let kept = options.target.count(gaussians)?;
@@ -193,38 +189,30 @@ pub fn precision(options: &PrecisionOptions) -> Result<PrecisionDiagram> {
     scene.keep_to(input.memory, |work, limits| {
         let mut needs = plan.estimates(work, limits);
         for need in &mut needs {
-            need.per_gaussian.push(("settings", HELD));
-            need.fixed.extend([("judged", Judge::bytes(work.pixels)), ("counts", COUNTS)]);
+            need.per_gaussian.push(("settings", HELD_BYTES));
+            need.fixed.extend([("judged", Judge::bytes(work.pixels)), ("counts", SKETCH_BYTES)]);
             need.fixed.push(("thinned", thinned_bytes(work, options.max_frames)));
         }
         needs
     })?;
     let work = scene.workload();
-    let beside = work.count() as u64 * (HELD + work.input.per_gaussian) + work.input.fixed + Judge::bytes(work.pixels);
-    let left = input.memory.bytes.map(|bytes| bytes.saturating_sub(beside));
-    let memory = Budget { bytes: left, tell: Verbosity::Nothing };
+    let reserved =
+        work.count() as u64 * (HELD_BYTES + work.input.per_gaussian) + work.input.fixed + Judge::bytes(work.pixels);
+    let remaining = input.memory.bytes.map(|bytes| bytes.saturating_sub(reserved));
+    let memory = Budget { bytes: remaining, tell: Verbosity::Nothing };
     let input = InputOptions { memory, events: Events::IGNORED, ..input };
     let mut notes = scene.notes.clone();
-    scene.schedule = thin(std::mem::take(&mut scene.schedule), options.max_frames);
+    scene.schedule = thin_frames(std::mem::take(&mut scene.schedule), options.max_frames);
     let looked_at = scene.schedule.iter().filter(|views| !views.is_empty()).count();
     if scene.rig.held_out().is_none() {
-        notes.push("no pictures are held out: those judged by are also looked at".to_owned());
+        notes.push("no views are held out: results are judged by views that are also used for ranking".to_owned());
     }
-    let mut knobs = Turned::ALL.to_vec();
-    knobs.retain(|knob| options.knobs.as_ref().is_none_or(|asked| asked.contains(knob)));
-    let is_long = gaussians as u64 * frames as u64 > SHORT;
-    let (left_out, turned): (Vec<Turned>, Vec<Turned>) =
-        knobs.into_iter().partition(|knob| options.knobs.is_none() && is_long && knob.is_of_whole_runs());
-    if !left_out.is_empty() {
-        let names: Vec<&str> = left_out.iter().map(|knob| knob.name()).collect();
-        let names = names.join(",");
-        notes.push(format!("{names}: left out for {gaussians} Gaussians x {frames} frames (--knobs {names})"));
-    }
+    let chosen = chosen_knobs(options, gaussians, frames, &mut notes);
 
     let measure = Measure::new(&options.recipe, true, UserOverrides::default());
     let scanned = measure.scan(&scene, &mut Journal::default())?;
     let judge = Judge::new(&scene)?;
-    // Hundreds of stages would hide which setting it is at.
+    // Progress of hundreds of stages would hide the current setting.
     scene.events = Events::IGNORED;
     let bench = Bench {
         scanned,
@@ -234,7 +222,7 @@ pub fn precision(options: &PrecisionOptions) -> Result<PrecisionDiagram> {
         work,
         recipe: &options.recipe,
         kept,
-        repeats: Repeats { most: options.runs, enough: ENOUGH },
+        repeats: Repeats { most: options.runs, enough: MAX_SETTING_SECONDS },
         scratch: &staged.path().join("run"),
         name,
         progress: options.input.events.counting_task("precision", "settings"),
@@ -252,32 +240,68 @@ pub fn precision(options: &PrecisionOptions) -> Result<PrecisionDiagram> {
         kept,
         threads: rayon::current_num_threads(),
         runs: options.runs.max(1),
-        enough: ENOUGH,
+        enough: MAX_SETTING_SECONDS,
         knobs: Vec::new(),
         notes,
     };
-    for knob in turned {
-        match bench.turn(knob)? {
+    for knob in chosen {
+        match bench.measure_knob(knob)? {
             Some(knob) => found.knobs.push(knob),
-            None => found.notes.push(format!("{}: left out, as {}", knob.name(), knob.needs())),
+            None => found.notes.push(format!("{}: not run, because {}", knob.name(), knob.needs())),
         }
     }
-    let write = |name: &str, text: String| {
-        let path = staged.path().join(name);
-        fs::write(&path, text).map_err(Error::io("write", &path))
-    };
-    write("precision.csv", found.csv())?;
-    write("precision.json", found.json())?;
-    write(PAGE, page(&found))?;
-    // By this a later run knows the folder as one that it may replace.
-    write(MARKER, format!("{:#}\n", serde_json::json!({ "tool": found.tool })))?;
+    write_files(&found, staged.path())?;
     staged.commit()?;
     Ok(found)
 }
 
+/// Opens the input.
+///
+/// # Errors
+/// Fails if the input cannot be opened or has no cameras.
+fn open_with_cameras(input: &InputOptions) -> Result<Scene> {
+    let scene = open_scene(input)?;
+    if !scene.has_cameras {
+        return Err(Error::usage(format!(
+            "{}: precision renders views, and no cameras were found\n  give --cameras",
+            scene.path.shown()
+        )));
+    }
+    Ok(scene)
+}
+
+/// Returns the requested knobs; by default all, but for a long model without those that need whole runs, which is added
+/// to `notes`.
+fn chosen_knobs(options: &PrecisionOptions, gaussians: usize, frames: usize, notes: &mut Vec<String>) -> Vec<Turned> {
+    let mut knobs = Turned::ALL.to_vec();
+    knobs.retain(|knob| options.knobs.as_ref().is_none_or(|asked| asked.contains(knob)));
+    let is_long = gaussians as u64 * frames as u64 > MAX_STATES_OF_WHOLE_RUNS;
+    let (left_out, chosen): (Vec<Turned>, Vec<Turned>) =
+        knobs.into_iter().partition(|knob| options.knobs.is_none() && is_long && knob.needs_whole_runs());
+    if !left_out.is_empty() {
+        let names: Vec<&str> = left_out.iter().map(|knob| knob.name()).collect();
+        let names = names.join(",");
+        notes.push(format!("{names}: not run for {gaussians} Gaussians x {frames} frames (--knobs {names} runs them)"));
+    }
+    chosen
+}
+
+/// Writes the tables and the page of `found` to `folder`.
+fn write_files(found: &PrecisionDiagram, folder: &Path) -> Result<()> {
+    let write = |name: &str, text: String| {
+        let path = folder.join(name);
+        fs::write(&path, text).map_err(Error::io("write", &path))
+    };
+    write("precision.csv", found.csv())?;
+    write("precision.json", found.json())?;
+    write(PAGE, page(found))?;
+    // With this file a later run recognizes the folder as one that it may replace.
+    write(MARKER, format!("{:#}\n", serde_json::json!({ "tool": found.tool })))
+}
+
 impl Bench<'_> {
-    /// All settings of a knob; none where the scene has nothing to turn it on.
-    fn turn(&self, knob: Turned) -> Result<Option<PrecisionKnob>> {
+    /// Runs all settings of a knob; `None` if the scene or the recipe has none.
+    fn measure_knob(&self, knob: Turned) -> Result<Option<PrecisionKnob>> {
         match knob {
             Turned::Look => self.look(),
             Turned::Rounds => self.rounds(),
@@ -290,8 +314,9 @@ impl Bench<'_> {
     }
 }
 
-/// The same with the pictures of at most `most` (at least one) of the frames that have some, evenly from first to last.
-fn thin(mut schedule: Schedule, most: usize) -> Schedule {
+/// Returns the schedule with the views of at most `most` (at least one) of the frames that have views, evenly from
+/// first to last.
+fn thin_frames(mut schedule: Schedule, most: usize) -> Schedule {
     let seen = schedule.iter().filter(|views| !views.is_empty()).count();
     let most = most.max(1);
     if seen <= most {
@@ -308,7 +333,8 @@ fn thin(mut schedule: Schedule, most: usize) -> Schedule {
     thinned
 }
 
-/// Bytes of what [`thin`] makes: of every frame it keeps one run, and of those up to the next another.
+/// Returns the bytes of the schedule made by [`thin_frames`]: one run for each frame kept, and one for the frames up to
+/// the next.
 fn thinned_bytes(work: &Workload, most: usize) -> u64 {
     let most = most.max(1) as u64;
     if work.frames <= most { 0 } else { Schedule::bytes(2 * most, work.views) }
@@ -321,23 +347,23 @@ mod tests {
     use crate::models::MemoryProfile;
 
     #[test]
-    fn thinned_schedules_keep_frames_evenly_and_all_of_their_pictures() {
-        let of = |frames: usize, most: usize| -> Vec<usize> {
+    fn thinning_keeps_even_frames_with_all_views() {
+        let frames_kept = |frames: usize, most: usize| -> Vec<usize> {
             let mut schedule = Schedule::default();
             for frame in 0..frames {
                 schedule.push(1, if frame % 2 == 0 { &[(0, 0), (1, 1)] } else { &[] });
             }
-            let thinned = thin(schedule, most);
+            let thinned = thin_frames(schedule, most);
             assert_eq!(thinned.frames(), frames);
             assert!(thinned.iter().all(|views| views.is_empty() || views.len() == 2));
             thinned.iter().enumerate().filter(|(_, views)| !views.is_empty()).map(|(frame, _)| frame).collect()
         };
-        assert_eq!(of(12, 3), [2, 6, 10]);
-        assert_eq!((of(5, 100), of(5, 0), of(0, 5)), (vec![0, 2, 4], vec![2], vec![]));
+        assert_eq!(frames_kept(12, 3), [2, 6, 10]);
+        assert_eq!((frames_kept(5, 100), frames_kept(5, 0), frames_kept(0, 5)), (vec![0, 2, 4], vec![2], vec![]));
     }
 
     #[test]
-    fn what_thinning_makes_is_counted_and_what_stays_as_it_is_takes_nothing() {
+    fn thinned_schedules_are_counted_in_memory() {
         let info = SequenceInfo { count: 1, times: vec![0.0; 1000], sh_degree: 0, varying: Columns::empty() };
         let work = Workload { views: 3, ..Workload::new(&info, MemoryProfile::of_tiles(1)) };
         assert_eq!((thinned_bytes(&work, 1000), thinned_bytes(&work, 5000)), (0, 0));

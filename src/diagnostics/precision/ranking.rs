@@ -1,4 +1,4 @@
-//! What ranking is made of: the pictures of the first look, the rounds, the percentiles of the scores.
+//! Settings of ranking: the views of the first pass, the pruning rounds, the percentiles of the scores.
 
 use std::collections::BTreeMap;
 use std::num::NonZeroU32;
@@ -21,18 +21,18 @@ use crate::recipe::{self, Recipe};
 use crate::statistics::score::sketch::MOST_BITS;
 use crate::statistics::score::{Graded, PercentilePasses, Scores, score_by};
 
-/// Pictures of a look or a round: numbers that are tried, as far as there are so many.
+/// Numbers of views of the first pass or a round that are tried, up to the number of existing views.
 const PICTURES_TRIED: [usize; 9] = [6, 12, 25, 50, 100, 200, 400, 800, 1600];
-/// Pictures of a round: the most that are tried.
+/// Maximum number of views of a round that is tried.
 const MOST_IN_ROUNDS: usize = 400;
 /// Strides that are tried.
 const STRIDES: [u32; 4] = [16, 8, 4, 2];
-/// Parts that a round leaves.
+/// Fractions left by a round that are tried.
 const FRACTIONS: [f64; 7] = [0.3, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95];
-/// Mantissa bits of a sketch.
+/// Numbers of mantissa bits of a sketch that are tried.
 const BITS: [u32; 8] = [1, 2, 3, 5, 7, 9, 11, MOST_BITS];
 
-/// A ranking, and what it took.
+/// A ranking, its errors and its cost.
 struct TriedRanking {
     value: f64,
     step: f64,
@@ -42,7 +42,7 @@ struct TriedRanking {
     kept: Vec<u32>,
 }
 
-/// A way to look: a recipe, and where on a curve it stands.
+/// A recipe to be tried, and its position on a curve.
 struct RankingVariant {
     value: f64,
     step: f64,
@@ -50,10 +50,11 @@ struct RankingVariant {
 }
 
 impl Bench<'_> {
-    /// The first look: how many pictures, and every how many-th pixel, view and frame. None where nothing is looked at.
+    /// Varies the first pass over the views: the number of views, and the strides of pixels, views and frames. Returns
+    /// `None` if the recipe has no such pass.
     pub(super) fn look(&self) -> Result<Option<PrecisionKnob>> {
         let all = self.scene.schedule.pairs();
-        let way = |value: f64, step: f64, change: &dyn Fn(&mut recipe::ScanParams)| {
+        let variant = |value: f64, step: f64, change: &dyn Fn(&mut recipe::ScanParams)| {
             let mut recipe = self.recipe.clone();
             let one = NonZeroU32::MIN;
             let scan = &mut recipe.scan;
@@ -61,97 +62,101 @@ impl Bench<'_> {
             change(scan);
             RankingVariant { value, step, recipe }
         };
-        let (finest, cost) = self.seen_at_cost(&way(1.0, 1.0, &|_| ()).recipe)?;
+        let (finest, cost) = self.contributions_with_cost(&variant(1.0, 1.0, &|_| ()).recipe)?;
         let Some(finest) = finest else { return Ok(None) };
         let own = Some(self.recipe.scan.look_pictures).filter(|&own| own > 0 && own < all).unwrap_or(all);
         let counts = tried(PICTURES_TRIED.into_iter().chain([own]).filter(|&count| count < all));
         let counts =
-            counts.into_iter().map(|n| way(n as f64, 1.0 / n as f64, &|scan| scan.look_pictures = n)).collect();
+            counts.into_iter().map(|n| variant(n as f64, 1.0 / n as f64, &|scan| scan.look_pictures = n)).collect();
         let last = (all as f64, 1.0 / all.max(1) as f64);
-        let mut curves = vec![self.looks("look_pictures", counts, (last, &finest, &cost), Some(own as f64))?];
-        let seen = self.scene.schedule.iter().filter(|views| !views.is_empty()).count();
+        let mut curves = vec![self.pass_curve("look_pictures", counts, (last, &finest, &cost), Some(own as f64))?];
+        let frames_with_views = self.scene.schedule.iter().filter(|views| !views.is_empty()).count();
         let views = self.scene.schedule.most_views();
-        type Set = fn(&mut recipe::ScanParams, NonZeroU32);
-        let strides: [(&str, usize, Set); 3] = [
+        type SetStride = fn(&mut recipe::ScanParams, NonZeroU32);
+        let strides: [(&str, usize, SetStride); 3] = [
             ("pixel_stride", usize::MAX, |scan, stride| scan.pixel_stride = stride),
             ("view_stride", views, |scan, stride| scan.view_stride = stride),
-            ("frame_stride", seen, |scan, stride| scan.frame_stride = stride),
+            ("frame_stride", frames_with_views, |scan, stride| scan.frame_stride = stride),
         ];
         for (name, most, set) in strides {
             let strides =
                 STRIDES.into_iter().filter_map(NonZeroU32::new).filter(|stride| stride.get() as usize <= most);
             let value = |stride: NonZeroU32| f64::from(stride.get());
-            let ways = strides.map(|n| way(value(n), value(n), &|scan| set(scan, n))).collect();
-            curves.push(self.looks(name, ways, ((1.0, 1.0), &finest, &cost), None)?);
+            let variants = strides.map(|n| variant(value(n), value(n), &|scan| set(scan, n))).collect();
+            curves.push(self.pass_curve(name, variants, ((1.0, 1.0), &finest, &cost), None)?);
         }
         Ok(Some(PrecisionKnob {
             name: "look".to_owned(),
-            about: "The first look: contributions C and W of every Gaussian from some of the pictures, and which Gaussians \
-                    the scores of these keep, before any round."
-                .to_owned(),
+            about:
+                "The first pass over the views: contributions C and W of every Gaussian from some of the views, and \
+                    which Gaussians the scores based on these keep, before any pruning round."
+                    .to_owned(),
             source: Source::Discretisation,
             curves,
         }))
     }
 
-    /// What the look of `recipe` sees, if it looks.
-    fn seen(&self, recipe: &Recipe) -> Result<Option<VisibleContribution>> {
+    /// Returns the contributions that the first pass with `recipe` measures; `None` if the recipe has no such pass.
+    fn contributions(&self, recipe: &Recipe) -> Result<Option<VisibleContribution>> {
         let measure = Measure::new(recipe, self.scene.has_cameras, UserOverrides::default());
         let look = |visible: &Visible| visible.run(self.scene, &self.scanned.rows.life, &mut Journal::default());
         measure.visible.as_ref().map(look).transpose()
     }
 
-    /// The same, and what that takes.
-    fn seen_at_cost(&self, recipe: &Recipe) -> Result<(Option<VisibleContribution>, Cost)> {
-        self.repeats.measure(|| self.seen(recipe), || Ok(()))
+    /// Returns the result of `contributions` and its cost.
+    fn contributions_with_cost(&self, recipe: &Recipe) -> Result<(Option<VisibleContribution>, Cost)> {
+        self.repeats.measure(|| self.contributions(recipe), || Ok(()))
     }
 
-    /// A curve of looks, at the end of which stands the `finest` one.
-    fn looks(
+    /// Measures a curve of first passes that ends at the `finest` one.
+    fn pass_curve(
         &self,
         name: &str,
-        ways: Vec<RankingVariant>,
+        variants: Vec<RankingVariant>,
         ((value, step), finest, cost): ((f64, f64), &VisibleContribution, &Cost),
         own: Option<f64>,
     ) -> Result<PrecisionCurve> {
         let best = self.scored(Some(finest.clone()))?;
-        let of = |value: f64, step: f64, seen: VisibleContribution, cost: Cost| -> Result<TriedRanking> {
-            let l2 = |of: fn(&VisibleContribution) -> &Vec<f64>| {
-                relative_l2(of(&seen).iter().copied(), of(finest).iter().copied())
+        let measured =
+            |value: f64, step: f64, contributions: VisibleContribution, cost: Cost| -> Result<TriedRanking> {
+                let l2 = |field: fn(&VisibleContribution) -> &Vec<f64>| {
+                    relative_l2(field(&contributions).iter().copied(), field(finest).iter().copied())
+                };
+                let [c, w] = [l2(|contributions| &contributions.coverage), l2(|contributions| &contributions.peak)];
+                let scored = self.scored(Some(contributions))?;
+                let staying = relative_error(scored.selection.counts.kept, best.selection.counts.kept);
+                let errors =
+                    [("C", c), ("W", w), (STAYING, staying)].map(|(name, error)| (name.to_owned(), error)).into();
+                Ok(TriedRanking { value, step, cost, errors, kept: scored.ranked().take(self.kept) })
             };
-            let [c, w] = [l2(|seen| &seen.coverage), l2(|seen| &seen.peak)];
-            let scored = self.scored(Some(seen))?;
-            let staying = off(scored.selection.counts.kept, best.selection.counts.kept);
-            let errors = [("C", c), ("W", w), (STAYING, staying)].map(|(of, error)| (of.to_owned(), error)).into();
-            Ok(TriedRanking { value, step, cost, errors, kept: scored.ranked().take(self.kept) })
-        };
-        let mut tried = Vec::with_capacity(ways.len() + 1);
-        for RankingVariant { value, step, recipe } in ways {
-            if let (Some(seen), cost) = self.seen_at_cost(&recipe)? {
-                tried.push(of(value, step, seen, cost)?);
+        let mut tried = Vec::with_capacity(variants.len() + 1);
+        for RankingVariant { value, step, recipe } in variants {
+            if let (Some(contributions), cost) = self.contributions_with_cost(&recipe)? {
+                tried.push(measured(value, step, contributions, cost)?);
             }
         }
-        tried.push(of(value, step, finest.clone(), cost.clone())?);
-        self.curve(name, "all pixels of all these pictures", tried, own, &[])
+        tried.push(measured(value, step, finest.clone(), cost.clone())?);
+        self.curve(name, "all pixels of all these views", tried, own, &[])
     }
 
-    /// Scores by what was scanned and `seen`.
-    fn scored(&self, seen: Option<VisibleContribution>) -> Result<Scored> {
+    /// Computes scores from the scan and the contributions `contributions`.
+    fn scored(&self, contributions: Option<VisibleContribution>) -> Result<Scored> {
         let measure = Measure::new(self.recipe, self.scene.has_cameras, UserOverrides::default());
-        measure.score.run(self.scene, self.scanned.clone(), seen, &mut Journal::default())
+        measure.score.run(self.scene, self.scanned.clone(), contributions, &mut Journal::default())
     }
 
-    /// Rounds of more and of fewer pictures, and of larger and of smaller cuts. None where nothing is looked at.
+    /// Varies the pruning rounds: views per round, and the fraction that a round leaves. Returns `None` if the recipe
+    /// ranks by no views.
     pub(super) fn rounds(&self) -> Result<Option<PrecisionKnob>> {
-        let Some(seen) = self.seen(self.recipe)? else { return Ok(None) };
-        let scored = self.scored(Some(seen))?;
+        let Some(contributions) = self.contributions(self.recipe)? else { return Ok(None) };
+        let scored = self.scored(Some(contributions))?;
         let own = &self.recipe.select;
         let most = self.scene.schedule.pairs().min(MOST_IN_ROUNDS);
         let own_pictures = own.round_pictures.min(most);
         let mut by_pictures = Vec::new();
         for count in tried(PICTURES_TRIED.into_iter().filter(|&count| count < most).chain([own_pictures, most])) {
             let select = recipe::Select { round_pictures: count, ..own.clone() };
-            by_pictures.push(self.ranked(&scored, &select, count as f64, 1.0 / count as f64)?);
+            by_pictures.push(self.rank_by(&scored, &select, count as f64, 1.0 / count as f64)?);
         }
         let mut fractions: Vec<f64> = FRACTIONS.into_iter().chain([own.round_fraction]).filter(|&f| f < 1.0).collect();
         fractions.sort_unstable_by(f64::total_cmp);
@@ -159,25 +164,25 @@ impl Bench<'_> {
         let mut by_fraction = Vec::new();
         for fraction in fractions {
             let select = recipe::Select { round_fraction: fraction, ..own.clone() };
-            by_fraction.push(self.ranked(&scored, &select, fraction, -fraction.ln())?);
+            by_fraction.push(self.rank_by(&scored, &select, fraction, -fraction.ln())?);
         }
         let own = (Some(own_pictures as f64), Some(own.round_fraction));
         let curves = vec![
-            self.curve("round_pictures", "the most pictures", by_pictures, own.0, &[])?,
-            self.curve("round_fraction", "the smallest cuts", by_fraction, own.1, &[])?,
+            self.curve("round_pictures", "the largest number of views", by_pictures, own.0, &[])?,
+            self.curve("round_fraction", "the rounds that remove least", by_fraction, own.1, &[])?,
         ];
         Ok(Some(PrecisionKnob {
             name: "rounds".to_owned(),
             about:
-                "Rounds that rank anew by what pictures would lose: pictures of each, and the part that each leaves."
+                "Pruning rounds, each ranked by removal error: views of each round, and the fraction that each leaves."
                     .to_owned(),
             source: Source::Discretisation,
             curves,
         }))
     }
 
-    /// What rounds of `select` keep.
-    fn ranked(&self, scored: &Scored, select: &recipe::Select, value: f64, step: f64) -> Result<TriedRanking> {
+    /// Ranks by the rounds of `select`, and measures the cost.
+    fn rank_by(&self, scored: &Scored, select: &recipe::Select, value: f64, step: f64) -> Result<TriedRanking> {
         let rounds = Rounds::from_recipe(select, None);
         let rank = || {
             let order = match &rounds {
@@ -190,41 +195,44 @@ impl Bench<'_> {
         Ok(TriedRanking { value, step, cost, errors: BTreeMap::new(), kept })
     }
 
-    /// Percentiles from one look at the values, by more and fewer bits, beside exact ones.
+    /// Compares percentiles from one pass over the values, with several numbers of bits, with exact ones.
     pub(super) fn percentiles(&self) -> Result<PrecisionKnob> {
-        let scored = self.scored(self.seen(self.recipe)?)?;
+        let scored = self.scored(self.contributions(self.recipe)?)?;
         let rows = scored.rows()?;
         let frames = self.scene.source().info().times.len();
-        let by = |looks: PercentilePasses| -> Result<(Scores, Cost)> {
-            self.repeats.measure(|| Ok(score_by(looks, &rows, frames, &self.recipe.score)), || Ok(()))
+        let by = |passes: PercentilePasses| -> Result<(Scores, Cost)> {
+            self.repeats.measure(|| Ok(score_by(passes, &rows, frames, &self.recipe.score)), || Ok(()))
         };
         let (exact, cost) = by(PercentilePasses::Two)?;
         let staying = scored.selection.counts.kept;
-        let of = |value: f64, step: f64, scores: &Scores, cost: Cost| -> Result<TriedRanking> {
+        let measured = |value: f64, step: f64, scores: &Scores, cost: Cost| -> Result<TriedRanking> {
             let selection = select(scores, &self.recipe.select, &Overrides::default())?;
-            let errors = [(PERCENTILES, worst(scores, &exact)), (STAYING, off(selection.counts.kept, staying))];
-            let errors = errors.map(|(of, error)| (of.to_owned(), error)).into();
+            let errors = [
+                (PERCENTILES, worst_percentile_error(scores, &exact)),
+                (STAYING, relative_error(selection.counts.kept, staying)),
+            ];
+            let errors = errors.map(|(name, error)| (name.to_owned(), error)).into();
             Ok(TriedRanking { value, step, cost, errors, kept: selection.ranking.take(self.kept) })
         };
         let mut tried = Vec::with_capacity(BITS.len() + 1);
         for bits in BITS {
             let (scores, cost) = by(PercentilePasses::One(bits))?;
-            tried.push(of(f64::from(bits), 0.5f64.powi(bits as i32), &scores, cost)?);
+            tried.push(measured(f64::from(bits), 0.5f64.powi(bits as i32), &scores, cost)?);
         }
         let own = f64::from(MOST_BITS + 1);
-        tried.push(of(own, 0.0, &exact, cost)?);
-        let against = "exact percentiles from two looks, as every run has them (the last mark)";
-        // Half a bucket at most, and buckets halve with every bit.
+        tried.push(measured(own, 0.0, &exact, cost)?);
+        let against = "exact percentiles from two passes, as in every run (the last mark)";
+        // The error is half a bucket at most, and each bit halves the buckets.
         let curve = self.curve("mantissa bits", against, tried, Some(own), &[(PERCENTILES, 1.0)])?;
         Ok(PrecisionKnob {
             name: "percentiles".to_owned(),
-            about: "Percentiles from one look at the values: mantissa bits of the histogram's keys.".to_owned(),
+            about: "Percentiles from one pass over the values: mantissa bits of the histogram's keys.".to_owned(),
             source: Source::Discretisation,
             curves: vec![curve],
         })
     }
 
-    /// A curve of rankings, of which the last is the finest.
+    /// Returns the curve of several rankings; the last one is the finest.
     fn curve(
         &self,
         name: &str,
@@ -237,12 +245,12 @@ impl Bench<'_> {
         let Some(finest) = tried.last().map(|last| last.kept.clone()) else {
             return Ok(PrecisionCurve::new(name, against, marks, None, expected));
         };
-        let best = self.judge.closeness(self.scene, &finest)?;
+        let best = self.judge.quality(self.scene, &finest)?;
         for TriedRanking { value, step, cost, mut errors, kept } in tried {
-            let found = if kept == finest { best } else { self.judge.closeness(self.scene, &kept)? };
+            let found = if kept == finest { best } else { self.judge.quality(self.scene, &kept)? };
             errors.extend(
                 [(KEPT, apart(&kept, &finest)), (PICTURES, found.error), (ADDED, added(found.error, best.error))]
-                    .map(|(of, error)| (of.to_owned(), error)),
+                    .map(|(name, error)| (name.to_owned(), error)),
             );
             marks.push(PrecisionSetting { value, step, cost, errors, psnr: Some(found.psnr) });
             self.advance();
@@ -251,7 +259,7 @@ impl Bench<'_> {
     }
 }
 
-/// Rising, each once.
+/// Returns the values in increasing order, without duplicates.
 fn tried(counts: impl Iterator<Item = usize>) -> Vec<usize> {
     let mut counts: Vec<usize> = counts.collect();
     counts.sort_unstable();
@@ -259,14 +267,14 @@ fn tried(counts: impl Iterator<Item = usize>) -> Vec<usize> {
     counts
 }
 
-/// Relative error of a count.
-fn off(count: usize, expected: usize) -> f64 {
+/// Returns the relative error of a count.
+fn relative_error(count: usize, expected: usize) -> f64 {
     (count as f64 / expected.max(1) as f64 - 1.0).abs()
 }
 
-/// The worst relative error of a percentile that scores are normalized by; those of scores of scores aside, whose values
-/// differ themselves.
-fn worst(scores: &Scores, exact: &Scores) -> f64 {
+/// Returns the worst relative error of a percentile that scores are normalized by. Percentiles of combined scores are
+/// skipped, because their values differ themselves.
+fn worst_percentile_error(scores: &Scores, exact: &Scores) -> f64 {
     let pairs = scores.terms.iter().zip(&exact.terms);
     let pairs = pairs.filter(|(term, _)| !matches!(term.of, Graded::Static | Graded::Dynamic));
     let errors = pairs.flat_map(|(rough, exact)| {

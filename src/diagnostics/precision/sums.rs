@@ -1,8 +1,7 @@
-//! What rounding does to the running sums of a scan: in f32, in f32 with the lost digits carried along, and as the scan has
-//! them, in f64.
+//! Rounding errors of the running sums of a scan: in f32, in f32 with compensation, and in f64 as in the scan.
 //!
-//! Some of the scene's trajectories are played to and fro for as long as it takes to see errors grow. Expected: the same
-//! sums in f64 with the lost digits carried along.
+//! Some of the scene's trajectories are played forward and backward repeatedly, long enough for errors to grow visibly.
+//! The expected sums are in f64 with compensation.
 
 use std::collections::BTreeMap;
 
@@ -17,14 +16,14 @@ use crate::recipe::{self, MotionParams, Recipe};
 use crate::source::{BlockReader, Ids, ReadPlan};
 use crate::statistics::{BlockScan, NEEDED, ScanPlan};
 
-/// Gaussians whose sums are looked at, evenly among all.
+/// Number of Gaussians whose sums are computed, spaced evenly over all.
 const GAUSSIANS: usize = 64;
-/// Frames of the scene that are played, evenly among all: at most.
+/// Maximum number of frames of the scene that are played, spaced evenly over all.
 const MOST_FRAMES: usize = 240;
-/// Frames that they are played for.
+/// Numbers of frames for which they are played.
 const PLAYED: [usize; 4] = [100, 1000, 10_000, 100_000];
 
-/// What errors of sums are measured against.
+/// Reference of the errors of sums.
 const AGAINST: &str = "f64, compensated";
 
 /// A running sum.
@@ -33,10 +32,10 @@ trait Sum<T: Float>: Default {
     fn total(self) -> f64;
 }
 
-/// One number, and what rounding loses is lost.
+/// A plain sum, which loses what rounding loses.
 struct Plain<T>(T);
 
-/// Kahan's sum: a second number holds what rounding lost.
+/// Kahan's compensated sum: the second number holds what rounding lost.
 struct Compensated<T>(T, T);
 
 impl<T: Float> Default for Plain<T> {
@@ -57,7 +56,7 @@ impl<T: Float> Sum<T> for Plain<T> {
     }
 
     fn total(self) -> f64 {
-        wide(self.0)
+        to_f64(self.0)
     }
 }
 
@@ -70,15 +69,15 @@ impl<T: Float> Sum<T> for Compensated<T> {
     }
 
     fn total(self) -> f64 {
-        wide(self.0) - wide(self.1)
+        to_f64(self.0) - to_f64(self.1)
     }
 }
 
-fn wide<T: Float>(value: T) -> f64 {
+fn to_f64<T: Float>(value: T) -> f64 {
     value.to_f64().unwrap_or(f64::NAN)
 }
 
-fn narrow<T: Float>(value: f64) -> T {
+fn from_f64<T: Float>(value: f64) -> T {
     T::from(value).unwrap_or(T::nan())
 }
 
@@ -86,7 +85,7 @@ fn narrow<T: Float>(value: f64) -> T {
 type SummedStatistics = [Vec<f64>; 3];
 
 impl Bench<'_> {
-    /// Sums over longer and longer sequences.
+    /// Measures the errors of sums over longer and longer sequences. Returns `None` for fewer than three frames.
     pub(super) fn sums(&self) -> Result<Option<PrecisionKnob>> {
         let source = self.scene.source();
         let info = source.info();
@@ -110,56 +109,57 @@ impl Bench<'_> {
         }
         let decoded: Vec<Decoded> = states.iter().map(Decoded::from_state).collect();
         let mut curves = Vec::new();
-        type Way = (&'static str, fn(&[Decoded], usize) -> SummedStatistics);
-        let ways: [Way; 2] =
-            [("f32", summed::<f32, Plain<f32>>), ("f32, compensated", summed::<f32, Compensated<f32>>)];
-        let expected = PLAYED.map(|played| summed::<f64, Compensated<f64>>(&decoded, played));
-        for (name, sum) in ways {
-            let marks = self.played(&expected, |played| Ok(sum(&decoded, played)))?;
+        type Variant = (&'static str, fn(&[Decoded], usize) -> SummedStatistics);
+        let variants: [Variant; 2] =
+            [("f32", sum_statistics::<f32, Plain<f32>>), ("f32, compensated", sum_statistics::<f32, Compensated<f32>>)];
+        let expected = PLAYED.map(|frames_played| sum_statistics::<f64, Compensated<f64>>(&decoded, frames_played));
+        for (name, sum) in variants {
+            let marks = self.measure_lengths(&expected, |frames_played| Ok(sum(&decoded, frames_played)))?;
             curves.push(PrecisionCurve::new(name, AGAINST, marks, None, &[]));
         }
-        let marks = self.played(&expected, |played| scanned(&states, played, columns))?;
-        curves.push(PrecisionCurve::new("f64, as the scan has them", AGAINST, marks, None, &[]));
+        let marks =
+            self.measure_lengths(&expected, |frames_played| scan_statistics(&states, frames_played, columns))?;
+        curves.push(PrecisionCurve::new("f64, as in the scan", AGAINST, marks, None, &[]));
         Ok(Some(PrecisionKnob {
             name: "sums".to_owned(),
             about: format!(
-                "Running sums over frames: D, κ and V of {count} Gaussians whose frames are played to and fro. Marks are \
-                 numbers of frames."
+                "Running sums over frames: D, κ and V of {count} Gaussians whose frames are played forward and \
+                 backward. Marks are numbers of frames."
             ),
             source: Source::Rounding,
             curves,
         }))
     }
 
-    /// A mark for every number of frames.
-    fn played(
+    /// Returns a mark for every number of frames.
+    fn measure_lengths(
         &self,
         expected: &[SummedStatistics],
         sums: impl Fn(usize) -> Result<SummedStatistics>,
     ) -> Result<Vec<PrecisionSetting>> {
-        let mark = |(played, expected): (usize, &SummedStatistics)| {
-            let (found, cost) = self.repeats.measure(|| sums(played), || Ok(()))?;
+        let mark = |(frames_played, expected): (usize, &SummedStatistics)| {
+            let (found, cost) = self.repeats.measure(|| sums(frames_played), || Ok(()))?;
             let errors = ["D", "kappa", "V"].into_iter().zip(found.iter().zip(expected));
             let errors: BTreeMap<String, f64> = errors
-                .map(|(of, (found, expected))| {
-                    (of.to_owned(), relative_l2(found.iter().copied(), expected.iter().copied()))
+                .map(|(name, (found, expected))| {
+                    (name.to_owned(), relative_l2(found.iter().copied(), expected.iter().copied()))
                 })
                 .collect();
             self.advance();
-            Ok(PrecisionSetting { value: played as f64, step: played as f64, cost, errors, psnr: None })
+            Ok(PrecisionSetting { value: frames_played as f64, step: frames_played as f64, cost, errors, psnr: None })
         };
         PLAYED.into_iter().zip(expected).map(mark).collect()
     }
 }
 
-/// Frame of `count` that is shown as the `k`-th of frames played to and fro.
-fn place(k: usize, count: usize) -> usize {
+/// Returns the index, of `count` frames, of the `k`-th frame when frames are played forward and backward.
+fn ping_pong_index(k: usize, count: usize) -> usize {
     let turn = 2 * (count - 1);
     let at = k % turn;
     at.min(turn - at)
 }
 
-/// What sums are of at one frame.
+/// Values of one frame that the sums need.
 struct Decoded {
     position: Vec<[f32; 3]>,
     opacity: Vec<f64>,
@@ -174,19 +174,19 @@ impl Decoded {
     }
 }
 
-/// D, κ and V over `played` frames of Gaussians that live throughout, in numbers T summed by S.
-fn summed<T: Float, S: Sum<T>>(states: &[Decoded], played: usize) -> SummedStatistics {
+/// Computes D, κ and V over `frames_played` frames of Gaussians that are always alive, in numbers T summed by S.
+fn sum_statistics<T: Float, S: Sum<T>>(states: &[Decoded], frames_played: usize) -> SummedStatistics {
     let count = states.first().map_or(0, |state| state.opacity.len());
     let length2 = |v: [T; 3]| v[0] * v[0] + v[1] * v[1] + v[2] * v[2];
     let difference = |a: [T; 3], b: [T; 3]| -> [T; 3] { std::array::from_fn(|axis| a[axis] - b[axis]) };
-    let of_gaussian = |i: usize| -> [f64; 3] {
-        let at = |k: usize| &states[place(k, states.len())];
-        let position = |k: usize| at(k).position[i].map(|x| narrow::<T>(f64::from(x)));
-        let first: T = narrow(at(0).opacity[i]);
+    let statistics_of_one = |i: usize| -> [f64; 3] {
+        let at = |k: usize| &states[ping_pong_index(k, states.len())];
+        let position = |k: usize| at(k).position[i].map(|x| from_f64::<T>(f64::from(x)));
+        let first: T = from_f64(at(0).opacity[i]);
         let (mut steps, mut turns, mut shifted, mut squares) = (S::default(), S::default(), S::default(), S::default());
         let mut before: Option<[T; 3]> = None;
-        for k in 0..played {
-            let opacity = narrow::<T>(at(k).opacity[i]) - first;
+        for k in 0..frames_played {
+            let opacity = from_f64::<T>(at(k).opacity[i]) - first;
             shifted.add(opacity);
             squares.add(opacity * opacity);
             if k > 0 {
@@ -198,27 +198,27 @@ fn summed<T: Float, S: Sum<T>>(states: &[Decoded], played: usize) -> SummedStati
                 before = Some(step);
             }
         }
-        let of = |terms: usize| terms.max(1) as f64;
+        let divisor = |terms: usize| terms.max(1) as f64;
         [
-            (steps.total() / of(played - 1)).sqrt(),
-            turns.total() / of(played - 2),
-            squares.total() / of(played) - (shifted.total() / of(played)).powi(2),
+            (steps.total() / divisor(frames_played - 1)).sqrt(),
+            turns.total() / divisor(frames_played - 2),
+            squares.total() / divisor(frames_played) - (shifted.total() / divisor(frames_played)).powi(2),
         ]
     };
-    let found: Vec<[f64; 3]> = (0..count).map(of_gaussian).collect();
-    std::array::from_fn(|statistic| found.iter().map(|of| of[statistic]).collect())
+    let found: Vec<[f64; 3]> = (0..count).map(statistics_of_one).collect();
+    std::array::from_fn(|statistic| found.iter().map(|values| values[statistic]).collect())
 }
 
-/// The same by the scan itself, of Gaussians that all count as living.
-fn scanned(states: &[Gaussians], played: usize, changed: Columns) -> Result<SummedStatistics> {
-    let times: Vec<f64> = (0..played).map(|k| k as f64).collect();
+/// Computes D, κ and V with the scan itself; all Gaussians count as alive.
+fn scan_statistics(states: &[Gaussians], frames_played: usize, changed: Columns) -> Result<SummedStatistics> {
+    let times: Vec<f64> = (0..frames_played).map(|k| k as f64).collect();
     let mut schedule = Schedule::default();
-    schedule.push(played, &[]);
+    schedule.push(frames_played, &[]);
     let scan = recipe::ScanParams { alpha_min: 0.0, motion: MotionParams::Runs, ..Recipe::preset("default")?.scan };
     let plan = ScanPlan::new(&scan, &times, &schedule)?;
     let mut block = BlockScan::new(states.first().map_or(0, Gaussians::len), 0, &plan);
-    for k in 0..played {
-        block.frame(k, &states[place(k, states.len())], &[], changed);
+    for k in 0..frames_played {
+        block.frame(k, &states[ping_pong_index(k, states.len())], &[], changed);
     }
     let rows = block.finish().rows;
     Ok([rows.d, rows.kappa, rows.v])
@@ -229,32 +229,37 @@ mod tests {
     use super::*;
 
     #[test]
-    fn frames_are_played_to_and_fro() {
-        assert_eq!((0..9).map(|k| place(k, 4)).collect::<Vec<_>>(), [0, 1, 2, 3, 2, 1, 0, 1, 2]);
+    fn frames_play_forward_and_backward() {
+        assert_eq!((0..9).map(|k| ping_pong_index(k, 4)).collect::<Vec<_>>(), [0, 1, 2, 3, 2, 1, 0, 1, 2]);
     }
 
     #[test]
-    fn sums_of_a_steady_walk_are_those_of_its_formula_in_any_number() {
-        // A quarter a frame, to and fro between 0 and 1: every fourth frame it turns, by half; opacities as it stands.
+    fn sums_of_a_steady_walk_equal_the_formula() {
+        // Moves a quarter per frame, forward and backward between 0 and 1; each reversal changes the step by one half.
+        // Opacities equal positions.
         let at = |k: u32| Decoded { position: vec![[0.25 * k as f32, 0.0, 0.0]], opacity: vec![0.25 * f64::from(k)] };
         let states: Vec<Decoded> = (0..5).map(at).collect();
-        // Of 4 frames to a side, 17 frames are two rounds: turns at frames 4, 8 and 12.
+        // One way takes 4 frames, so 17 frames are two round trips with reversals at frames 4, 8 and 12.
         let d = 0.25;
         let kappa = 3.0 * 0.5 / 15.0;
-        let levels: Vec<f64> = (0..17).map(|k| 0.25 * place(k, 5) as f64).collect();
+        let levels: Vec<f64> = (0..17).map(|k| 0.25 * ping_pong_index(k, 5) as f64).collect();
         let mean = levels.iter().sum::<f64>() / 17.0;
         let v = levels.iter().map(|a| (a - mean).powi(2)).sum::<f64>() / 17.0;
-        let ways = [summed::<f32, Plain<f32>>, summed::<f32, Compensated<f32>>, summed::<f64, Compensated<f64>>];
-        for (way, sum) in ways.into_iter().enumerate() {
+        let variants = [
+            sum_statistics::<f32, Plain<f32>>,
+            sum_statistics::<f32, Compensated<f32>>,
+            sum_statistics::<f64, Compensated<f64>>,
+        ];
+        for (variant, sum) in variants.into_iter().enumerate() {
             let [found_d, found_kappa, found_v] = sum(&states, 17).map(|values| values[0]);
             for (found, expected) in [(found_d, d), (found_kappa, kappa), (found_v, v)] {
-                assert!((found - expected).abs() < 1e-6 * expected, "way {way}: {found}, expected {expected}");
+                assert!((found - expected).abs() < 1e-6 * expected, "variant {variant}: {found}, expected {expected}");
             }
         }
     }
 
     #[test]
-    fn what_a_plain_sum_loses_a_compensated_one_keeps() {
+    fn compensated_sums_keep_what_plain_ones_lose() {
         let (mut plain, mut compensated) = (Plain::<f32>::default(), Compensated::<f32>::default());
         for _ in 0..1_000_000 {
             plain.add(0.1);

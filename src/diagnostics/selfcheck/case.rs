@@ -1,4 +1,4 @@
-//! One case: a name, a bound, and the largest error found.
+//! Result of one case: a name, a bound, and the largest error found.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
@@ -6,20 +6,21 @@ use serde::Serialize;
 
 use crate::error::Result;
 
-/// What was checked, how far off it may be, and how far off it is.
+/// Result of one case.
 #[derive(Debug, Serialize)]
 pub struct Case {
-    /// A few words that name it.
+    /// Short name of the case.
     pub name: &'static str,
-    /// What is compared with what.
+    /// Values that are compared, and their reference.
     pub what: &'static str,
-    /// Largest error of a sound build. Errors are relative or in the unit that `what` names.
+    /// Largest error of a correct build. Errors are relative or in the unit that `what` names.
     pub bound: f64,
-    /// The largest error; infinite or NaN, as JSON null, where one is no number or nothing could be measured.
+    /// Largest error found; infinite or NaN, which is JSON null, if a value is not a number or nothing could be
+    /// measured.
     pub error: f64,
     /// Whether the error is within the bound.
     pub pass: bool,
-    /// Why nothing could be measured.
+    /// Reason why nothing could be measured.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub failure: Option<String>,
 }
@@ -31,7 +32,7 @@ impl Case {
         bound: f64,
         measure: impl FnOnce() -> Result<LargestError>,
     ) -> Case {
-        // A build so broken that it panics has other cases to show.
+        // A panic is caught, so that the other cases still run.
         let (error, failure) = match catch_unwind(AssertUnwindSafe(measure)) {
             Ok(Ok(LargestError(error))) => (error, None),
             Ok(Err(error)) => (f64::INFINITY, Some(error.to_string())),
@@ -41,7 +42,7 @@ impl Case {
     }
 }
 
-/// The largest error so far; NaN, which is within no bound, of nothing looked at.
+/// Largest error so far; NaN, which exceeds every bound, before any value was compared.
 #[derive(Debug)]
 pub(super) struct LargestError(pub(super) f64);
 
@@ -52,22 +53,22 @@ impl Default for LargestError {
 }
 
 impl LargestError {
-    /// An error, which is infinite where it is no number.
+    /// Adds an error; NaN counts as infinite.
     pub(super) fn add(&mut self, error: f64) {
         self.0 = if error.is_nan() { f64::INFINITY } else { self.0.max(error) };
     }
 
-    /// |got − expected| in parts of `unit`, which is positive.
+    /// Adds |got − expected| / `unit`, for a positive unit.
     pub(super) fn near(&mut self, got: f64, expected: f64, unit: f64) {
         self.add((got - expected).abs() / unit);
     }
 
-    /// |got − expected| in parts of what is expected, or 0 where both are the same.
+    /// Adds |got − expected| / |expected|, or 0 if both are equal.
     pub(super) fn relative(&mut self, got: f64, expected: f64) {
         self.add(if got == expected { 0.0 } else { (got - expected).abs() / expected.abs() });
     }
 
-    /// 1 where things differ that must be the same.
+    /// Adds 1 if values differ that must be equal, else 0.
     pub(super) fn same<T: PartialEq + ?Sized>(&mut self, got: &T, expected: &T) {
         self.add(if got == expected { 0.0 } else { 1.0 });
     }

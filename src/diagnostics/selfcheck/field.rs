@@ -1,4 +1,4 @@
-//! The deformation field of a 4DGaussians model.
+//! Cases for the deformation field of a 4DGaussians model.
 
 use std::path::Path;
 
@@ -8,11 +8,11 @@ use crate::deform::synthetic::{Noise, plain, tensors};
 use crate::deform::{Deltas, Field, FieldConfig, Scratch};
 use crate::model::{Columns, Gaussians};
 
-/// Against the definition, in parts of 1 and the value; some 60 roundings of f32.
+/// Compares states with the definition, relative to 1 + |value|; the bound allows some 60 roundings in f32.
 pub(super) fn states() -> Case {
     Case::new("deformation field", "states: planes, layers in f64", 5e-6, || {
         let mut worst = LargestError::default();
-        let raw = cloud(40);
+        let raw = random_gaussians(40);
         for (config, depth) in [
             (plain(), 1),
             (FieldConfig { empty_voxel: true, ..plain() }, 2),
@@ -39,27 +39,28 @@ pub(super) fn states() -> Case {
     })
 }
 
-/// Against differences of the definition over 2e-6, in parts of 1 and the value; f32 slopes of products of six samples.
+/// Compares the Jacobian with differences of the definition over 2e-6, relative to 1 + |value|; derivatives in f32 of
+/// products of six samples.
 pub(super) fn derivative() -> Case {
     Case::new("field's derivative", "of positions: differences in f64", 1e-5, || {
         let (config, time, step) = (plain(), 0.37, 1e-6);
         let tensors = tensors(&config, 2);
         let field = Field::new(&tensors, config.clone(), 3, Path::new("made up"))?;
         let oracle = Oracle { tensors: &tensors, config: &config };
-        let raw = cloud(40);
+        let raw = random_gaussians(40);
         let found = field.jacobian(&raw, time, Columns::POSITION)?;
         let mut worst = LargestError::default();
         worst.same(&found.column(Columns::POSITION).width(), &9);
         for i in 0..raw.len() {
-            for by in 0..3 {
+            for input in 0..3 {
                 let [low, high] = [-step, step].map(|step| {
                     let mut moved = Parameters::from_row(&raw, i);
-                    moved.position[by] += step;
+                    moved.position[input] += step;
                     oracle.state(&moved, time).position
                 });
-                for of in 0..3 {
-                    let expected = (high[of] - low[of]) / (2.0 * step);
-                    let got = f64::from(found.column(Columns::POSITION).plane(3 * of + by)[i]);
+                for output in 0..3 {
+                    let expected = (high[output] - low[output]) / (2.0 * step);
+                    let got = f64::from(found.column(Columns::POSITION).plane(3 * output + input)[i]);
                     worst.near(got, expected, 1.0 + expected.abs());
                 }
             }
@@ -68,12 +69,12 @@ pub(super) fn derivative() -> Case {
     })
 }
 
-/// Random Gaussians of degree 3, some outside the field's box.
-fn cloud(count: usize) -> Gaussians {
+/// Returns random Gaussians of SH degree 3, some outside the field's box.
+fn random_gaussians(count: usize) -> Gaussians {
     let mut noise = Noise(99);
-    let mut cloud = Gaussians::zeros(count, 3);
-    for column in cloud.columns_mut(Columns::all()) {
+    let mut random_gaussians = Gaussians::zeros(count, 3);
+    for column in random_gaussians.columns_mut(Columns::all()) {
         column.planes_mut().iter_mut().for_each(|x| *x = 2.0 * noise.next());
     }
-    cloud
+    random_gaussians
 }

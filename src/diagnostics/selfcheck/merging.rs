@@ -1,4 +1,4 @@
-//! What one Gaussian keeps of those that it stands for.
+//! Cases for merging: properties of its members that a proxy conserves.
 
 use glam::{DMat3, DQuat, DVec3};
 
@@ -11,7 +11,7 @@ use crate::merging::{Survivors, run};
 use crate::model::{Columns, Gaussians};
 use crate::recipe::{MergeParams, Placement, ProxyOpacity, Recipe};
 
-/// Against Σ formed in f64, in parts of its largest entry; a dozen parts lose some 1e-15.
+/// Compares moments with Σ formed in f64, relative to its largest entry; a dozen parts lose some 1e-15.
 pub(super) fn mixture() -> Case {
     Case::new("mixture", "mean, covariance: Σ formed in f64", 1e-13, || {
         let mut random = Random(1);
@@ -27,14 +27,14 @@ pub(super) fn mixture() -> Case {
                     scales: DVec3::new(within(0.01, 1.0), within(0.01, 1.0), within(0.01, 1.0)),
                 })
                 .collect();
-            keeps_moments(&moments(&parts, None), &parts, &mut worst);
+            compare_moments(&moments(&parts, None), &parts, &mut worst);
         }
         Ok(worst)
     })
 }
 
-/// Twice the same is the same: scales of 1 : 1e12 come back to 1e-12 of each; a covariance in f64 would keep nothing of
-/// the smallest.
+/// Merges a Gaussian with its copy, which must return the Gaussian: scales of 1 : 1e12 are exact to 1e-12 each. A
+/// covariance formed in f64 would lose the smallest scale entirely.
 pub(super) fn needle() -> Case {
     Case::new("needle and its twin", "scales of 1 : 1e12: themselves", 1e-12, || {
         let mut worst = LargestError::default();
@@ -48,9 +48,10 @@ pub(super) fn needle() -> Case {
     })
 }
 
-/// As [`mixture`], of stored Gaussians 1000 units away, whose offsets lose 1e-13 there; opacity is 1 − Π(1 − α).
+/// Compares like [`mixture`], for stored Gaussians 1000 units away, whose offsets lose 1e-13 there; the opacity is 1 −
+/// Π(1 − α).
 pub(super) fn proxy() -> Case {
-    Case::new("proxy of five", "mass, mean, covariance, colour: f64", 1e-10, || {
+    Case::new("proxy of five", "mass, mean, covariance, color: f64", 1e-10, || {
         let mut states = scene(4, 5, 1);
         states.position.planes_mut().iter_mut().for_each(|x| *x = 1000.0 + 0.1 * *x);
         let (coverage, visibility) = ([1.0, 2.0, 3.0, 4.0, 5.0], [0.5, 1.0, 0.25, 1.0, 0.75]);
@@ -67,7 +68,7 @@ pub(super) fn proxy() -> Case {
         let [w, x, y, z] = found.rotation;
         let rotation = DQuat::from_xyzw(x, y, z, w);
         let scales = DVec3::from(found.log_scale).exp();
-        keeps_moments(&Ellipsoid { mean: found.position, rotation, scales }, &parts, &mut worst);
+        compare_moments(&Ellipsoid { mean: found.position, rotation, scales }, &parts, &mut worst);
         let opacity = |logit: f64| 1.0 / (1.0 + (-logit).exp());
         let clear: f64 = states.opacity_logit.plane(0).iter().map(|&logit| 1.0 - opacity(logit.into())).product();
         worst.near(opacity(found.opacity_logit), 1.0 - clear, 1.0);
@@ -80,7 +81,7 @@ pub(super) fn proxy() -> Case {
     })
 }
 
-/// Exact copies become one whose parameters are theirs to the bit, of the opacity that the rule has for them in f32.
+/// Merges exact copies: the proxy has their parameters to the bit, and the opacity of the rule in f32.
 pub(super) fn duplicates() -> Case {
     Case::new("duplicates", "8 copies and 1 apart: 2, opacity", 1e-6, || {
         let one = scene(6, 1, 0);
@@ -118,7 +119,7 @@ fn recipe(opacity: ProxyOpacity) -> Result<MergeParams> {
     Ok(MergeParams { opacity, ..Recipe::preset("default")?.merge })
 }
 
-/// Gaussian `i` as it is stored.
+/// Returns Gaussian `i` as a part of a mixture.
 fn part(states: &Gaussians, i: usize, weight: f64) -> WeightedGaussian {
     let [w, x, y, z] = states.rotation.row::<4>(i).map(f64::from);
     WeightedGaussian {
@@ -129,8 +130,8 @@ fn part(states: &Gaussians, i: usize, weight: f64) -> WeightedGaussian {
     }
 }
 
-/// Mean and covariance by the textbook, forming Σ; both in parts of what Σ has as its largest entry.
-fn keeps_moments(found: &Ellipsoid, parts: &[WeightedGaussian], worst: &mut LargestError) {
+/// Compares with mean and covariance by the textbook, forming Σ; errors are relative to the largest entry of Σ.
+fn compare_moments(found: &Ellipsoid, parts: &[WeightedGaussian], worst: &mut LargestError) {
     let covariance = |rotation: DQuat, scales: DVec3| {
         let axes = DMat3::from_quat(rotation);
         axes * DMat3::from_diagonal(scales * scales) * axes.transpose()

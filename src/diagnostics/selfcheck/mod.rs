@@ -1,10 +1,12 @@
-//! The numbers of this very program on this very machine, against closed forms and slow oracles.
+//! Self-check: compares numbers computed by this program on this machine with closed forms and slow oracles.
 //!
-//! In: nothing; what cases look at is made up, the same on every run. Out: a [`SelfcheckReport`], one line a case. Memory: a few
-//! sequences of at most 3000 Gaussians; on disk, one of them at a time, in a temporary folder that is gone afterwards.
+//! Input: none; every case generates its data, the same on every run. Output: a [`SelfcheckReport`], one line per case.
+//! Memory: a few sequences of at most 3000 Gaussians; on disk one sequence at a time, in a temporary folder that is
+//! deleted.
 //!
-//! A case runs the code that `compress` runs. What it expects shares none of it: a formula, integers, or the definition
-//! in f64 over whole arrays ([`oracle`]). Errors are as large as the worst of all values looked at.
+//! A case runs the code that `compress` runs. The expected values share no code with it: they come from a formula, from
+//! integers, or from the definition in f64 over whole arrays ([`oracle`]). The error of a case is the largest error of
+//! all values compared.
 
 mod case;
 mod field;
@@ -26,7 +28,7 @@ use crate::error::{Error, Result};
 
 pub use case::Case;
 
-/// Every case, in the order of the pipeline.
+/// Cases in the order of the pipeline.
 const CASES: [fn() -> Case; 28] = [
     statistics::motion,
     statistics::motion_far_away,
@@ -58,16 +60,16 @@ const CASES: [fn() -> Case; 28] = [
     threads::same_bytes,
 ];
 
-/// What all cases found.
+/// Results of all cases.
 #[derive(Debug, Serialize)]
 pub struct SelfcheckReport {
     /// Program and version.
     pub tool: &'static str,
     /// Whether every case passes.
     pub pass: bool,
-    /// How long it took.
+    /// Run time in seconds.
     pub seconds: f64,
-    /// The cases, in the order of the pipeline.
+    /// Results of the cases, in the order of the pipeline.
     pub cases: Vec<Case>,
 }
 
@@ -83,13 +85,17 @@ impl SelfcheckReport {
         SelfcheckReport { tool: TOOL, pass: cases.iter().all(|case| case.pass), seconds, cases }
     }
 
-    /// A table for a person.
+    /// Returns the report as a text table.
     pub fn text(&self) -> String {
         let mut out = format!("{:<20} {:>7} {:>7} {:<4} {}\n", "case", "bound", "error", "", "what is compared");
         for case in &self.cases {
             let pass = if case.pass { "pass" } else { "FAIL" };
             let (name, what) = (case.name, case.what);
-            out += &format!("{name:<20} {:>7} {:>7} {pass:<4} {what}\n", short(case.bound), short(case.error));
+            out += &format!(
+                "{name:<20} {:>7} {:>7} {pass:<4} {what}\n",
+                short_number(case.bound),
+                short_number(case.error)
+            );
             if let Some(failure) = &case.failure {
                 out += &format!("    {failure}\n");
             }
@@ -98,8 +104,10 @@ impl SelfcheckReport {
         out + &format!("{passed} of {} pass in {:.1} s: {}\n", self.cases.len(), self.seconds, self.tool)
     }
 
+    /// Checks that every case passed.
+    ///
     /// # Errors
-    /// A case that fails; the error names all that do.
+    /// Returns [`Error::Unsound`] with the names of all failed cases.
     pub fn verdict(&self) -> Result<()> {
         let failed: Vec<&str> = self.cases.iter().filter(|case| !case.pass).map(|case| case.name).collect();
         if failed.is_empty() {
@@ -109,8 +117,8 @@ impl SelfcheckReport {
     }
 }
 
-/// A number in seven characters.
-fn short(value: f64) -> String {
+/// Formats a number in at most seven characters.
+fn short_number(value: f64) -> String {
     match value {
         0.0 => "0".to_owned(),
         _ => format!("{value:.1e}"),
@@ -123,7 +131,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_case_passes_and_the_table_fits_a_terminal() {
+    fn all_cases_pass_and_the_table_fits_a_terminal() {
         let report = run();
         assert!(report.pass, "{}", report.text());
         report.verdict().unwrap();
@@ -137,7 +145,7 @@ mod tests {
     }
 
     #[test]
-    fn a_case_fails_beyond_its_bound_without_a_number_and_with_an_error() {
+    fn large_errors_nan_errors_and_panics_fail_a_case() {
         let case = |error| Case::new("made up", "nothing", 1e-9, || Ok(error));
         let nan = || {
             let mut worst = LargestError::default();

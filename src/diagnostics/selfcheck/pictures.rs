@@ -1,4 +1,4 @@
-//! What cameras see, how it changes with what is stored, and how pictures are compared.
+//! Cases for renders, their derivatives with respect to the stored parameters, and image metrics.
 
 use std::f64::consts::TAU;
 use std::num::NonZeroU32;
@@ -14,8 +14,8 @@ use crate::render::{Contribution, Image, RemovalError, Renderer, render};
 
 const BACKGROUND: [f32; 3] = [0.1, 0.9, 0.4];
 
-/// Against α·c + (1 − α)·background, α = o·exp(−r²/2(f²s²/z² + 0.3)); values of 1 in f32 are off by 6e-8, an
-/// exponential by some more.
+/// Compares with α·c + (1 − α)·background, α = o·exp(−r²/2(f²s²/z² + 0.3)). Values of 1 in f32 are off by 6e-8, an
+/// exponential by a little more.
 pub(super) fn one_gaussian() -> Case {
     Case::new("one Gaussian", "its picture: closed form (of white)", 3e-7, || {
         let (size, depth, scale, opacity) = (48u32, 2.0f64, 0.08f64, 0.7f64);
@@ -35,8 +35,8 @@ pub(super) fn one_gaussian() -> Case {
     })
 }
 
-/// Against sums in f64, pixel by pixel; a pixel adds up some dozen f32. Where a threshold is as near as 1e-4, f32 may
-/// decide the other way: those pixels, of which there are few, are passed over.
+/// Compares with sums in f64, pixel by pixel; a pixel adds some dozen values in f32. Pixels with a decision within 1e-4
+/// of a threshold, which are few, are skipped, because f32 may decide differently.
 pub(super) fn many_gaussians() -> Case {
     Case::new("many Gaussians", "their picture: f64 (of white)", 2e-6, || {
         let (scene, camera) = (scene(1, 300, 3), camera(67, 45));
@@ -52,10 +52,10 @@ pub(super) fn many_gaussians() -> Case {
     })
 }
 
-/// Σ and largest α·T in parts of 1 and the value; sums in f32 over a tile of 256 pixels.
+/// Compares Σ and maximum of α·T, relative to 1 + value; sums are in f32 over a tile of 256 pixels.
 pub(super) fn weights() -> Case {
     Case::new("contributions", "C, W as seen: sums in f64 (px)", 2e-6, || {
-        let (scene, camera) = sure_scene();
+        let (scene, camera) = undoubtful_scene();
         let expected = picture(&scene, &camera, BACKGROUND, 1);
         let mut seen = Contribution::new(scene.len());
         Renderer::new().contribution(&scene, &camera, NonZeroU32::MIN, &mut seen);
@@ -68,10 +68,11 @@ pub(super) fn weights() -> Case {
     })
 }
 
-/// Σ‖picture − picture without it‖², both in f64; a color behind is what is left of a difference of f32.
+/// Compares with Σ‖render − render without the Gaussian‖², both in f64; the color behind a Gaussian results from a
+/// difference in f32.
 pub(super) fn removal() -> Case {
     Case::new("removal errors", "pictures without one: f64 (px)", 5e-6, || {
-        let (scene, camera) = sure_scene();
+        let (scene, camera) = undoubtful_scene();
         let mut found = RemovalError::new(scene.len(), 0.0);
         Renderer::new().removal_error(&scene, &camera, BACKGROUND, &mut found);
         let all = blended(&scene, &camera);
@@ -89,7 +90,7 @@ pub(super) fn removal() -> Case {
     })
 }
 
-/// Against K·P(cos θ)·cos mφ by recurrence; a color of 1 is off by some 1e-7 in f32.
+/// Compares with K·P(cos θ)·cos mφ by recurrence; a color of 1 is off by some 1e-7 in f32.
 pub(super) fn harmonics() -> Case {
     Case::new("harmonics", "16 Y of a direction: Legendre, f64", 3e-7, || {
         let mut worst = LargestError::default();
@@ -100,7 +101,7 @@ pub(super) fn harmonics() -> Case {
             wall.position.set_row(0, toward.to_array().map(|x| 4.0 * x as f32));
             wall.rotation.set_row(0, [1.0, 0.0, 0.0, 0.0]);
             wall.log_scale.set_row(0, [9.0; 3]);
-            // Opaque but for a hundredth, where alpha is cut.
+            // Opaque except for a hundredth, because alpha is clamped to 0.99.
             wall.opacity_logit.set_row(0, [9.0]);
             for (k, expected) in basis(toward).into_iter().enumerate() {
                 wall.sh.planes_mut().fill(0.0);
@@ -116,27 +117,27 @@ pub(super) fn harmonics() -> Case {
     })
 }
 
-/// The largest of every column against differences of f64 pictures over 6e-5, in parts of each; sums of f32 with both
-/// signs.
+/// Compares the largest gradients of every attribute with differences of f64 renders over 6e-5, relative to each; the
+/// gradients are sums in f32 with both signs.
 pub(super) fn gradients() -> Case {
     Case::new("backward pass", "derivatives: differences in f64", 5e-5, || {
         let (scene, camera) = (scene(3, 40, 3), camera(33, 100));
         let doubtful = picture(&scene, &camera, BACKGROUND, 1).doubtful;
         let mut random = Random(103);
         let target: Vec<f64> = (0..3 * doubtful.len()).map(|_| random.draw().into()).collect();
-        let off = |at: usize, value: f64| if doubtful[at / 3] { 0.0 } else { value - target[at] };
+        let residual = |at: usize, value: f64| if doubtful[at / 3] { 0.0 } else { value - target[at] };
         let mut found = Gradients::new(scene.len(), Columns::all(), 3);
         let slope = |image: &Image| {
-            let data = image.data.iter().enumerate().map(|(at, &x)| off(at, x.into()) as f32).collect();
+            let data = image.data.iter().enumerate().map(|(at, &x)| residual(at, x.into()) as f32).collect();
             (0.0, Image { data, ..*image })
         };
         Renderer::new().gradient(&scene, &camera, BACKGROUND, slope, &mut found);
 
-        // What is blended is decided beforehand, so that the loss has no steps.
+        // The blended Gaussians are fixed beforehand, so that the loss has no steps.
         let blended = blended(&scene, &camera);
         let loss = |changed: &Gaussians| -> f64 {
             let pixels = decided(changed, &camera, BACKGROUND, &blended);
-            let squares = pixels.as_flattened().iter().enumerate().map(|(at, &x)| off(at, x).powi(2));
+            let squares = pixels.as_flattened().iter().enumerate().map(|(at, &x)| residual(at, x).powi(2));
             0.5 * squares.sum::<f64>()
         };
         let mut worst = LargestError::default();
@@ -159,7 +160,8 @@ pub(super) fn gradients() -> Case {
     })
 }
 
-/// PSNR from whole numbers, in dB, and SSIM from its definition; sums in f64 of 786,432 squares lose 1e-12 at most.
+/// Compares PSNR (in dB) with whole numbers, and SSIM with its definition; sums in f64 of 786,432 squares lose 1e-12 at
+/// most.
 pub(super) fn comparison() -> Case {
     Case::new("PSNR and SSIM", "whole numbers; windows in f64", 1e-12, || {
         let mut random = Random(8);
@@ -173,22 +175,24 @@ pub(super) fn comparison() -> Case {
         let mut worst = LargestError::default();
         worst.near(psnr(&a, &b), -10.0 * (squares as f64 / 65536.0 / levels.len() as f64).log10(), 1.0);
         let ((a, _), (b, _)) = (image(16), image(16));
-        worst.near(ssim(&a, &b), plain_ssim(&a, &b), 1.0);
+        worst.near(ssim(&a, &b), reference_ssim(&a, &b), 1.0);
         Ok(worst)
     })
 }
 
-/// Its picture holds no doubtful pixel.
-const SURE_SEED: u64 = 1;
+/// Seed of a scene whose render has no doubtful pixel.
+const UNDOUBTFUL_SEED: u64 = 1;
 
-/// A scene and a camera that see no decision so near that f32 takes it otherwise, and no alpha that is cut.
-fn sure_scene() -> (Gaussians, Camera) {
-    let mut scene = scene(SURE_SEED, 60, 1);
+/// Returns a scene and a camera without a decision so near a threshold that f32 decides differently, and without
+/// clamped alphas.
+fn undoubtful_scene() -> (Gaussians, Camera) {
+    let mut scene = scene(UNDOUBTFUL_SEED, 60, 1);
     scene.opacity_logit.planes_mut().iter_mut().for_each(|logit| *logit = logit.min(2.0));
     (scene, camera(40, 33))
 }
 
-/// Real spherical harmonics of degree up to 3 by angles: √2·K·P(cos θ)·cos mφ, with sin |m|φ for negative m.
+/// Returns the real spherical harmonics of degree up to 3 by angles: √2·K·P(cos θ)·cos mφ, with sin |m|φ for negative
+/// m.
 fn basis(toward: DVec3) -> [f64; 16] {
     let (height, angle) = (toward.z, toward.y.atan2(toward.x));
     std::array::from_fn(|k| {
@@ -206,7 +210,7 @@ fn basis(toward: DVec3) -> [f64; 16] {
     })
 }
 
-/// Associated Legendre function, with the sign (−1)^m, by the recurrence in its degree.
+/// Returns the associated Legendre function, with the sign (−1)^m, by the recurrence in its degree.
 fn legendre(degree: usize, m: usize, x: f64) -> f64 {
     let sine = (1.0 - x * x).sqrt();
     let (mut before, mut last) = (0.0, (0..m).map(|k| -((2 * k + 1) as f64) * sine).product::<f64>());
@@ -217,8 +221,8 @@ fn legendre(degree: usize, m: usize, x: f64) -> f64 {
     last
 }
 
-/// SSIM window by window: 11×11 values, σ = 1.5, zeros beyond the border.
-fn plain_ssim(a: &Image, b: &Image) -> f64 {
+/// Computes SSIM window by window: 11×11 values, σ = 1.5, zeros beyond the border.
+fn reference_ssim(a: &Image, b: &Image) -> f64 {
     let size = a.width as i64;
     let bell = |d: i64| (-(d * d) as f64 / 4.5).exp();
     let total: f64 = (-5..=5).map(bell).sum();

@@ -1,4 +1,4 @@
-//! Percentiles, by which values are normalized and scenes measured.
+//! Cases for the percentiles by which values are normalized and scenes are measured.
 
 use super::case::{Case, LargestError};
 use super::made::clouds::Random;
@@ -6,7 +6,7 @@ use crate::model::Column;
 use crate::model::RobustBox;
 use crate::statistics::score::FloatSketch;
 
-/// Against the sorted values: the value at the rank, to the bit.
+/// Compares with sorted values: the value at the rank, to the bit.
 pub(super) fn percentiles() -> Case {
     Case::new("percentiles", "nearest ranks: the sorted values", 0.0, || {
         let mut worst = LargestError::default();
@@ -22,7 +22,7 @@ pub(super) fn percentiles() -> Case {
     })
 }
 
-/// As [`percentiles`].
+/// Compares like [`percentiles`].
 pub(super) fn robust_box() -> Case {
     Case::new("extent of a scene", "P1, P50, P99: the sorted values", 0.0, || {
         let mut worst = LargestError::default();
@@ -41,14 +41,14 @@ pub(super) fn robust_box() -> Case {
     })
 }
 
-/// The value at rank ⌈p·n/100⌉, at least 1.
+/// Returns the value at rank ⌈p·n/100⌉, at least 1.
 fn sorted_percentile(values: &[f64], p: usize) -> f64 {
     let mut sorted = values.to_vec();
     sorted.sort_by(f64::total_cmp);
     sorted[(sorted.len() * p).div_ceil(100).max(1) - 1]
 }
 
-/// Distinct values over twenty powers of ten, both signs, subnormals of f32 among them.
+/// Returns distinct values over 46 powers of ten with both signs, including subnormals of f32.
 fn values(count: usize) -> Vec<f64> {
     let mut random = Random(count as u64);
     let value = |_| {

@@ -1,4 +1,4 @@
-//! The statistics of a scan.
+//! Cases for the statistics of a scan.
 
 use std::f64::consts::PI;
 
@@ -12,16 +12,16 @@ use crate::model::{Camera, Columns, Gaussians, Rows, Schedule};
 use crate::recipe::{MotionParams, Recipe, ScanParams};
 use crate::statistics::{BlockScan, ScanPlan};
 
-const BOTH: [MotionParams; 2] = [MotionParams::Literal, MotionParams::Runs];
+const DEFINITIONS: [MotionParams; 2] = [MotionParams::Literal, MotionParams::Runs];
 
-/// Against the definition, with lives of many gaps; sums of 40 terms in f64 lose some 1e-15, and variances a few digits
-/// more.
+/// Compares with the definition, for life spans with many gaps; sums of 40 terms in f64 lose some 1e-15, and variances
+/// a few digits more.
 pub(super) fn motion() -> Case {
     Case::new("motion and life", "D, κ, V, life: definition, f64", 1e-13, || {
-        let frames = wanderers(500, 40);
+        let frames = random_frames(500, 40);
         let mut worst = LargestError::default();
-        for motion in BOTH {
-            let (schedule, recipe) = (unseen(frames.len()), recipe(motion)?);
+        for motion in DEFINITIONS {
+            let (schedule, recipe) = (without_views(frames.len()), recipe(motion)?);
             let got = scan(&frames, &schedule, &recipe)?;
             for i in 0..got.len() {
                 let OracleRow { d, kappa, v, life, .. } = row(i, &frames, &schedule, &recipe);
@@ -35,19 +35,21 @@ pub(super) fn motion() -> Case {
     })
 }
 
-/// Against whole numbers of ulps; the differences are exact, and a sum of 2000 squares in f64 loses 1e-14 at most.
+/// Compares with whole numbers of ulps; the differences are exact, and a sum of 2000 squares in f64 loses 1e-14 at
+/// most.
 pub(super) fn motion_far_away() -> Case {
-    Case::new("motion far away", "D, κ at 1e6: whole numbers of ulps", 1e-13, || walks(&[(1e6, 0.0625)]))
+    Case::new("motion far away", "D, κ at 1e6: whole numbers of ulps", 1e-13, || compare_walks(&[(1e6, 0.0625)]))
 }
 
-/// As [`motion_far_away`], where positions are subnormal and where their squares overflow f32.
+/// Compares like [`motion_far_away`], with subnormal positions and with positions whose squares overflow f32.
 pub(super) fn motion_of_any_size() -> Case {
     Case::new("motion of any size", "D, κ at 1e-42, 1e37: whole numbers", 1e-13, || {
-        walks(&[(0.0, f32::from_bits(1)), (0.0, 2f32.powi(115))])
+        compare_walks(&[(0.0, f32::from_bits(1)), (0.0, 2f32.powi(115))])
     })
 }
 
-/// x = t² at whole t of mean step m has velocities m·(t + t') and turns of 2m²; sums of 40 terms in f64.
+/// Compares with a formula: x = t² at whole t of mean step m has velocities m·(t + t') and turns of 2m²; sums of 40
+/// terms in f64.
 pub(super) fn uneven_frames() -> Case {
     Case::new("uneven frames", "D, κ of t² at odd stamps: formula", 1e-13, || {
         let times: Vec<f64> = (0..40).map(|k| f64::from(k + k / 3 + 5 * (k / 7))).collect();
@@ -59,7 +61,7 @@ pub(super) fn uneven_frames() -> Case {
                 frame
             })
             .collect();
-        let got = scan_at(&times, &frames, &unseen(frames.len()), &recipe(MotionParams::Runs)?)?;
+        let got = scan_at(&times, &frames, &without_views(frames.len()), &recipe(MotionParams::Runs)?)?;
         let steps = times.len() - 1;
         let mean_step = times[steps] / steps as f64;
         let squares: f64 = times.windows(2).map(|pair| (mean_step * (pair[0] + pair[1])).powi(2)).sum();
@@ -70,12 +72,13 @@ pub(super) fn uneven_frames() -> Case {
     })
 }
 
-/// Nothing, one and two life frames have exact answers.
+/// Compares with exact values for 0 to 3 frames of life.
 pub(super) fn short_lives() -> Case {
     Case::new("short lives", "D, κ, V of 0 to 3 life frames: exact", 0.0, || {
         let mut worst = LargestError::default();
-        for motion in BOTH {
-            // Whether it lives in each frame; steps of 3 and turns of 6 that count, for the paper and in runs.
+        for motion in DEFINITIONS {
+            // Cases: liveness in each frame; numbers of steps of 3 and of turns of 6 that count, for the paper and for
+            // runs.
             for (life, steps, turns) in [
                 (&[0][..], [0, 0], [0, 0]),
                 (&[1], [0, 0], [0, 0]),
@@ -83,12 +86,12 @@ pub(super) fn short_lives() -> Case {
                 (&[0, 1, 1], [2, 1], [0, 0]),
                 (&[1, 0, 1], [1, 0], [0, 0]),
                 (&[1, 1, 1], [2, 2], [1, 1]),
-                // The turn about the last life frame is none.
+                // The turn at the last frame of life does not count.
                 (&[1, 1, 1, 0], [2, 2], [1, 1]),
                 (&[1, 1, 0, 0], [1, 1], [0, 0]),
             ] {
                 let frames: Vec<Gaussians> = (0..life.len()).map(|t| zigzag(t, life[t] == 1)).collect();
-                let got = scan(&frames, &unseen(frames.len()), &recipe(motion)?)?;
+                let got = scan(&frames, &without_views(frames.len()), &recipe(motion)?)?;
                 let alive = life.iter().sum::<u32>();
                 let (k, divisor) = match motion {
                     MotionParams::Literal => (0, alive),
@@ -104,8 +107,8 @@ pub(super) fn short_lives() -> Case {
     })
 }
 
-/// Opacities of 0.9 that differ by 1e-6 are off by 1e-16, so V by less than 1e-9 of itself; of unshifted moments nothing
-/// would be left but 2 digits.
+/// Compares V with two passes in f64. Opacities of 0.9 that differ by 1e-6 are off by 1e-16, so V by less than 1e-9 of
+/// itself; with unshifted moments only 2 digits would remain.
 pub(super) fn steady_opacity() -> Case {
     Case::new("steady opacity", "V of 0.9 ± 1e-6: two passes in f64", 1e-9, || {
         let mut random = Random(5);
@@ -115,12 +118,12 @@ pub(super) fn steady_opacity() -> Case {
             .iter()
             .map(|&logit| {
                 let mut frame = resting(2);
-                // The second one never changes.
+                // The second Gaussian never changes.
                 frame.opacity_logit.plane_mut(0).copy_from_slice(&[logit, -0.7]);
                 frame
             })
             .collect();
-        let got = scan(&frames, &unseen(frames.len()), &recipe(MotionParams::Runs)?)?;
+        let got = scan(&frames, &without_views(frames.len()), &recipe(MotionParams::Runs)?)?;
         let count = logits.len() as f64;
         let mean = logits.iter().map(|&x| opacity(x)).sum::<f64>() / count;
         let variance = logits.iter().map(|&x| (opacity(x) - mean).powi(2)).sum::<f64>() / count;
@@ -131,10 +134,10 @@ pub(super) fn steady_opacity() -> Case {
     })
 }
 
-/// Against full matrices in f64, in parts of the area or of 1 px; C is summed in units of some 3e-11 px.
+/// Compares with full matrices in f64, relative to max(area, 1 px); C is summed in units of some 3e-11 px.
 pub(super) fn projected_area() -> Case {
     Case::new("projected area", "C, Vis: full matrices, f64 (px)", 1e-9, || {
-        let frames = wanderers(500, 3);
+        let frames = random_frames(500, 3);
         let cameras = vec![camera(320, 256), camera(40, 300)];
         let mut schedule = Schedule::new(cameras);
         schedule.push(frames.len(), &[(0, 0), (1, 1)]);
@@ -150,8 +153,9 @@ pub(super) fn projected_area() -> Case {
     })
 }
 
-/// Turned about the line of sight, a needle of variances a and b px² has det Σ = (a + 0.3)(b + 0.3); formed from Σ's
-/// entries nothing of it is left. In parts of the area or of 1 px, as in [`projected_area`].
+/// Compares with a closed form: a needle of variances a and b px², rotated about the line of sight, has det Σ = (a +
+/// 0.3)(b + 0.3). Computed from the entries of Σ, no digit of the determinant would be correct. The error is relative
+/// to max(area, 1 px), as in [`projected_area`].
 pub(super) fn needle_on_screen() -> Case {
     Case::new("needle on screen", "C of 1e4 × 1e-8 px: closed form (px)", 1e-9, || {
         let (size, focal) = (256, 250.0);
@@ -161,7 +165,7 @@ pub(super) fn needle_on_screen() -> Case {
             near: Camera::NEAR,
             fx: focal,
             fy: focal,
-            // Pixel centers are whole numbers, so the picture's middle is half a pixel off its size's.
+            // Pixel centers are whole numbers, so the center of the image is half a pixel off half its size.
             cx: f64::from(size) / 2.0,
             cy: f64::from(size) / 2.0,
             rotation: DMat3::IDENTITY,
@@ -184,22 +188,22 @@ pub(super) fn needle_on_screen() -> Case {
             let sides = [cosine * cosine * a + sine * sine * b, sine * sine * a + cosine * cosine * b];
             let share = |variance: f64| (f64::from(size) / (6.0 * (variance + 0.3).sqrt())).min(1.0);
             let area = 9.0 * PI * ((a + 0.3) * (b + 0.3)).sqrt() * share(sides[0]) * share(sides[1]);
-            // Half opaque.
+            // The Gaussian has an opacity of one half.
             worst.near(got.c[0], area / 2.0, (area / 2.0).max(1.0));
         }
         Ok(worst)
     })
 }
 
-/// One Gaussian that walks along x by whole numbers of `unit` from `from`, for every (from, unit).
-fn walks(sizes: &[(f32, f32)]) -> Result<LargestError> {
+/// Measures one Gaussian that moves along x by whole numbers of `unit` from `from`, for every (from, unit).
+fn compare_walks(sizes: &[(f32, f32)]) -> Result<LargestError> {
     let mut worst = LargestError::default();
     for &(from, unit) in sizes {
         let mut random = Random(9);
         let mut place = 0i64;
         let places: Vec<i64> = (0..2000)
             .map(|_| {
-                // Back when it is far out, so that every place is a number of f32.
+                // Steps lead back toward the start, so that every position is exact in f32.
                 let step = (1000.0 * random.draw()) as i64;
                 place += if place > 0 { -step } else { step };
                 place
@@ -213,7 +217,7 @@ fn walks(sizes: &[(f32, f32)]) -> Result<LargestError> {
                 frame
             })
             .collect();
-        let got = scan(&frames, &unseen(frames.len()), &recipe(MotionParams::Runs)?)?;
+        let got = scan(&frames, &without_views(frames.len()), &recipe(MotionParams::Runs)?)?;
         let steps: Vec<i64> = places.windows(2).map(|pair| pair[1] - pair[0]).collect();
         let squares: i64 = steps.iter().map(|step| step * step).sum();
         let turns: i64 = steps.windows(2).map(|pair| (pair[1] - pair[0]).abs()).sum();
@@ -223,7 +227,7 @@ fn walks(sizes: &[(f32, f32)]) -> Result<LargestError> {
     Ok(worst)
 }
 
-/// One Gaussian whose steps are +3, −3, …
+/// Returns one Gaussian with steps +3, −3, …
 fn zigzag(t: usize, alive: bool) -> Gaussians {
     let mut frame = resting(1);
     frame.position.set_row(0, [3.0 * (t % 2) as f32, 0.0, 0.0]);
@@ -231,16 +235,16 @@ fn zigzag(t: usize, alive: bool) -> Gaussians {
     frame
 }
 
-/// Gaussians at the origin, half opaque.
+/// Returns Gaussians at the origin with an opacity of one half.
 fn resting(count: usize) -> Gaussians {
     let mut frame = Gaussians::zeros(count, 0);
     frame.rotation.plane_mut(0).fill(1.0);
     frame
 }
 
-/// Gaussians that jump about before a camera at the origin, some of them behind it; a third of their frames they are
-/// dead.
-fn wanderers(count: usize, frames: usize) -> Vec<Gaussians> {
+/// Returns Gaussians at random positions in every frame before a camera at the origin, some of them behind it; in a
+/// third of the frames they are not alive.
+fn random_frames(count: usize, frames: usize) -> Vec<Gaussians> {
     let mut random = Random(3);
     let mut frame = |_| {
         let mut frame = Gaussians::zeros(count, 0);
@@ -260,19 +264,19 @@ fn recipe(motion: MotionParams) -> Result<ScanParams> {
     Ok(ScanParams { motion, ..Recipe::preset("default")?.scan })
 }
 
-fn unseen(frames: usize) -> Schedule {
+fn without_views(frames: usize) -> Schedule {
     let mut schedule = Schedule::default();
     schedule.push(frames, &[]);
     schedule
 }
 
-/// The rows of evenly spaced frames.
+/// Returns the statistics of evenly spaced frames.
 fn scan(frames: &[Gaussians], schedule: &Schedule, recipe: &ScanParams) -> Result<Rows> {
     let times: Vec<f64> = (0..frames.len()).map(|t| t as f64).collect();
     scan_at(&times, frames, schedule, recipe)
 }
 
-/// The rows of frames at `times`, told where opacities stay, as sources do.
+/// Returns the statistics of frames at `times`; reports unchanged opacities to the scan, as sources do.
 fn scan_at(times: &[f64], frames: &[Gaussians], schedule: &Schedule, recipe: &ScanParams) -> Result<Rows> {
     let plan = ScanPlan::new(recipe, times, schedule)?;
     let mut block = BlockScan::new(frames.first().map_or(0, Gaussians::len), 0, &plan);

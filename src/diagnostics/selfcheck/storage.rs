@@ -1,4 +1,4 @@
-//! What comes back of what was written.
+//! Cases for stored data: reads back what was written.
 
 use std::collections::BTreeMap;
 use std::iter::repeat;
@@ -21,38 +21,40 @@ use crate::outputs::bounds::{Bounds, MaxError};
 use crate::outputs::container::{Packing, write_container};
 use crate::source::{BlockReader, FrameSource, Ids};
 
-/// Every bit, NaN and −0 among them, and of a column whose last frame is its first.
+/// Compares every bit, including NaN and −0, and including an attribute whose last frame equals its first.
 pub(super) fn container() -> Case {
     Case::new("container", "values of 70 frames: the same bits", 0.0, || {
         let mut worst = LargestError::default();
-        let made = MemoryFrames::new();
+        let written = MemoryFrames::new();
         for compression in [Compression::Raw, Compression::Zstd(1)] {
-            through_container(&made, compression, |got, expected, _| worst.same(&got.to_bits(), &expected.to_bits()))?;
+            compare_round_trip(&written, compression, |got, expected, _| {
+                worst.same(&got.to_bits(), &expected.to_bits())
+            })?;
         }
         Ok(worst)
     })
 }
 
-/// In parts of the bound that was asked for.
+/// Compares values; the unit of the error is the requested bound.
 pub(super) fn bounded_container() -> Case {
     Case::new("container in bounds", "values: within 1 bound of theirs", 1.0, || {
         let mut worst = LargestError::default();
-        let mut made = MemoryFrames::new();
-        for column in made.frames.iter_mut().flat_map(|frame| frame.columns_mut(Columns::all())) {
+        let mut written = MemoryFrames::new();
+        for column in written.frames.iter_mut().flat_map(|frame| frame.columns_mut(Columns::all())) {
             column.planes_mut().iter_mut().filter(|x| !x.is_finite()).for_each(|x| *x = 0.0);
         }
-        let asked = ["position=1e-3", "rotation=2e-3", "log_scale=0.01", "opacity_logit=0.02", "sh=0.005"];
-        let asked: Vec<MaxError> =
-            asked.iter().map(|text| text.parse()).collect::<std::result::Result<_, _>>().map_err(Error::usage)?;
-        let bounds = Bounds::from_errors(&asked, || Ok(1.0))?;
-        through_container(&made, Packing::within(bounds, 3), |got, expected, column| {
+        let requested = ["position=1e-3", "rotation=2e-3", "log_scale=0.01", "opacity_logit=0.02", "sh=0.005"];
+        let requested: Vec<MaxError> =
+            requested.iter().map(|text| text.parse()).collect::<std::result::Result<_, _>>().map_err(Error::usage)?;
+        let bounds = Bounds::from_errors(&requested, || Ok(1.0))?;
+        compare_round_trip(&written, Packing::within(bounds, 3), |got, expected, column| {
             worst.near(got.into(), expected.into(), bounds.column(column));
         })?;
         Ok(worst)
     })
 }
 
-/// In parts of half a step of the grid, and a rounding to f32.
+/// Compares values; the unit of the error is half a step of the grid plus a rounding to f32.
 pub(super) fn archive_grid() -> Case {
     Case::new("archive's grid", "values: within ½ step of theirs", 1.0, || {
         let (content, steps) = model();
@@ -75,7 +77,7 @@ pub(super) fn archive_grid() -> Case {
     })
 }
 
-/// What is on the grid, and bytes, come back to the bit: predicting and coding lose nothing.
+/// Compares values on the grid and bytes to the bit: prediction and coding are lossless.
 pub(super) fn archive_codes() -> Case {
     Case::new("archive's codes", "symbols and bytes: the same", 0.0, || {
         let (content, steps) = model();
@@ -94,10 +96,10 @@ pub(super) fn archive_codes() -> Case {
     })
 }
 
-/// The grid of a matrix: 2^(−60/8).
+/// Quantization step of a matrix: 2^(−60/8).
 const MATRIX_STEP: i32 = -60;
 
-/// A model of 2000 Gaussians of degree 2 with two tensors and a file, and grids for it.
+/// Returns a model of 2000 Gaussians of SH degree 2 with two tensors and a file, and its quantization steps.
 fn model() -> (Content, Steps) {
     let mut random = Random(12);
     let mut tensor = |shape: &[usize]| Tensor {
@@ -111,32 +113,32 @@ fn model() -> (Content, Steps) {
     }
     content.files.insert("cfg_args".to_owned(), b"Namespace()".to_vec());
     content.beside = (0..content.cloud.len()).map(|i| (i * 7) as u8).collect();
-    let of_matrix = TensorSteps { step: MATRIX_STEP, channels: Vec::new() };
-    let field = FieldSteps([("a.matrix".to_owned(), of_matrix)].into());
+    let matrix_steps = TensorSteps { step: MATRIX_STEP, channels: Vec::new() };
+    let field = FieldSteps([("a.matrix".to_owned(), matrix_steps)].into());
     (content, Steps { cloud: [-64, -50, -40, -30, -45, -35, -25, 0], field })
 }
 
-/// Position to opacity, and the bands that there are.
+/// Returns the number of attributes in use: position to opacity, and the SH degrees that exist.
 fn used_attributes(content: &Content) -> usize {
     ATTRIBUTES.len() - 3 + content.cloud.sh_degree()
 }
 
-/// Hands every value that comes back of `made`, and what it was, to `compare`.
-fn through_container(
-    made: &MemoryFrames,
+/// Writes `written` to a container, reads it back, and passes every value read and its original to `compare`.
+fn compare_round_trip(
+    written: &MemoryFrames,
     packing: impl Into<Packing>,
     mut compare: impl FnMut(f32, f32, Columns),
 ) -> Result<()> {
     let folder = ScratchFolder::new(&std::env::temp_dir())?;
     let path = folder.path().join("made.gseq");
-    write_container(made, &path, packing, BTreeMap::new(), |_| ())?;
+    write_container(written, &path, packing, BTreeMap::new(), |_| ())?;
     let container = Container::open(&path)?;
-    let mut reader = container.open(Ids::Range(0..made.info.count))?;
-    let mut state = Gaussians::zeros(0, made.info.sh_degree);
-    for (frame, expected) in made.frames.iter().enumerate() {
+    let mut reader = container.open(Ids::Range(0..written.info.count))?;
+    let mut state = Gaussians::zeros(0, written.info.sh_degree);
+    for (frame, expected) in written.frames.iter().enumerate() {
         reader.read(frame, Columns::all(), &mut state)?;
         for column in Columns::all().iter() {
-            // What is missing is no number.
+            // A missing value counts as NaN.
             let got = state.column(column).planes().iter().copied().chain(repeat(f32::NAN));
             let values = got.zip(expected.column(column).planes());
             values.for_each(|(got, &expected)| compare(got, expected, column));
@@ -152,8 +154,8 @@ struct MemoryFrames {
 }
 
 impl MemoryFrames {
-    /// 1100 Gaussians, more than a block, at 70 frames, more than two: positions wander, opacities jump, rotations are
-    /// at their first value again in the last frame of a block, scales and colors stay.
+    /// Creates 1100 Gaussians, more than a block, at 70 frames, more than two blocks. Positions wander, opacities jump,
+    /// rotations return to their first value in the last frame of a block, scales and colors are constant.
     fn new() -> MemoryFrames {
         let (count, times) = (1100, 70);
         let mut random = Random(14);
@@ -166,7 +168,7 @@ impl MemoryFrames {
                 now.opacity_logit.plane_mut(0)[4..].iter_mut().for_each(|x| *x = random.within(-6.0, 6.0));
             }
             now.rotation.clone_from(&rotation);
-            // Blocks are of 32 frames, or of 64 within bounds.
+            // Blocks have 32 frames, or 64 with error bounds.
             if (1..31).contains(&(t % 32)) && t != times - 1 {
                 now.rotation.planes_mut().iter_mut().for_each(|x| *x += 0.5);
             }

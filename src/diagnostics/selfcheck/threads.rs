@@ -1,4 +1,4 @@
-//! Work that is shared out.
+//! Cases for work that is distributed over threads.
 
 use std::fs;
 
@@ -15,25 +15,25 @@ use crate::progress::Events;
 use crate::recipe::Recipe;
 use crate::render::{Image, Renderer};
 
-/// Byte by byte: which thread does what must not show.
+/// Compares bytes: the distribution of work over threads must not change the result.
 pub(super) fn same_bytes() -> Case {
     Case::new("1 and 2 threads", "demo compressed, gradients: same bits", 0.0, || {
-        let (one, two) = (made_on(1)?, made_on(2)?);
+        let (one, two) = (run_on(1)?, run_on(2)?);
         let mut worst = LargestError::default();
         worst.same(&two, &one);
         Ok(worst)
     })
 }
 
-/// The compressed demo scene, and a picture's gradients, as `threads` threads make them.
-fn made_on(threads: usize) -> Result<(Vec<u8>, Gradients)> {
+/// Returns the compressed demo scene and the gradients of one view, computed on `threads` threads.
+fn run_on(threads: usize) -> Result<(Vec<u8>, Gradients)> {
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
     let pool = pool.map_err(|error| Error::usage(format!("{threads} threads: {error}")))?;
     pool.install(|| {
         let folder = ScratchFolder::new(&std::env::temp_dir())?;
         let output = folder.path().join("demo");
         let mut recipe = Recipe::preset("default")?;
-        // Enough to go through all of it.
+        // Few steps are enough to run all code of refinement.
         recipe.refine.refine_steps = 10;
         demo::run(&DemoOptions {
             gaussians: 400,

@@ -1,26 +1,26 @@
-//! Kinds of outputs, what may be replaced, and what lies at an output path.
+//! Kinds of outputs, the policy for replacing existing files, and the check of an output path.
 
 use std::fs;
 use std::path::{Path, PathBuf};
 
 use splat_platform::{FileKind, is_system_folder};
 
-use super::named::{MARKER, Owner, entries, parts};
+use super::named::{MARKER, Owner, entries, split_target};
 use crate::error::{Error, Result, ShowPath};
 
 /// Kind of an output.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
-    /// One file.
+    /// A single file.
     File,
-    /// A folder with everything in it.
+    /// A folder with all its content.
     Folder,
 }
 
 /// Policy for an output path that already exists.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize, serde::Deserialize)]
 pub enum Replace {
-    /// Nothing is replaced.
+    /// Existing outputs are never replaced.
     #[default]
     Never,
     /// A file is replaced, whatever it holds: the user named it. In a folder that holds an earlier result, the files that
@@ -29,10 +29,10 @@ pub enum Replace {
     Existing,
 }
 
-/// What lies at an output path.
+/// Kind of entry found at an output path.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Destination {
-    /// Nothing.
+    /// No entry.
     Free,
     /// A regular file or a link to one.
     File,
@@ -44,23 +44,23 @@ pub(super) enum Destination {
     Stream,
 }
 
-/// Finds out what lies at `target`.
+/// Returns the kind of entry at `target`.
 ///
 /// # Errors
-/// Sockets, block devices, links to nothing, and links that lead through a system folder to a regular file, as
-/// [`Error::Usage`]: these are neither written nor replaced.
+/// Fails with [`Error::Usage`] for sockets, block devices, dangling links, and links that lead through a system folder
+/// to a regular file: these are neither written nor replaced.
 pub(super) fn destination(target: &Path) -> Result<Destination> {
     let refuse = |what: &str| Err(Error::usage(format!("{} is {what}; give another output", target.shown())));
     let Ok(named) = fs::symlink_metadata(target) else { return Ok(Destination::Free) };
     let is_link = named.is_symlink();
     let found = match fs::metadata(target) {
         Ok(found) => found.file_type(),
-        Err(_) if is_link => return refuse("a link to nothing, which is not replaced"),
+        Err(_) if is_link => return refuse("a link to nothing (its target does not exist), which is not replaced"),
         Err(error) => return Err(Error::io("examine", target)(error)),
     };
     match FileKind::from_type(found) {
         FileKind::CharacterDevice | FileKind::Fifo => Ok(Destination::Stream),
-        // Standard output that is redirected to a file: replacing the link would replace a file of the system.
+        // Standard output redirected to a file: replacing the link would replace a link of the system.
         FileKind::File if is_link && leads_through_system_link(target) => {
             refuse("a link of the system, which is not replaced")
         }
@@ -72,12 +72,12 @@ pub(super) fn destination(target: &Path) -> Result<Destination> {
     }
 }
 
-/// Whether `target` or a link that it leads to lies in a folder of the system, as `/dev/stdout` does.
+/// Returns whether `target`, or a link it leads to, lies in a system folder, as `/dev/stdout` does.
 fn leads_through_system_link(target: &Path) -> bool {
     let mut link = target.to_owned();
     // Linux follows at most 40 links.
     for _ in 0..40 {
-        let Ok((parent, name)) = parts(&link) else { return false };
+        let Ok((parent, name)) = split_target(&link) else { return false };
         let Ok(parent) = fs::canonicalize(parent) else { return false };
         let Ok(leads_to) = fs::read_link(parent.join(name)) else { return false };
         if is_system_folder(&parent) {
@@ -88,10 +88,10 @@ fn leads_through_system_link(target: &Path) -> bool {
     false
 }
 
-/// Confirms that the entry at `target`, if there is one, may be replaced by an output of `kind`.
+/// Checks that the entry at `target`, if there is one, may be replaced by an output of `kind`.
 ///
 /// # Errors
-/// As [`Error::Usage`]: an entry of another kind, or one that `replace` does not allow to replace.
+/// Fails with [`Error::Usage`] if the entry has another kind or `replace` does not allow to replace it.
 pub(super) fn check_replace(target: &Path, kind: Kind, replace: Replace) -> Result<()> {
     let shown = target.shown();
     let found = destination(target)?;
@@ -117,7 +117,7 @@ pub(super) fn check_replace(target: &Path, kind: Kind, replace: Replace) -> Resu
     }
 }
 
-/// Confirms that the folder at `target` is a result of this program that lists its files.
+/// Checks that the folder at `target` is a result of this program with a list of its files.
 fn check_folder(target: &Path) -> Result<()> {
     let shown = target.shown();
     match Owner::read(&target.join(MARKER)) {
@@ -129,7 +129,7 @@ fn check_folder(target: &Path) -> Result<()> {
     }
 }
 
-/// Whether `target` is an empty folder and not a link to one.
+/// Returns whether `target` is an empty folder and not a link to one.
 fn is_empty_folder(target: &Path) -> bool {
     fs::symlink_metadata(target).is_ok_and(|found| found.is_dir())
         && entries(target).is_ok_and(|entries| entries.is_empty())
@@ -138,9 +138,9 @@ fn is_empty_folder(target: &Path) -> bool {
 /// Returns the real path of the folder that `target` is written into.
 ///
 /// # Errors
-/// As [`Error::Usage`]: a target without a name, a folder that does not exist, a parent that is no folder.
+/// Fails with [`Error::Usage`] if the target has no name, or if its folder does not exist or is not a folder.
 pub(super) fn real_parent(target: &Path) -> Result<PathBuf> {
-    let (parent, _) = parts(target)?;
+    let (parent, _) = split_target(target)?;
     let real = fs::canonicalize(&parent).map_err(|_| {
         Error::usage(format!(
             "{}: the folder {} to write it into does not exist; create it first",

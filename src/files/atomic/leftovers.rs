@@ -1,4 +1,5 @@
-//! Workspaces of runs that were killed: interrupted publications are completed or taken back, the rest is removed.
+//! Cleanup of workspaces of killed runs: interrupted publications are completed or reverted, everything else is
+//! removed.
 
 use std::ffi::{OsStr, OsString};
 use std::io::{self, Read as _};
@@ -9,7 +10,7 @@ use serde::{Deserialize, Serialize};
 use splat_platform::FolderHandle;
 
 use super::destination::{Kind, Replace, check_replace};
-use super::named::{MARKER, carry_foreign, parts};
+use super::named::{MARKER, move_foreign_entries, split_target};
 use super::warnings::warn;
 use super::workspace::{
     DISCARDED, JOURNAL, Leftover, REPLACED, Refusal, SCRATCH, Workspace, is_unfinished, is_workspace, publishing_name,
@@ -17,27 +18,27 @@ use super::workspace::{
 };
 use crate::error::{Error, Result, ShowPath};
 
-/// Longest wait for another run that is publishing its result under the same name, which takes it milliseconds.
-const LONGEST_WAIT: Duration = Duration::from_secs(60);
-/// Longest wait for another run to stop looking at an unfinished workspace, which takes it microseconds.
-const LONGEST_LOOK: Duration = Duration::from_secs(5);
-/// Bytes of the largest journal that is read.
+/// Maximum time to wait for another run that publishes a result under the same name, which takes milliseconds.
+const MAX_WAIT: Duration = Duration::from_secs(60);
+/// Maximum time to wait until another run has finished inspecting an unfinished workspace, which takes microseconds.
+const MAX_INSPECTION_WAIT: Duration = Duration::from_secs(5);
+/// Maximum length of a journal in bytes.
 const MAX_JOURNAL: u64 = 1 << 20;
 
-/// Lock that a run holds while it publishes a result under one name, or repairs an interrupted publication of it.
+/// Lock of a run while it publishes a result under one name or repairs an interrupted publication of it.
 ///
-/// The lock is a workspace with a fixed name, so the rules for leftovers of killed runs hold for it as well.
+/// The lock is a workspace with a fixed name, so a lock left by a killed run is removed like any other leftover.
 pub(super) struct PublishLock {
     _workspace: Workspace,
 }
 
 impl PublishLock {
-    /// Waits until no other run publishes under the name of `target`.
+    /// Waits until no other run publishes under the name of `target`, then takes the lock.
     ///
     /// # Errors
-    /// Another run or a foreign folder that has the name of the lock for a minute; the system refuses.
+    /// Fails if another run or a foreign folder has the name of the lock for a minute, or if a system call fails.
     pub(super) fn acquire(target: &Path) -> Result<PublishLock> {
-        let (parent, name) = parts(target)?;
+        let (parent, name) = split_target(target)?;
         let name = publishing_name(name);
         let start = Instant::now();
         loop {
@@ -48,14 +49,14 @@ impl PublishLock {
             let folder = FolderHandle::open(&parent).map_err(Error::io("open", &parent))?;
             match Leftover::take(&folder, &name) {
                 Ok(leftover) => leftover.remove(&folder),
-                Err(_) if start.elapsed() > LONGEST_WAIT => {
+                Err(_) if start.elapsed() > MAX_WAIT => {
                     let source = io::Error::new(
                         io::ErrorKind::TimedOut,
                         format!(
                             "{} has existed for {} s: another run is writing this output, or was killed on a file system \
                              without locks or by another user\n  remove that folder if no other run is going on",
                             parent.join(&name).shown(),
-                            LONGEST_WAIT.as_secs()
+                            MAX_WAIT.as_secs()
                         ),
                     );
                     return Err(Error::io("write", target)(source));
@@ -66,19 +67,19 @@ impl PublishLock {
     }
 }
 
-/// Files of a result that are published together, in this order.
+/// List of files of a result that are published together, in this order.
 #[derive(Debug, Serialize, Deserialize)]
 pub(super) struct Journal {
     pub(super) replace: Replace,
-    /// Name of each file in the workspace, and its name beside it.
+    /// Name of each file in the workspace, and its final name beside the workspace.
     pub(super) files: Vec<(String, OsString)>,
 }
 
-/// Repairs and removes what killed runs left beside `target` of outputs with this name and of scratch files.
+/// Repairs and removes leftovers of killed runs beside `target`: outputs with this name and scratch files.
 ///
-/// Never fails: what cannot be repaired stays, with a warning.
-pub(super) fn tidy(target: &Path) {
-    let Ok((path, name)) = parts(target) else { return };
+/// Never fails; leftovers that cannot be repaired stay and cause a warning.
+pub(super) fn clean_up(target: &Path) {
+    let Ok((path, name)) = split_target(target) else { return };
     let Ok(parent) = FolderHandle::open(&path) else { return };
     let entries = parent.entries().unwrap_or_default();
     let left = |name: &OsStr| entries.iter().filter(|entry| is_workspace(entry, name)).collect::<Vec<_>>();
@@ -89,7 +90,7 @@ pub(super) fn tidy(target: &Path) {
         }
     }
     for entry in left(name).into_iter().chain(left(SCRATCH.as_ref())) {
-        // A workspace that became unfinished meanwhile is left to the next run.
+        // Leave a workspace that became unfinished meanwhile to the next run.
         if let Ok(leftover) = Leftover::take(&parent, entry)
             && !is_unfinished(&leftover.folder)
         {
@@ -98,7 +99,7 @@ pub(super) fn tidy(target: &Path) {
     }
 }
 
-/// Removes what killed runs left in `folder` of files whose names end with `ending`.
+/// Removes leftovers of killed runs in `folder` whose target names end with `ending`.
 pub fn remove_leftovers(folder: &Path, ending: &str) {
     let Ok(parent) = FolderHandle::open(folder) else { return };
     for entry in parent.entries().unwrap_or_default() {
@@ -112,56 +113,57 @@ pub fn remove_leftovers(folder: &Path, ending: &str) {
 
 /// Repairs interrupted publications under the name of `target`. The caller holds the [`PublishLock`].
 ///
-/// A publication that cannot be completed is discarded if the caller publishes a result that `supersedes` it: a later run
-/// must not complete it over that result.
+/// `supersedes`: the caller is about to publish a result. A publication that cannot be completed is then discarded, so
+/// that no later run completes it over that result.
 pub(super) fn repair(target: &Path, supersedes: bool) {
-    let Ok((path, name)) = parts(target) else { return };
+    let Ok((path, name)) = split_target(target) else { return };
     let Ok(parent) = FolderHandle::open(&path) else { return };
     for entry in parent.entries().unwrap_or_default().iter().filter(|entry| is_workspace(entry, name)) {
         if !parent.open_folder(entry).is_ok_and(|folder| is_unfinished(&folder)) {
             continue;
         }
         let Some(leftover) = take_unfinished(&parent, entry) else { continue };
-        if let Err(error) = settle(&leftover.folder, &parent, target) {
+        if let Err(error) = finish_publication(&leftover.folder, &parent, target) {
             let _ = if supersedes { leftover.folder.remove(JOURNAL) } else { Ok(()) };
             warn(format!("an interrupted run that wrote {} could not be repaired: {error}", target.shown()));
         }
     }
 }
 
-/// Takes an unfinished workspace while this run holds the [`PublishLock`]. No run that goes on has one then, except after
-/// a failure and just before its end, so a lock on it is another run looking at it for a moment.
+/// Takes an unfinished workspace while this run holds the [`PublishLock`]. A running process has an unfinished
+/// workspace then only after a failure, just before it ends. A lock on the workspace otherwise means that another run
+/// is inspecting it for a moment, so this waits.
 fn take_unfinished(parent: &FolderHandle, name: &OsStr) -> Option<Leftover> {
     let start = Instant::now();
     loop {
         match Leftover::take(parent, name) {
             Ok(leftover) => return Some(leftover),
-            Err(Refusal::Busy) if start.elapsed() < LONGEST_LOOK => std::thread::sleep(Duration::from_millis(1)),
+            Err(Refusal::Busy) if start.elapsed() < MAX_INSPECTION_WAIT => std::thread::sleep(Duration::from_millis(1)),
             Err(_) => return None,
         }
     }
 }
 
-/// Brings an interrupted publication to its end. The caller holds the [`PublishLock`].
+/// Completes or reverts an interrupted publication. The caller holds the [`PublishLock`].
 ///
-/// Files of a journal get their names. An earlier folder gets its name back if no other entry has it; otherwise entries
-/// that its summary does not list are moved into the new folder. If that is refused, for example because a folder belongs
-/// to another user, the earlier folder is kept beside the result under a visible name.
-pub(super) fn settle(folder: &FolderHandle, parent: &FolderHandle, target: &Path) -> Result<()> {
-    let (_, name) = parts(target)?;
+/// Files of a journal get their final names. An earlier folder gets its name back if no other entry has it. Otherwise
+/// its entries that its summary does not list are moved into the new folder. If that fails, for example because a
+/// folder belongs to another user, the earlier folder is kept beside the result under a visible name.
+pub(super) fn finish_publication(folder: &FolderHandle, parent: &FolderHandle, target: &Path) -> Result<()> {
+    let (_, name) = split_target(target)?;
     if folder.has(JOURNAL) {
-        complete(folder, parent, target)?;
+        complete_journal(folder, parent, target)?;
     }
     if folder.has(REPLACED) && !parent.has(name) {
         folder.rename(REPLACED, parent, name).map_err(Error::io("put back", target))?;
     }
-    // In one step: a part of an earlier result must not be taken for a result.
+    // Rename in one step: a partly deleted earlier result must not be mistaken for a result.
     if !folder.has(REPLACED) {
         return Ok(());
     }
     let old = folder.open_folder(REPLACED).map_err(Error::io("open the earlier folder of", target))?;
     let carried = match parent.has_folder(name) {
-        true => carry_foreign(&old, target),
+        true => move_foreign_entries(&old, target),
         false => Err(io::Error::from(io::ErrorKind::NotADirectory)),
     };
     let Err(refused) = carried else {
@@ -183,10 +185,10 @@ pub(super) fn settle(folder: &FolderHandle, parent: &FolderHandle, target: &Path
     Ok(())
 }
 
-/// Gives the remaining files of a journal their names.
-fn complete(folder: &FolderHandle, parent: &FolderHandle, target: &Path) -> Result<()> {
+/// Gives the remaining files of the journal their final names.
+fn complete_journal(folder: &FolderHandle, parent: &FolderHandle, target: &Path) -> Result<()> {
     let failed = |error| Error::io("complete the interrupted output of", target)(error);
-    let (_, name) = parts(target)?;
+    let (_, name) = split_target(target)?;
     let mut text = Vec::new();
     let mut file = folder.open_file(JOURNAL, false).map_err(failed)?;
     (&mut file).take(MAX_JOURNAL).read_to_end(&mut text).map_err(failed)?;

@@ -1,7 +1,7 @@
-//! Which files are a result's own, and which are somebody else's.
+//! Ownership of files: which files belong to a result, and which were added by others.
 //!
-//! The summary of a result names them: its `files`, relative to the summary's folder. Files that came into a result's
-//! folder from elsewhere, pictures and scores that other programs wrote, are in no such list.
+//! The summary of a result lists its files under `files`, relative to the folder of the summary. Files that other
+//! programs added to a result's folder, such as images and scores, are not in the list.
 
 use std::collections::BTreeSet;
 use std::ffi::{OsStr, OsString};
@@ -14,24 +14,25 @@ use splat_platform::{FolderHandle, open_without_waiting};
 
 use crate::error::{Error, Result, ShowPath, quoted};
 
-/// The file by which a folder is known as this program's: a JSON object whose `tool` names it. Its `files` are the
-/// result's own; [`super::StagedFolder::commit`] and [`super::commit_files`] enter them.
+/// Name of the summary file that identifies a folder as a result of this program: a JSON object whose `tool` names the
+/// program. Its `files` list the result's files; [`super::StagedFolder::commit`] and [`super::StagedFiles::commit`] add
+/// them.
 pub const MARKER: &str = "summary.json";
 
-/// Bytes of the largest file that is read as a summary, 16 MiB: the list of some 500,000 files. A larger file is not a
-/// summary of this program, and not read.
+/// Maximum size in bytes of a file that is read as a summary: 16 MiB, enough to list about 500,000 files. Larger files
+/// are not summaries of this program and are not read.
 const MAX_SUMMARY: u64 = 16 << 20;
 
-/// Ownership that a summary declares.
+/// Ownership declared by a summary.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) enum Owner {
-    /// There is no summary that lists its files, or it is another program's.
+    /// No summary with a list of files, or a summary of another program.
     Unknown,
-    /// A result of this program with these files.
+    /// Result of this program with these files.
     Listed(BTreeSet<String>),
 }
 
-/// Entries of a summary that say whose it is. Other entries are skipped without keeping them in memory.
+/// Fields of a summary that declare ownership. Other fields are skipped without keeping them in memory.
 #[derive(Deserialize)]
 struct Declared {
     tool: String,
@@ -39,9 +40,9 @@ struct Declared {
 }
 
 impl Owner {
-    /// Reads the summary at `path`; a link to a summary counts as one.
+    /// Reads the summary at `path`, which may be a link.
     pub(super) fn read(path: &Path) -> Owner {
-        // Opening a FIFO would wait for its writer.
+        // A plain open of a FIFO would wait for its writer.
         open_without_waiting(path).map_or(Owner::Unknown, Owner::read_file)
     }
 
@@ -61,11 +62,11 @@ impl Owner {
     }
 }
 
-/// Writes into the summary at `path` that these are its files.
-pub(super) fn name_files(path: &Path, files: &[String]) -> Result<()> {
+/// Adds the list `files` to the summary at `path`. Fails if the summary is not a JSON object.
+pub(super) fn add_file_list(path: &Path, files: &[String]) -> Result<()> {
     let text = fs::read_to_string(path).map_err(Error::io("read back", path))?;
     let found: serde_json::Value = serde_json::from_str(&text).unwrap_or_default();
-    // As text, for the other entries keep their order.
+    // Edit the text, so that the other entries keep their order.
     let Some(entries) = text.trim_end().strip_suffix('}').filter(|_| found.is_object()) else {
         return Err(Error::internal(format!(
             "{}: expected a JSON object to list files in, found {}",
@@ -81,7 +82,7 @@ pub(super) fn name_files(path: &Path, files: &[String]) -> Result<()> {
     fs::write(path, text).map_err(Error::io("write", path))
 }
 
-/// Every file below `folder`, relative to it, sorted.
+/// Returns the paths of all files below `folder`, relative to it and sorted.
 pub(super) fn files_below(folder: &Path) -> Result<Vec<String>> {
     fn visit(folder: &Path, inside: &Path, out: &mut Vec<String>) -> Result<()> {
         for entry in entries(folder)? {
@@ -96,12 +97,12 @@ pub(super) fn files_below(folder: &Path) -> Result<Vec<String>> {
     Ok(files)
 }
 
-/// Moves the entries of the folder `old` that its summary does not list into the folder `new`. Where `new` has an entry of
-/// the same name, the moved one gets `.kept` behind its name.
+/// Moves the entries of the folder `old` that its summary does not list into the folder `new`. An entry whose name
+/// exists in `new` gets `.kept` appended to its name.
 ///
-/// Entries that cannot be moved stay, and the first failure is returned. May be repeated after it was interrupted at
-/// any point: every entry is always in exactly one of both folders.
-pub(super) fn carry_foreign(old: &FolderHandle, new: &Path) -> io::Result<()> {
+/// Entries that cannot be moved stay, and the first failure is returned. The function may be repeated after an
+/// interruption at any point: every entry is always in exactly one of the two folders.
+pub(super) fn move_foreign_entries(old: &FolderHandle, new: &Path) -> io::Result<()> {
     let listed = match old.open_file(MARKER, false).map(Owner::read_file) {
         Ok(Owner::Listed(listed)) => listed,
         _ => BTreeSet::new(),
@@ -109,16 +110,16 @@ pub(super) fn carry_foreign(old: &FolderHandle, new: &Path) -> io::Result<()> {
     let mut foreign = Vec::new();
     let mut result = find_foreign(old, new, Path::new(""), &listed, &mut foreign);
     for relative in foreign {
-        let to = free_place(new, &relative);
+        let to = unused_path(new, &relative);
         let made = to.parent().map_or(Ok(()), fs::create_dir_all);
         result = result.and(made.and_then(|()| old.move_to(&relative, &to)));
     }
     result
 }
 
-/// Collects the relative paths of files in `folder`, which is `inside` the old result, that `listed` does not hold, and of
-/// folders that hold no listed file and do not exist in `new`. Folders that cannot be read are skipped; the first failure
-/// is returned.
+/// Collects in `out` the relative paths of foreign entries of `folder`, which lies at `inside` in the old result: files
+/// that are not in `listed`, and folders that hold no listed file and do not exist in `new`. Skips folders that cannot
+/// be read and returns the first failure.
 fn find_foreign(
     folder: &FolderHandle,
     new: &Path,
@@ -148,14 +149,14 @@ fn find_foreign(
     result
 }
 
-/// A path below `folder` that nothing has and that can be made: `relative`, but for what is in its way.
-fn free_place(folder: &Path, relative: &Path) -> PathBuf {
+/// Returns an unused path below `folder` for `relative`. Names that are in the way of it get `.kept` appended.
+fn unused_path(folder: &Path, relative: &Path) -> PathBuf {
     let mut place = folder.to_owned();
     let mut components = relative.components().peekable();
     while let Some(component) = components.next() {
         let mut name = component.as_os_str().to_owned();
         let is_last = components.peek().is_none();
-        while present(&place.join(&name)) && (is_last || !is_folder(&place.join(&name))) {
+        while exists(&place.join(&name)) && (is_last || !is_folder(&place.join(&name))) {
             name.push(".kept");
         }
         place.push(name);
@@ -163,13 +164,13 @@ fn free_place(folder: &Path, relative: &Path) -> PathBuf {
     place
 }
 
-/// How lists write a relative path, on every system.
+/// Returns a relative path as summaries list it, with `/` on every system.
 fn listed_name(relative: &Path) -> String {
     let components: Vec<_> = relative.iter().map(OsStr::to_string_lossy).collect();
     components.join("/")
 }
 
-/// Names in a folder, sorted: the order of a listing is the file system's.
+/// Returns the names in a folder, sorted because the order of a listing depends on the file system.
 pub(super) fn entries(folder: &Path) -> Result<Vec<OsString>> {
     let listed = fs::read_dir(folder).and_then(|entries| entries.map(|entry| Ok(entry?.file_name())).collect());
     let mut names: Vec<OsString> = listed.map_err(Error::io("list", folder))?;
@@ -177,20 +178,23 @@ pub(super) fn entries(folder: &Path) -> Result<Vec<OsString>> {
     Ok(names)
 }
 
-/// Whether anything has that name, be it a link to nowhere.
-pub(super) fn present(path: &Path) -> bool {
+/// Returns whether an entry exists at `path`, including dangling links.
+pub(super) fn exists(path: &Path) -> bool {
     fs::symlink_metadata(path).is_ok()
 }
 
-/// Whether that is a folder, and no link to one.
+/// Returns whether `path` is a folder and not a link to one.
 fn is_folder(path: &Path) -> bool {
     fs::symlink_metadata(path).is_ok_and(|found| found.is_dir())
 }
 
-/// The folder and the name of a target.
-pub(super) fn parts(target: &Path) -> Result<(PathBuf, &OsStr)> {
+/// Splits a target into its folder and its name. Fails if it has no name.
+pub(super) fn split_target(target: &Path) -> Result<(PathBuf, &OsStr)> {
     let Some(name) = target.file_name() else {
-        return Err(Error::usage(format!("{} is no name for an output", quoted(&target.to_string_lossy()))));
+        return Err(Error::usage(format!(
+            "{} cannot be the name of an output; give a file or folder name",
+            quoted(&target.to_string_lossy())
+        )));
     };
     let parent = target.parent().filter(|parent| !parent.as_os_str().is_empty());
     Ok((parent.unwrap_or(Path::new(".")).to_owned(), name))

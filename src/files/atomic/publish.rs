@@ -1,4 +1,4 @@
-//! Publication: finished outputs get their names, one run at a time for each name.
+//! Publication of finished outputs under their names, by one run at a time for each name.
 
 use std::ffi::OsString;
 use std::fs;
@@ -7,20 +7,20 @@ use std::path::Path;
 use splat_platform::{FolderHandle, sync_file, sync_folder};
 
 use super::destination::{Kind, Replace, check_replace};
-use super::leftovers::{Journal, PublishLock, repair, settle};
-use super::named::{parts, present};
+use super::leftovers::{Journal, PublishLock, finish_publication, repair};
+use super::named::{exists, split_target};
 use super::warnings::warn;
-use super::workspace::{JOURNAL, REPLACED, Workspace, live};
+use super::workspace::{JOURNAL, REPLACED, Workspace, live_workspaces};
 use crate::error::{Error, Result, ShowPath};
 
-/// Gives files in `workspace` the names beside it that go with them, in order; the last one is the output itself, the others
-/// are its companions. The files have been written through to the disk.
+/// Renames files from `workspace` to their targets, in order. The last one is the output itself, the others are its
+/// companions. The files must have been synced to disk.
 ///
-/// A journal says which files belong together: after a kill or a failure in between the next run with this output
-/// completes the set.
+/// For more than one file, a journal records which files belong together: if the process is killed or fails in between,
+/// the next run with this output completes the set.
 ///
 /// # Errors
-/// An entry that appeared meanwhile and that `replace` does not allow to replace; the system refuses.
+/// Fails if a file that `replace` does not allow to replace appeared meanwhile, or if a system call fails.
 pub(super) fn publish_files(workspace: &Workspace, files: &[(String, &Path)], replace: Replace) -> Result<()> {
     let Some((_, target)) = files.last() else { return Ok(()) };
     let lock = PublishLock::acquire(target)?;
@@ -28,7 +28,7 @@ pub(super) fn publish_files(workspace: &Workspace, files: &[(String, &Path)], re
     for (_, target) in files {
         check_replace(target, Kind::File, replace)?;
     }
-    let held = live();
+    let held = live_workspaces();
     let journal = workspace.folder.join(JOURNAL);
     if files.len() > 1 {
         write_journal(workspace, files, replace)?;
@@ -47,11 +47,12 @@ pub(super) fn publish_files(workspace: &Workspace, files: &[(String, &Path)], re
     Ok(())
 }
 
+/// Writes and syncs the journal of the files in `workspace`.
 fn write_journal(workspace: &Workspace, files: &[(String, &Path)], replace: Replace) -> Result<()> {
-    let names = files.iter().map(|(content, target)| Ok((content.clone(), parts(target)?.1.to_owned())));
+    let names = files.iter().map(|(content, target)| Ok((content.clone(), split_target(target)?.1.to_owned())));
     let journal = Journal { replace, files: names.collect::<Result<Vec<(String, OsString)>>>()? };
     let text = serde_json::to_vec(&journal).expect("plain data");
-    // Under another name until it is complete.
+    // Write under another name until it is complete.
     let (begun, path) = (workspace.folder.join("journal-begun"), workspace.folder.join(JOURNAL));
     let written = fs::write(&begun, text).and_then(|()| sync_file(&begun));
     let written = written.and_then(|()| fs::rename(&begun, &path)).and_then(|()| workspace.sync());
@@ -61,20 +62,21 @@ fn write_journal(workspace: &Workspace, files: &[(String, &Path)], replace: Repl
     })
 }
 
-/// Gives the folder in `workspace` the name `target`, in place of an earlier folder if there is one.
+/// Renames the folder in `workspace` to `target`, replacing an earlier folder if there is one.
 ///
-/// After a kill in between, the next run with this output puts the earlier folder back or moves what follows the name.
+/// If the process is killed in between, the next run with this output either puts the earlier folder back or completes
+/// the replacement.
 ///
 /// # Errors
-/// An entry that appeared meanwhile and that `replace` does not allow to replace; the system refuses. The target is then
-/// as it was. A failure after the folder has its name is a warning.
+/// Fails if an entry that `replace` does not allow to replace appeared meanwhile, or if a system call fails. The target
+/// is then unchanged. A failure after the rename is only a warning.
 pub(super) fn publish_folder(workspace: &Workspace, target: &Path, replace: Replace) -> Result<()> {
     let lock = PublishLock::acquire(target)?;
     repair(target, true);
     check_replace(target, Kind::Folder, replace)?;
-    let held = live();
+    let held = live_workspaces();
     let aside = workspace.folder.join(REPLACED);
-    if present(target) {
+    if exists(target) {
         workspace.sync().map_err(Error::io("sync", &workspace.folder))?;
         fs::rename(target, &aside).map_err(Error::io("move aside", target))?;
     }
@@ -82,13 +84,14 @@ pub(super) fn publish_folder(workspace: &Workspace, target: &Path, replace: Repl
         let _ = fs::rename(&aside, target);
         return Err(Error::io("write", target)(error));
     }
-    let (parent, _) = parts(target)?;
+    let (parent, _) = split_target(target)?;
     let handles = FolderHandle::open(&workspace.folder).and_then(|folder| Ok((folder, FolderHandle::open(&parent)?)));
-    let settled =
-        handles.map_err(Error::io("open", &parent)).and_then(|(folder, parent)| settle(&folder, &parent, target));
+    let settled = handles
+        .map_err(Error::io("open", &parent))
+        .and_then(|(folder, parent)| finish_publication(&folder, &parent, target));
     if let Err(error) = settled {
         warn(format!(
-            "{} is complete and in place, but the earlier folder could not be dealt with ({error}); the next run with this \
+            "{} is complete and in place, but the earlier folder could not be cleaned up ({error}); the next run with this \
              output tries again",
             target.shown()
         ));
@@ -99,9 +102,9 @@ pub(super) fn publish_folder(workspace: &Workspace, target: &Path, replace: Repl
     Ok(())
 }
 
-/// Writes the name of a published output through to the disk. A failure is a warning: the output is in place.
+/// Syncs the name of a published output to disk. A failure is only a warning, because the output is in place.
 fn sync_parent(target: &Path) {
-    let Ok((parent, _)) = parts(target) else { return };
+    let Ok((parent, _)) = split_target(target) else { return };
     if let Err(error) = sync_folder(&parent) {
         warn(format!(
             "{} is complete and in place, but its name could not be written through to the disk ({error}): a power failure \

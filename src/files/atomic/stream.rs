@@ -1,4 +1,4 @@
-//! Outputs that are written into a character device or a FIFO instead of getting a name.
+//! Outputs that are written into a character device or a FIFO.
 
 use std::fs::File;
 use std::io;
@@ -11,20 +11,23 @@ use splat_platform::{is_standard_output, open_stream};
 use super::destination::{Destination, destination};
 use crate::error::{Error, Result, ShowPath};
 
-/// Longest wait for a program that opens the other end of a FIFO.
-const LONGEST_WAIT: Duration = Duration::from_secs(10);
+/// Maximum time to wait for a program to open the other end of a FIFO.
+const MAX_WAIT: Duration = Duration::from_secs(10);
 
+/// Whether an output was written to standard output.
 static IS_STANDARD_OUTPUT_USED: AtomicBool = AtomicBool::new(false);
 
-/// Whether an output was written into the same device or pipe that is standard output: reports must not follow it there.
+/// Returns whether an output was written to the device or pipe that is standard output. Reports must then not be
+/// printed there.
 pub fn is_standard_output_used() -> bool {
     IS_STANDARD_OUTPUT_USED.load(Ordering::Relaxed)
 }
 
-/// Writes the file `content` into the device or FIFO `target`.
+/// Copies the file `content` into the device or FIFO `target`.
 ///
 /// # Errors
-/// A target that is no device or FIFO any more; a FIFO that no program reads for 10 s; a failed write.
+/// Fails if the target is no longer a device or FIFO, if no program opens a FIFO for reading within 10 s, or if a write
+/// fails.
 pub(super) fn copy(content: &Path, target: &Path) -> Result<()> {
     let failed = |error| Error::io("write to", target)(error);
     let mut from = File::open(content).map_err(Error::io("read back", content))?;
@@ -39,14 +42,14 @@ pub(super) fn copy(content: &Path, target: &Path) -> Result<()> {
     Ok(())
 }
 
-/// Opens a device or FIFO for writing. A FIFO that nobody reads is tried again for a while, then is an error.
+/// Opens a device or FIFO for writing. Retries for [`MAX_WAIT`] if no program reads a FIFO, then fails.
 fn open(target: &Path) -> io::Result<File> {
     let start = Instant::now();
     loop {
         if let Some(file) = open_stream(target)? {
             return Ok(file);
         }
-        if start.elapsed() > LONGEST_WAIT {
+        if start.elapsed() > MAX_WAIT {
             return Err(io::Error::new(
                 io::ErrorKind::TimedOut,
                 "no program has opened this FIFO for reading for 10 s",

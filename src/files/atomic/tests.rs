@@ -2,7 +2,7 @@ use std::fs::File;
 
 use super::*;
 
-fn put(path: &Path, text: &str) {
+fn write_file(path: &Path, text: &str) {
     if let Some(parent) = path.parent() {
         fs::create_dir_all(parent).unwrap();
     }
@@ -10,7 +10,7 @@ fn put(path: &Path, text: &str) {
 }
 
 /// Names in a folder, sorted.
-fn names(folder: &Path) -> Vec<String> {
+fn names_in(folder: &Path) -> Vec<String> {
     let mut names: Vec<String> =
         fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect();
     names.sort();
@@ -18,8 +18,8 @@ fn names(folder: &Path) -> Vec<String> {
 }
 
 fn result_folder(path: &Path, content: &str) {
-    put(&path.join(MARKER), r#"{"tool": "splatsieve 0.1.0", "files": ["content", "summary.json"]}"#);
-    put(&path.join("content"), content);
+    write_file(&path.join(MARKER), r#"{"tool": "splatsieve 0.1.0", "files": ["content", "summary.json"]}"#);
+    write_file(&path.join("content"), content);
 }
 
 fn refusal(target: &Path, kind: Kind, inputs: &[&Path], replace: Replace) -> String {
@@ -37,49 +37,49 @@ fn a_file_appears_only_at_commit() {
     assert!(!target.exists());
     staged.commit().unwrap();
     assert_eq!(fs::read_to_string(&target).unwrap(), "new");
-    assert_eq!(names(base.path()), ["out.ply"]);
+    assert_eq!(names_in(base.path()), ["out.ply"]);
 }
 
 #[test]
-fn what_is_dropped_leaves_nothing_and_the_old_output_whole() {
+fn dropped_output_leaves_the_old_output() {
     let base = tempfile::tempdir().unwrap();
     let (file, folder) = (base.path().join("out.ply"), base.path().join("out"));
-    put(&file, "old");
+    write_file(&file, "old");
     result_folder(&folder, "old");
     let staged = StagedFile::new(&file, Replace::Existing).unwrap();
     fs::write(staged.path(), "new").unwrap();
     drop(staged);
     let staged = StagedFolder::new(&folder, Replace::Existing).unwrap();
-    put(&staged.path().join("deep/content"), "new");
+    write_file(&staged.path().join("deep/content"), "new");
     drop(staged);
-    assert_eq!(names(base.path()), ["out", "out.ply"]);
+    assert_eq!(names_in(base.path()), ["out", "out.ply"]);
     assert_eq!(fs::read_to_string(file).unwrap(), "old");
     assert_eq!(fs::read_to_string(folder.join("content")).unwrap(), "old");
 }
 
 #[test]
-fn an_existing_target_is_refused_before_work_and_again_at_commit() {
+fn existing_target_is_refused_at_start_and_at_commit() {
     let base = tempfile::tempdir().unwrap();
     let target = base.path().join("out.ply");
     check_target(&target, Kind::File, &[], Replace::Never).unwrap();
     let staged = StagedFile::new(&target, Replace::Never).unwrap();
     fs::write(staged.path(), "new").unwrap();
-    put(&target, "somebody else's");
+    write_file(&target, "somebody else's");
     assert!(staged.commit().unwrap_err().to_string().contains("exists already"));
     assert_eq!(fs::read_to_string(&target).unwrap(), "somebody else's");
     assert!(refusal(&target, Kind::File, &[], Replace::Never).contains("--overwrite"));
     assert!(StagedFile::new(&target, Replace::Never).is_err());
     check_target(&target, Kind::File, &[], Replace::Existing).unwrap();
-    assert_eq!(names(base.path()), ["out.ply"]);
+    assert_eq!(names_in(base.path()), ["out.ply"]);
 }
 
 #[test]
-fn the_input_what_holds_it_and_what_lies_in_it_are_never_a_target() {
+fn input_its_parents_and_children_are_never_targets() {
     let base = tempfile::tempdir().unwrap();
     let model = base.path().join("scenes/model");
     let cloud = model.join("point_cloud.ply");
     result_folder(&model, "");
-    put(&cloud, "");
+    write_file(&cloud, "");
     for replace in [Replace::Never, Replace::Existing] {
         assert!(refusal(&model, Kind::Folder, &[&model], replace).contains("input itself"));
         assert!(refusal(&cloud, Kind::File, &[&cloud], replace).contains("input itself"));
@@ -89,13 +89,13 @@ fn the_input_what_holds_it_and_what_lies_in_it_are_never_a_target() {
         assert!(refusal(&detour, Kind::Folder, &[&model], replace).contains("input itself"));
         assert!(refusal(&model.join("smaller"), Kind::Folder, &[&model], replace).contains("lies inside the input"));
     }
-    // A name that merely starts like the input's is another one.
+    // A name that only starts like the input's is another path.
     check_target(&base.path().join("scenes/model2"), Kind::Folder, &[&model], Replace::Never).unwrap();
 }
 
 #[cfg(unix)]
 #[test]
-fn a_link_to_the_input_is_the_input() {
+fn link_to_the_input_is_refused() {
     let base = tempfile::tempdir().unwrap();
     let (model, link) = (base.path().join("model"), base.path().join("link"));
     result_folder(&model, "");
@@ -108,17 +108,17 @@ fn a_link_to_the_input_is_the_input() {
 fn overwrite_deletes_only_folders_this_program_wrote() {
     let base = tempfile::tempdir().unwrap();
     let home = base.path().join("home");
-    put(&home.join("thesis.txt"), "years of work");
+    write_file(&home.join("thesis.txt"), "years of work");
     assert!(refusal(&home, Kind::Folder, &[], Replace::Existing).contains("not a result of splatsieve"));
     let unlisted = r#"{"tool": "splatsieve 0.1.0"}"#;
     for foreign in ["{}", "[]", "no json", r#"{"tool": "another"}"#, r#"{"tool": 1}"#, unlisted] {
-        put(&home.join(MARKER), foreign);
+        write_file(&home.join(MARKER), foreign);
         assert!(
             refusal(&home, Kind::Folder, &[], Replace::Existing).contains("not a result of splatsieve"),
             "{foreign}"
         );
     }
-    put(&home.join(MARKER), r#"{"tool": "splatsieve 0.1.0", "files": ["summary.json"]}"#);
+    write_file(&home.join(MARKER), r#"{"tool": "splatsieve 0.1.0", "files": ["summary.json"]}"#);
     check_target(&home, Kind::Folder, &[], Replace::Existing).unwrap();
     let empty = base.path().join("empty");
     fs::create_dir(&empty).unwrap();
@@ -128,56 +128,58 @@ fn overwrite_deletes_only_folders_this_program_wrote() {
 }
 
 #[test]
-fn a_folder_that_became_foreign_during_the_run_is_left_alone() {
+fn folder_that_becomes_foreign_during_the_run_is_kept() {
     let base = tempfile::tempdir().unwrap();
     let target = base.path().join("out");
     let staged = StagedFolder::new(&target, Replace::Existing).unwrap();
     result_folder(staged.path(), "new");
-    put(&target.join("thesis.txt"), "years of work");
+    write_file(&target.join("thesis.txt"), "years of work");
     staged.commit().unwrap_err();
-    assert_eq!(names(&target), ["thesis.txt"]);
-    assert_eq!(names(base.path()), ["out"]);
+    assert_eq!(names_in(&target), ["thesis.txt"]);
+    assert_eq!(names_in(base.path()), ["out"]);
 }
 
 #[test]
 fn impossible_targets_are_refused() {
     let base = tempfile::tempdir().unwrap();
-    put(&base.path().join("file"), "");
+    write_file(&base.path().join("file"), "");
     assert!(refusal(&base.path().join("no/such/out"), Kind::Folder, &[], Replace::Never).contains("create it first"));
     assert!(refusal(&base.path().join("file/out"), Kind::File, &[], Replace::Never).contains("is not a folder"));
     for nameless in ["", "/", ".."] {
-        assert!(refusal(Path::new(nameless), Kind::Folder, &[], Replace::Existing).contains("no name"), "{nameless}");
+        assert!(
+            refusal(Path::new(nameless), Kind::Folder, &[], Replace::Existing).contains("cannot be the name of an output"),
+            "{nameless}"
+        );
     }
 }
 
-/// What a run leaves beside `base/out` that is killed: its folder, and the file whose lock it held.
-fn left_behind(base: &Path, random: &str) -> PathBuf {
+/// Creates the workspace that a killed run leaves beside `base/out`: its folder and an unlocked lock file.
+fn killed_workspace(base: &Path, random: &str) -> PathBuf {
     let folder = base.join(format!(".out.{random}.splatsieve-tmp"));
-    put(&folder.join("lock"), workspace::LOCK_LINE);
+    write_file(&folder.join("lock"), workspace::LOCK_LINE);
     folder
 }
 
 #[test]
-fn leftovers_of_killed_runs_go_and_those_of_running_ones_stay() {
+fn only_leftovers_of_killed_runs_are_removed() {
     let base = tempfile::tempdir().unwrap();
     let target = base.path().join("out");
-    put(&left_behind(base.path(), "dead1").join("content/deep/part"), "half");
-    put(&left_behind(base.path(), "dead2").join("content"), "half");
+    write_file(&killed_workspace(base.path(), "dead1").join("content/deep/part"), "half");
+    write_file(&killed_workspace(base.path(), "dead2").join("content"), "half");
     fs::create_dir(base.path().join(".out.begun.splatsieve-tmp")).unwrap();
-    // A run of which this process knows nothing but its lock, as of one in another container.
-    let runs = left_behind(base.path(), "alive");
+    // A run known to this process only by its lock, like one in another container.
+    let runs = killed_workspace(base.path(), "alive");
     let lock = File::open(runs.join("lock")).unwrap();
     lock.lock().unwrap();
-    put(&runs.join("content"), "half");
-    // Somebody else's, whatever they are called.
-    // A folder without the line in its lock is foreign.
+    write_file(&runs.join("content"), "half");
+    // Folders of other targets or with other names, and folders without the line in their lock file, are foreign.
     let kept = [
         ".other.dead1.splatsieve-tmp/lock",
         ".out.a.b.splatsieve-tmp/lock",
         ".out.x.splatsieve-tmp/no lock",
         ".out.y.splatsieve-tmp/lock",
     ];
-    kept.iter().for_each(|name| put(&base.path().join(name), ""));
+    kept.iter().for_each(|name| write_file(&base.path().join(name), ""));
     let first = StagedFolder::new(&target, Replace::Never).unwrap();
     let second = StagedFolder::new(&target, Replace::Never).unwrap();
     assert!(first.path().exists() && second.path().exists() && first.path() != second.path());
@@ -185,70 +187,70 @@ fn leftovers_of_killed_runs_go_and_those_of_running_ones_stay() {
     let mut expected: Vec<String> = kept.iter().map(|name| name.split_once('/').unwrap().0.to_owned()).collect();
     expected.push(".out.alive.splatsieve-tmp".to_owned());
     expected.sort();
-    assert_eq!(names(base.path()), expected);
+    assert_eq!(names_in(base.path()), expected);
     drop(lock);
     drop(StagedFile::new(&target, Replace::Never).unwrap());
     assert!(!runs.exists(), "its run has ended now");
 }
 
 #[test]
-fn a_run_killed_between_its_renames_does_not_lose_the_old_output() {
+fn run_killed_between_renames_keeps_the_old_output() {
     for aside in ["replaced", "replaced-whole"] {
         let base = tempfile::tempdir().unwrap();
         let target = base.path().join("out");
-        result_folder(&left_behind(base.path(), "dead").join(aside), "old");
+        result_folder(&killed_workspace(base.path(), "dead").join(aside), "old");
         drop(StagedFolder::new(&target, Replace::Existing).unwrap());
-        assert_eq!(names(base.path()), ["out"]);
+        assert_eq!(names_in(base.path()), ["out"]);
         assert_eq!(fs::read_to_string(target.join("content")).unwrap(), "old");
     }
 }
 
 #[test]
-fn a_workspace_whose_lock_is_still_empty_is_removed() {
+fn workspace_with_an_empty_lock_is_removed() {
     let base = tempfile::tempdir().unwrap();
     let target = base.path().join("out");
-    // As a run leaves it that is killed between creating the lock file and writing its line.
+    // State left by a run that is killed between creating the lock file and writing its line.
     let workspace = Workspace::beside(&target).unwrap();
     File::create(workspace.folder.join("lock")).unwrap();
     let begun = base.path().join(".out.killed.splatsieve-tmp");
     fs::rename(&workspace.folder, &begun).unwrap();
     drop(workspace);
-    assert_eq!(names(base.path()), [".out.killed.splatsieve-tmp"]);
+    assert_eq!(names_in(base.path()), [".out.killed.splatsieve-tmp"]);
     drop(StagedFile::new(&target, Replace::Never).unwrap());
-    assert_eq!(names(base.path()), [] as [&str; 0]);
+    assert_eq!(names_in(base.path()), [] as [&str; 0]);
 }
 
 #[test]
-fn a_run_killed_after_its_renames_has_the_new_output_and_does_not_lose_foreign_files() {
+fn run_killed_after_renames_keeps_foreign_files() {
     for (aside, is_carried) in [("replaced", true), ("replaced-whole", false), ("discarded", false)] {
         let base = tempfile::tempdir().unwrap();
         let target = base.path().join("out");
         result_folder(&target, "new");
-        let old = left_behind(base.path(), "dead").join(aside);
+        let old = killed_workspace(base.path(), "dead").join(aside);
         result_folder(&old, "old");
-        put(&old.join("test/one.png"), "precious");
+        write_file(&old.join("test/one.png"), "precious");
         drop(StagedFolder::new(&target, Replace::Existing).unwrap());
-        assert_eq!(names(base.path()), ["out"]);
+        assert_eq!(names_in(base.path()), ["out"]);
         assert_eq!(fs::read_to_string(target.join("content")).unwrap(), "new");
         assert_eq!(target.join("test/one.png").exists(), is_carried, "{aside}");
     }
 }
 
 #[test]
-fn what_another_put_into_a_result_stays_and_where_the_new_one_has_its_place_lies_beside_it() {
+fn foreign_files_in_a_result_are_kept() {
     let base = tempfile::tempdir().unwrap();
     let target = base.path().join("out");
     let staged = StagedFolder::new(&target, Replace::Never).unwrap();
     for name in [MARKER, "a/own", "a/b/own", "only/own"] {
-        put(&staged.path().join(name), r#"{"tool": "splatsieve 0.1.0"}"#);
+        write_file(&staged.path().join(name), r#"{"tool": "splatsieve 0.1.0"}"#);
     }
     staged.commit().unwrap();
     let foreign = ["a/theirs", "a/b/own2", "all/theirs/deep", "file", "folder/theirs", "file in the new one/theirs"];
-    foreign.iter().for_each(|name| put(&target.join(name), name));
+    foreign.iter().for_each(|name| write_file(&target.join(name), name));
     fs::create_dir(target.join("empty")).unwrap();
     let staged = StagedFolder::new(&target, Replace::Existing).unwrap();
     for name in [MARKER, "a/own", "file", "folder/own", "file in the new one"] {
-        put(&staged.path().join(name), r#"{"tool": "splatsieve 0.1.0"}"#);
+        write_file(&staged.path().join(name), r#"{"tool": "splatsieve 0.1.0"}"#);
     }
     staged.commit().unwrap();
     let found = named::files_below(&target).unwrap();
@@ -273,7 +275,7 @@ fn what_another_put_into_a_result_stays_and_where_the_new_one_has_its_place_lies
         let kept = found.iter().any(|found| fs::read_to_string(target.join(found)).unwrap() == *name);
         assert!(kept, "{name} is lost");
     }
-    assert_eq!(names(base.path()), ["out"]);
+    assert_eq!(names_in(base.path()), ["out"]);
 }
 
 #[test]
@@ -281,50 +283,50 @@ fn a_summary_lists_its_files_and_keeps_its_order() {
     let base = tempfile::tempdir().unwrap();
     let target = base.path().join("out");
     let staged = StagedFolder::new(&target, Replace::Never).unwrap();
-    put(&staged.path().join(MARKER), "{\n  \"tool\": \"splatsieve 0.1.0\",\n  \"a\": [1]\n}\n");
-    put(&staged.path().join("b/\"quoted\""), "");
+    write_file(&staged.path().join(MARKER), "{\n  \"tool\": \"splatsieve 0.1.0\",\n  \"a\": [1]\n}\n");
+    write_file(&staged.path().join("b/\"quoted\""), "");
     staged.commit().unwrap();
     let text = fs::read_to_string(target.join(MARKER)).unwrap();
     let head = "{\n  \"tool\": \"splatsieve 0.1.0\",\n  \"a\": [1],\n  \"files\": [\n";
     assert_eq!(text, format!("{head}    \"b/\\\"quoted\\\"\",\n    \"{MARKER}\"\n  ]\n}}\n"));
     let staged = StagedFolder::new(&base.path().join("broken"), Replace::Never).unwrap();
-    put(&staged.path().join(MARKER), "no json");
+    write_file(&staged.path().join(MARKER), "no json");
     assert!(staged.commit().unwrap_err().to_string().contains("expected a JSON object"));
-    assert_eq!(names(base.path()), ["out"]);
+    assert_eq!(names_in(base.path()), ["out"]);
 }
 
-/// Prepares `x.ply` and its two companions in `base`, with `text` in each.
+/// Stages `x.ply` and its two companions in `base`, with `text` in each.
 fn stage_set(base: &Path, text: &str, replace: Replace) -> Result<StagedFiles> {
     let companions = ["x.ply.summary.json", "x.ply.recipe.toml"].map(|name| base.join(name)).to_vec();
     let staged = StagedFiles::new(&base.join("x.ply"), companions, replace)?;
-    put(staged.path(), text);
-    put(&staged.companion(0), r#"{"tool": "splatsieve 0.1.0"}"#);
-    put(&staged.companion(1), text);
+    write_file(staged.path(), text);
+    write_file(&staged.companion(0), r#"{"tool": "splatsieve 0.1.0"}"#);
+    write_file(&staged.companion(1), text);
     Ok(staged)
 }
 
 #[test]
 fn overwriting_a_file_replaces_it_with_its_companions() {
     let base = tempfile::tempdir().unwrap();
-    put(&base.path().join("x.ply"), "written by another program");
-    put(&base.path().join("x.ply.notes"), "precious");
+    write_file(&base.path().join("x.ply"), "written by another program");
+    write_file(&base.path().join("x.ply.notes"), "precious");
     stage_set(base.path(), "new", Replace::Existing).unwrap().commit().unwrap();
-    assert_eq!(names(base.path()), ["x.ply", "x.ply.notes", "x.ply.recipe.toml", "x.ply.summary.json"]);
+    assert_eq!(names_in(base.path()), ["x.ply", "x.ply.notes", "x.ply.recipe.toml", "x.ply.summary.json"]);
     assert_eq!(fs::read_to_string(base.path().join("x.ply")).unwrap(), "new");
     assert_eq!(fs::read_to_string(base.path().join("x.ply.notes")).unwrap(), "precious");
 }
 
-/// What a run leaves in `base` that is killed after it published `published` of its companions.
+/// Creates the state left in `base` by a run that is killed after it published the first `published` files.
 fn leave_half_published(base: &Path, published: usize, replace: Replace) {
     let left = base.join(".x.ply.dead.splatsieve-tmp");
-    put(&left.join("lock"), workspace::LOCK_LINE);
+    write_file(&left.join("lock"), workspace::LOCK_LINE);
     let files = [("a", "x.ply.recipe.toml"), ("b", "x.ply.summary.json"), ("content", "x.ply")];
     for (index, (content, name)) in files.iter().enumerate() {
-        put(&if index < published { base.join(name) } else { left.join(content) }, "of the killed run");
+        write_file(&if index < published { base.join(name) } else { left.join(content) }, "of the killed run");
     }
     let files = files.map(|(content, name)| (content.to_owned(), name.into())).to_vec();
     let journal = serde_json::to_string(&leftovers::Journal { replace, files }).unwrap();
-    put(&left.join("journal"), &journal);
+    write_file(&left.join("journal"), &journal);
 }
 
 #[test]
@@ -333,8 +335,8 @@ fn a_killed_publication_is_completed_by_the_next_run() {
         let base = tempfile::tempdir().unwrap();
         leave_half_published(base.path(), published, Replace::Never);
         assert!(refusal(&base.path().join("x.ply"), Kind::File, &[], Replace::Never).contains("exists already"));
-        assert_eq!(names(base.path()), ["x.ply", "x.ply.recipe.toml", "x.ply.summary.json"]);
-        for name in names(base.path()) {
+        assert_eq!(names_in(base.path()), ["x.ply", "x.ply.recipe.toml", "x.ply.summary.json"]);
+        for name in names_in(base.path()) {
             assert_eq!(fs::read_to_string(base.path().join(name)).unwrap(), "of the killed run");
         }
     }
@@ -347,7 +349,7 @@ fn a_killed_publication_is_never_completed_over_a_later_one() {
     leave_half_published(base.path(), 1, Replace::Existing);
     staged.commit().unwrap();
     check_target(&base.path().join("x.ply"), Kind::File, &[], Replace::Existing).unwrap();
-    assert_eq!(names(base.path()), ["x.ply", "x.ply.recipe.toml", "x.ply.summary.json"]);
+    assert_eq!(names_in(base.path()), ["x.ply", "x.ply.recipe.toml", "x.ply.summary.json"]);
     assert_eq!(fs::read_to_string(base.path().join("x.ply")).unwrap(), "new");
     assert_eq!(fs::read_to_string(base.path().join("x.ply.recipe.toml")).unwrap(), "new");
 }
@@ -356,14 +358,14 @@ fn a_killed_publication_is_never_completed_over_a_later_one() {
 fn a_killed_publication_does_not_replace_a_file_that_came_later() {
     let base = tempfile::tempdir().unwrap();
     leave_half_published(base.path(), 1, Replace::Never);
-    put(&base.path().join("x.ply"), "precious");
+    write_file(&base.path().join("x.ply"), "precious");
     refusal(&base.path().join("x.ply"), Kind::File, &[], Replace::Never);
     assert_eq!(fs::read_to_string(base.path().join("x.ply")).unwrap(), "precious");
     assert!(take_warnings().iter().any(|warning| warning.contains("could not be repaired")));
 }
 
 #[test]
-fn of_two_runs_without_flags_one_publishes() {
+fn only_one_of_two_runs_publishes() {
     let base = tempfile::tempdir().unwrap();
     let staged = [0, 1].map(|run| stage_set(base.path(), &run.to_string(), Replace::Never).unwrap());
     let mut done = 0;
@@ -380,13 +382,13 @@ fn of_two_runs_without_flags_one_publishes() {
 fn a_summary_larger_than_the_limit_is_not_read() {
     let base = tempfile::tempdir().unwrap();
     let path = base.path().join("summary.json");
-    put(&path, r#"{"tool": "splatsieve 0.1.0", "files": ["a"]}"#);
+    write_file(&path, r#"{"tool": "splatsieve 0.1.0", "files": ["a"]}"#);
     assert!(matches!(named::Owner::read(&path), named::Owner::Listed(_)));
     File::options().write(true).open(&path).unwrap().set_len(3 << 30).unwrap();
     assert_eq!(named::Owner::read(&path), named::Owner::Unknown);
 }
 
 #[test]
-fn a_bare_name_lands_in_the_working_folder() {
-    assert_eq!(parts(Path::new("out")).unwrap(), (PathBuf::from("."), "out".as_ref()));
+fn bare_name_is_written_to_the_working_folder() {
+    assert_eq!(split_target(Path::new("out")).unwrap(), (PathBuf::from("."), "out".as_ref()));
 }

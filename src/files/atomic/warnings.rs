@@ -1,7 +1,8 @@
-//! Warnings about results that are in place although something failed afterwards.
+//! Warnings about failures after a result was put in place.
 
 use std::sync::{Mutex, PoisonError};
 
+/// Warnings since the last call of [`take_warnings`].
 static WARNINGS: Mutex<Vec<String>> = Mutex::new(Vec::new());
 
 /// Records a warning for [`take_warnings`].

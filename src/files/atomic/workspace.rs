@@ -1,13 +1,13 @@
-//! Hidden folders in which outputs are written before they get their names.
+//! Workspaces: hidden folders in which outputs are written before they get their names.
 //!
-//! A workspace `.<name>.<random>.splatsieve-tmp` lies beside its target. It holds `lock`, what is being written, and, while
-//! an earlier folder is replaced, that folder. The lock file contains a line that marks the workspace as created by this
-//! program; a folder without it is somebody else's and stays untouched, whatever its name is.
+//! A workspace `.<name>.<random>.splatsieve-tmp` lies beside its target. It holds the file `lock`, the output being
+//! written, and, while an earlier folder is replaced, that folder. The lock file contains a line that marks the
+//! workspace as created by this program; a folder without it is foreign and stays untouched, whatever its name is.
 //!
-//! The system releases the lock when the process that holds it ends, for whatever reason, so a workspace whose lock can
-//! be taken is a leftover. Locks hold between containers and, where the file system supports it, between machines; process
-//! ids, which have another meaning in every container, are not used. On a file system without locks no workspace is
-//! recognized as a leftover; a person has to remove it.
+//! The system releases a lock when the process that holds it ends for any reason, so a workspace whose lock can be
+//! taken is a leftover. Locks work between containers and, if the file system supports it, between machines. Process
+//! ids are not used, because they have another meaning in every container. On a file system without locks no workspace
+//! is recognized as a leftover; the user has to remove it.
 
 use std::collections::BTreeMap;
 use std::ffi::{OsStr, OsString};
@@ -19,35 +19,37 @@ use std::time::Duration;
 
 use splat_platform::{FileIdentity, FolderHandle, create_private_folder, private_permissions};
 
-use super::named::{parts, present};
+use super::named::{exists, split_target};
 use crate::error::{Error, Result};
 
-/// Target name of scratch files, in any folder.
+/// Target name of scratch files in any folder.
 pub(super) const SCRATCH: &str = "splatsieve-scratch";
-/// Ends the names of workspaces.
+/// End of the names of workspaces.
 const ENDING: &str = ".splatsieve-tmp";
-/// File whose lock says that the run goes on.
+/// Name of the file whose lock shows that the run is still going on.
 const LOCK: &str = "lock";
-/// Content of the lock file. It marks the folder as a workspace of this program.
+/// Content of the lock file, which marks the folder as a workspace of this program.
 pub(super) const LOCK_LINE: &str = "workspace of a splatsieve run\n";
-/// File or folder that is being written.
+/// Name in the workspace of the file or folder being written.
 pub(super) const CONTENT: &str = "content";
-/// Earlier folder that is being replaced; entries that its summary does not list are moved into the new one.
+/// Name in the workspace of an earlier folder that is being replaced. Entries that its summary does not list are moved
+/// into the new one.
 pub(super) const REPLACED: &str = "replaced";
-/// Entries that only have to be deleted.
+/// Name in the workspace of content that only has to be deleted.
 pub(super) const DISCARDED: &str = "discarded";
-/// Journal of files that are being published together.
+/// Name of the journal of files that are being published together.
 pub(super) const JOURNAL: &str = "journal";
-/// Entries of a workspace that must not be deleted with it: the next run with the same output deals with them.
+/// Entries that must not be deleted with their workspace: the next run with the same output handles them.
 const UNFINISHED: [&str; 2] = [REPLACED, JOURNAL];
 
-/// Workspaces of this process. A thread that publishes a result holds the guard, so that a signal is handled either before
-/// the result has its name or after.
-static LIVE: Mutex<BTreeMap<PathBuf, FileIdentity>> = Mutex::new(BTreeMap::new());
+/// Workspaces of this process and the identity of their folders. A thread that publishes a result holds the guard, so
+/// that a signal is handled either before the result has its name or after.
+static LIVE_WORKSPACES: Mutex<BTreeMap<PathBuf, FileIdentity>> = Mutex::new(BTreeMap::new());
 
-pub(super) fn live() -> MutexGuard<'static, BTreeMap<PathBuf, FileIdentity>> {
-    // The map is consistent even if a thread panicked beside it.
-    LIVE.lock().unwrap_or_else(PoisonError::into_inner)
+/// Locks the table of workspaces of this process.
+pub(super) fn live_workspaces() -> MutexGuard<'static, BTreeMap<PathBuf, FileIdentity>> {
+    // The map is consistent even if a thread panicked while holding the lock.
+    LIVE_WORKSPACES.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// Hidden folder for the content of one target. Dropping it removes the folder.
@@ -62,21 +64,21 @@ pub(super) struct Workspace {
 impl Workspace {
     /// Creates a workspace beside `target`.
     pub(super) fn beside(target: &Path) -> Result<Workspace> {
-        let (parent, name) = parts(target)?;
+        let (parent, name) = split_target(target)?;
         let mut prefix = OsString::from(".");
         prefix.push(name);
         prefix.push(".");
         loop {
-            // Held until the folder is listed, so that a signal handler knows of it.
-            let mut live = live();
+            // Held until the folder is in the table, so that a signal handler knows it.
+            let mut live = live_workspaces();
             let mut builder = tempfile::Builder::new();
             builder.prefix(&prefix).suffix(ENDING);
-            // Private, by which [`Leftover::take`] knows it even before the line is in its lock file.
+            // Private permissions: [`Leftover::take`] recognizes the folder by them before its lock file has the line.
             if let Some(private) = private_permissions() {
                 builder.permissions(private);
             }
             let made = builder.tempdir_in(&parent).map_err(Error::io("create a folder in", &parent))?;
-            let claimed = claim(made.path()).map_err(Error::io("create a lock in", made.path()))?;
+            let claimed = lock_and_mark(made.path()).map_err(Error::io("create a lock in", made.path()))?;
             if let Some(workspace) = claimed {
                 let _ = made.keep();
                 live.insert(workspace.folder.clone(), workspace.identity);
@@ -88,12 +90,12 @@ impl Workspace {
     /// Creates the workspace `name` in the folder `parent`; `None` if the name is taken.
     pub(super) fn with_name(parent: &Path, name: &OsStr) -> io::Result<Option<Workspace>> {
         let folder = parent.join(name);
-        let mut live = live();
+        let mut live = live_workspaces();
         match create_private_folder(&folder) {
             Err(error) if error.kind() == io::ErrorKind::AlreadyExists => return Ok(None),
             made => made?,
         }
-        let claimed = claim(&folder);
+        let claimed = lock_and_mark(&folder);
         match &claimed {
             Ok(Some(workspace)) => _ = live.insert(folder, workspace.identity),
             Ok(None) => (),
@@ -105,17 +107,17 @@ impl Workspace {
         claimed
     }
 
-    /// Path of the main file or folder that is written in this workspace.
+    /// Returns the path of the output being written in this workspace.
     pub(super) fn content(&self) -> PathBuf {
         self.folder.join(CONTENT)
     }
 
-    /// Whether the workspace holds files that must not be deleted with it.
+    /// Returns whether the workspace holds entries that must not be deleted with it.
     fn is_unfinished(&self) -> bool {
-        UNFINISHED.iter().any(|name| present(&self.folder.join(name)))
+        UNFINISHED.iter().any(|name| exists(&self.folder.join(name)))
     }
 
-    /// Writes the lock file and the names in the workspace through to the disk.
+    /// Syncs the lock file and the names in the workspace to disk.
     pub(super) fn sync(&self) -> io::Result<()> {
         if let Some(lock) = &self.lock {
             lock.sync_all()?;
@@ -126,15 +128,15 @@ impl Workspace {
 
 impl Drop for Workspace {
     fn drop(&mut self) {
-        let mut live = live();
+        let mut live = live_workspaces();
         live.remove(&self.folder);
         if !self.is_unfinished() {
-            dismantle(&self.folder, self.identity, self.lock.take());
+            remove_workspace(&self.folder, self.identity, self.lock.take());
         }
     }
 }
 
-/// Name of the workspace of `name` that is not random, for the run that publishes its result under this name.
+/// Returns the fixed workspace name that serves as lock for publishing a result called `name`.
 pub(super) fn publishing_name(name: &OsStr) -> OsString {
     let mut workspace = OsString::from(".");
     workspace.push(name);
@@ -143,32 +145,32 @@ pub(super) fn publishing_name(name: &OsStr) -> OsString {
     workspace
 }
 
-/// Whether a workspace holds an earlier folder or a journal, which must be dealt with before it is removed.
+/// Returns whether a workspace holds an earlier folder or a journal, which must be handled before it is removed.
 pub(super) fn is_unfinished(folder: &FolderHandle) -> bool {
     UNFINISHED.iter().any(|name| folder.has(name))
 }
 
-/// Whether an entry has the name of a workspace of `name`.
+/// Returns whether `entry` is the name of a workspace with a random part for the target `name`.
 pub(super) fn is_workspace(entry: &OsStr, name: &OsStr) -> bool {
     let rest = entry.as_encoded_bytes().strip_prefix(b".").and_then(|rest| rest.strip_prefix(name.as_encoded_bytes()));
     let random = rest.and_then(|rest| rest.strip_prefix(b".")?.strip_suffix(ENDING.as_bytes()));
     random.is_some_and(|random| !random.is_empty() && random.iter().all(u8::is_ascii_alphanumeric))
 }
 
-/// Name of the target of the workspace `entry`; `None` if the name is not one of a workspace.
+/// Returns the target name of the workspace `entry`, or `None` if `entry` is not the name of a workspace.
 pub(super) fn target_name(entry: &OsStr) -> Option<&str> {
     hidden_name(entry, ENDING)
 }
 
-/// Returns `name` of `.name.random` before `ending`.
+/// Returns `name` from an entry `.name.random` followed by `ending`.
 fn hidden_name<'a>(entry: &'a OsStr, ending: &str) -> Option<&'a str> {
     let name = entry.to_str()?.strip_prefix('.')?.strip_suffix(ending)?;
     Some(name.rsplit_once('.')?.0)
 }
 
-/// Translates a path in a workspace into the path that the user gave: the target or a file in it. For a scratch file, whose
-/// name means nothing to the user, returns its folder and `true`. Returns `None` for other paths.
-pub(super) fn named_in(path: &Path) -> Option<(PathBuf, bool)> {
+/// Translates a path in a workspace into the path that the user gave: the target or a file in it. For a scratch file,
+/// whose name means nothing to the user, returns its folder and `true`. Returns `None` for other paths.
+pub(super) fn user_path(path: &Path) -> Option<(PathBuf, bool)> {
     let mut parts = path.components();
     let mut before = PathBuf::new();
     let name = loop {
@@ -191,27 +193,27 @@ pub(super) fn named_in(path: &Path) -> Option<(PathBuf, bool)> {
     Some((before, false))
 }
 
-/// While this value exists, the process neither publishes nor removes an output; see [`withdraw_all`].
+/// Guard during whose lifetime this process neither publishes nor removes an output; see [`withdraw_all`].
 #[must_use = "runs go on as soon as this is dropped"]
 pub struct Withdrawn(
     #[allow(dead_code, reason = "held, not read")] MutexGuard<'static, BTreeMap<PathBuf, FileIdentity>>,
 );
 
-/// Removes everything that this process has begun and not published, for a process that is about to end.
+/// Removes all unpublished outputs of this process, for a process that is about to end.
 ///
 /// Waits for a result that is being published, which is then complete. Files outside workspaces stay.
 pub fn withdraw_all() -> Withdrawn {
-    let mut live = live();
+    let mut live = live_workspaces();
     for (folder, identity) in std::mem::take(&mut *live) {
-        if UNFINISHED.iter().any(|name| present(&folder.join(name))) {
+        if UNFINISHED.iter().any(|name| exists(&folder.join(name))) {
             continue;
         }
-        // Threads that still write into it find no folder from here on.
+        // Threads that are still writing into it fail from here on, because the folder is gone.
         let _ = fs::rename(folder.join(CONTENT), folder.join(DISCARDED));
-        // A file that a thread is just creating may appear while the folder is emptied.
+        // A thread may be creating a file while the folder is emptied, so try again.
         for _ in 0..100 {
-            dismantle(&folder, identity, None);
-            if !present(&folder) {
+            remove_workspace(&folder, identity, None);
+            if !exists(&folder) {
                 break;
             }
             std::thread::sleep(Duration::from_millis(1));
@@ -220,8 +222,8 @@ pub fn withdraw_all() -> Withdrawn {
     Withdrawn(live)
 }
 
-/// Locks and marks the new workspace `folder`; `None` if another run took it for a leftover and removes it.
-fn claim(folder: &Path) -> io::Result<Option<Workspace>> {
+/// Locks and marks the new workspace `folder`; `None` if another run mistook it for a leftover and is removing it.
+fn lock_and_mark(folder: &Path) -> io::Result<Option<Workspace>> {
     let lost = |error: io::Error| match error.kind() {
         io::ErrorKind::NotFound | io::ErrorKind::AlreadyExists => Ok(None),
         _ => Err(error),
@@ -236,8 +238,8 @@ fn claim(folder: &Path) -> io::Result<Option<Workspace>> {
     };
     let lock = match file.try_lock() {
         Err(TryLockError::WouldBlock) => return Ok(None),
-        // Whoever removes a workspace unlinks its lock file before releasing the lock. A lock file that still has its name
-        // stays, and its folder with it.
+        // A run that removes a workspace deletes its lock file before it releases the lock. So if the lock file still
+        // has its name, the workspace is not being removed.
         Ok(()) if handle.names_file(LOCK, &file) => true,
         Ok(()) => return Ok(None),
         Err(TryLockError::Error(_)) => false,
@@ -247,19 +249,19 @@ fn claim(folder: &Path) -> io::Result<Option<Workspace>> {
     Ok(Some(Workspace { folder: folder.to_owned(), identity, lock: lock.then_some(file) }))
 }
 
-/// Workspace whose run has ended, with its lock.
+/// Workspace whose run has ended, with its lock held by this process.
 pub(super) struct Leftover {
     name: OsString,
     pub(super) folder: FolderHandle,
     lock: File,
 }
 
-/// Why a workspace is not a leftover that may be taken.
+/// Reason why a workspace may not be taken as a leftover.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Refusal {
-    /// Its run goes on, or another run is looking at it.
+    /// Workspace whose run is going on, or that another run is inspecting.
     Busy,
-    /// This program did not create it for this user, or it is gone.
+    /// Workspace that is gone, or that this program did not create for this user.
     Foreign,
 }
 
@@ -269,14 +271,16 @@ impl Leftover {
         let foreign = |_: io::Error| Refusal::Foreign;
         let folder = parent.open_folder(name).map_err(foreign)?;
         let status = folder.status().map_err(foreign)?;
-        // A network file system may release this process's own lock when the lock file is opened a second time.
-        if !status.is_own || live().values().any(|&identity| identity == status.identity) {
+        // Skip workspaces of this process: a network file system may release this process's own lock when the lock file
+        // is opened a second time.
+        if !status.is_own || live_workspaces().values().any(|&identity| identity == status.identity) {
             return Err(Refusal::Foreign);
         }
         let mut lock = match folder.open_file(LOCK, true) {
             Ok(lock) => lock,
             Err(error) => {
-                // Its run is about to create the lock, then fails and tries again; or the folder is nearly removed.
+                // The run is about to create the lock file (it will fail and try again), or the folder is almost
+                // removed.
                 if error.kind() == io::ErrorKind::NotFound {
                     let _ = parent.remove_empty(name);
                 }
@@ -290,34 +294,34 @@ impl Leftover {
         }
         let mut line = String::new();
         (&mut lock).take(LOCK_LINE.len() as u64 + 1).read_to_string(&mut line).map_err(foreign)?;
-        // A run that was killed before it had written the line has left a private folder with an empty lock file.
+        // A run killed before it wrote the line leaves a private folder with an empty or partly written lock file.
         let is_begun =
             || LOCK_LINE.starts_with(&line) && status.is_private && folder.entries().is_ok_and(|names| names == [LOCK]);
         let is_marked = line == LOCK_LINE || is_begun();
         if is_marked { Ok(Leftover { name: name.to_owned(), folder, lock }) } else { Err(Refusal::Foreign) }
     }
 
-    /// Removes the workspace. What cannot be removed stays and does no harm.
+    /// Removes the workspace. Entries that cannot be removed stay and are harmless.
     pub(super) fn remove(self, parent: &FolderHandle) {
-        empty(&self.folder, Some(self.lock));
+        remove_content(&self.folder, Some(self.lock));
         let _ = parent.remove_empty(&self.name);
     }
 }
 
-/// Removes the workspace at `folder` if it is still the one with this identity.
-fn dismantle(folder: &Path, identity: FileIdentity, lock: Option<File>) {
-    let Ok((parent, name)) = parts(folder) else { return };
+/// Removes the workspace at `folder` if it still has this identity.
+fn remove_workspace(folder: &Path, identity: FileIdentity, lock: Option<File>) {
+    let Ok((parent, name)) = split_target(folder) else { return };
     let Ok(parent) = FolderHandle::open(&parent) else { return };
     let Ok(handle) = parent.open_folder(name) else { return };
     if handle.status().is_ok_and(|status| status.identity == identity) {
-        empty(&handle, lock);
+        remove_content(&handle, lock);
         let _ = parent.remove_empty(name);
     }
 }
 
-/// Removes everything in a workspace, its lock file last and before the lock is released: a run that gets the lock
-/// afterwards sees that its file is gone.
-fn empty(folder: &FolderHandle, lock: Option<File>) {
+/// Removes everything in a workspace. The lock file goes last and before the lock is released: a run that gets the lock
+/// afterwards sees that the file is gone.
+fn remove_content(folder: &FolderHandle, lock: Option<File>) {
     for entry in folder.entries().unwrap_or_default().iter().filter(|entry| *entry != LOCK) {
         let _ = folder.remove(entry);
     }

@@ -1,4 +1,4 @@
-//! From pictures as a file lists them to a [`Rig`]: cameras checked and told apart, views numbered.
+//! Builds a [`Rig`] from the images that a file lists: checks cameras, finds equal ones, numbers views.
 
 use std::hash::BuildHasher;
 use std::path::{Path, PathBuf};
@@ -7,60 +7,63 @@ use glam::{DMat3, DVec3};
 use hashbrown::{DefaultHashBuilder, HashSet, HashTable};
 
 use super::fields::place;
-use super::{MAX_PICTURES, MAX_SIDE_PX};
+use super::{MAX_IMAGES, MAX_SIDE_PX};
 use crate::error::{Error, Result};
 use crate::limits::ReadLimit;
 use crate::model::{Camera, Rig, Shot, Split};
 
-/// Largest entry of |RᵀR − I| of a rotation. Matrices written in f32 reach 1e-6; at 1e-4 a point
-/// moves by 0.05 px at a focal length of 1000 px, and a scaled or sheared matrix is far beyond.
+/// Maximum absolute entry of RᵀR − I of a rotation matrix R. Matrices written in f32 reach 1e-6; at 1e-4 a point moves
+/// by 0.05 px at a focal length of 1000 px, and a scaled or sheared matrix is far beyond.
 const ROTATION_TOLERANCE: f64 = 1e-4;
 
-/// Longest focal length in pixels: beyond it, the squares of what a picture shows of the largest Gaussians overflow.
+/// Maximum focal length in pixels. Above it, the squared image size of the largest Gaussians overflows.
 const MAX_FOCAL_PX: f64 = 1e9;
 
-/// A picture as a file lists it.
+/// Image as a camera file lists it.
 #[derive(Debug, Clone)]
 pub(super) struct ListedImage {
-    /// The camera that took it.
+    /// Camera that took the image.
     pub(super) camera: Camera,
-    /// Its time stamp; none when it stands for every frame.
+    /// Time stamp; `None` if the image stands for every frame.
     pub(super) time: Option<f64>,
-    /// Part of the data set.
+    /// Split of the data set.
     pub(super) split: Split,
-    /// Its file.
+    /// Path of the image file.
     pub(super) image: Option<PathBuf>,
-    /// View number, when the file states it.
+    /// View number, if the file states it.
     pub(super) view: Option<u32>,
 }
 
-/// A [`Rig`] in the making: takes the pictures of all files of a data set one by one.
+/// Builder of a [`Rig`] that takes the images of all files of a data set one by one.
 ///
-/// Cameras equal in every bit become one. Views are numbered as the files state, or, unless they do
-/// so for every picture, by distinct camera in order of appearance. A picture without a time stands
-/// for every frame, so a second one of the same camera and split adds nothing and is left out.
+/// Cameras that are equal in every bit become one. Views have the numbers stated in the files if every image has one,
+/// else one number per distinct camera in order of appearance. An image without a time stands for every frame, so a
+/// second one of the same camera and split adds nothing and is left out.
 #[derive(Debug)]
 pub(super) struct Assembly {
     rig: Rig,
-    gauge: MemoryCounter,
-    /// Indices of `rig.cameras` by their values.
+    memory_counter: MemoryCounter,
+    /// Indices in `rig.cameras`, by the values of the camera.
     known: HashTable<u32>,
     hasher: DefaultHashBuilder,
     /// (Camera, split) pairs that stand for every frame.
     untimed: HashSet<(u32, Split)>,
-    /// Every file, and the index of its first shot.
+    /// Path of every file, and the index of its first shot.
     files: Vec<(PathBuf, usize)>,
-    /// Number of pictures of the last file.
+    /// Number of images added from the last file.
     taken: usize,
+    /// Whether every image so far has a view number.
     are_views_stated: bool,
+    /// Whether images have times; `None` before the first image.
     is_timed: Option<bool>,
 }
 
 impl Assembly {
+    /// Returns an empty rig; `memory` limits the memory of its images and cameras.
     pub(super) fn new(memory: ReadLimit) -> Assembly {
         Assembly {
             rig: Rig { cameras: Vec::new(), shots: Vec::new(), background: None, origin: String::new() },
-            gauge: MemoryCounter { limit: memory, used: 0 },
+            memory_counter: MemoryCounter { limit: memory, used: 0 },
             known: HashTable::new(),
             hasher: DefaultHashBuilder::default(),
             untimed: HashSet::new(),
@@ -71,87 +74,88 @@ impl Assembly {
         }
     }
 
-    /// Counts the memory of what is kept beside the rig while it is made.
-    pub(super) fn gauge(&mut self) -> &mut MemoryCounter {
-        &mut self.gauge
+    /// Returns the counter of the memory that is used while the rig is built.
+    pub(super) fn memory_counter(&mut self) -> &mut MemoryCounter {
+        &mut self.memory_counter
     }
 
-    /// Makes room for the `count` pictures that `file` lists. Those that are added next are its pictures.
+    /// Reserves memory for the `count` images that `file` lists. Images added from now on belong to this file.
     ///
     /// # Errors
-    /// Too many pictures; more memory than allowed.
+    /// There are too many images, or they take more memory than allowed.
     pub(super) fn begin(&mut self, file: &Path, count: usize) -> Result<()> {
         let total = self.rig.shots.len() + count;
-        if total > MAX_PICTURES {
-            return Err(Error::input(file, "", format!("at most {MAX_PICTURES} pictures"), total.to_string()));
+        if total > MAX_IMAGES {
+            return Err(Error::input(file, "", format!("at most {MAX_IMAGES} images"), total.to_string()));
         }
-        self.gauge.take(file, "", &format!("{count} pictures"), Rig::SHOT_BYTES * count as u64)?;
+        self.memory_counter.take(file, "", &format!("{count} images"), Rig::SHOT_BYTES * count as u64)?;
         self.rig.shots.reserve_exact(count);
-        // Most often a camera is new, or few are. What is not used of the list takes no memory, but copying it would.
-        let affordable = self.gauge.limit.bytes() / 4 / Rig::CAMERA_BYTES;
+        // Usually either every camera is new or few are. Reserved memory that stays unused costs nothing, but copying
+        // the list would.
+        let affordable = self.memory_counter.limit.bytes() / 4 / Rig::CAMERA_BYTES;
         self.rig.cameras.reserve_exact(count.min(affordable.min(1 << 20) as usize));
         self.files.push((file.to_owned(), self.rig.shots.len()));
         self.taken = 0;
         Ok(())
     }
 
-    /// Adds the next picture of the file that was begun last.
+    /// Adds the next image of the file that was begun last.
     ///
     /// # Errors
-    /// A camera that is none; times for some pictures only; more memory than allowed.
+    /// The camera is invalid; only some images have a time; the memory limit is exceeded.
     ///
     /// # Panics
     /// If no file was begun.
-    pub(super) fn add(&mut self, picture: ListedImage) -> Result<()> {
+    pub(super) fn add(&mut self, listed: ListedImage) -> Result<()> {
         let path = &self.files.last().expect("a file was begun").0;
         let frame = self.taken;
         let wrong = |expected: String, found: String| Error::input(path, place(Some(frame)), expected, found);
         self.taken += 1;
-        if let Err((expected, found)) = check(&picture.camera) {
+        if let Err((expected, found)) = check(&listed.camera) {
             return Err(wrong(expected, found));
         }
-        let is_timed = *self.is_timed.get_or_insert(picture.time.is_some());
-        if picture.time.is_some() != is_timed {
-            return Err(wrong("a time for every picture or for none".into(), one_sided(is_timed).into()));
+        let is_timed = *self.is_timed.get_or_insert(listed.time.is_some());
+        if listed.time.is_some() != is_timed {
+            return Err(wrong("a time for every image or for none".into(), time_mismatch(is_timed).into()));
         }
-        let values = key(&picture.camera);
+        let values = camera_bits(&listed.camera);
         let (cameras, hasher) = (&mut self.rig.cameras, &self.hasher);
         let hash = hasher.hash_one(values);
-        let found = self.known.find(hash, |&at| key(&cameras[at as usize]) == values).copied();
+        let found = self.known.find(hash, |&at| camera_bits(&cameras[at as usize]) == values).copied();
         let camera = match found {
             Some(camera) => camera,
             None => {
-                self.gauge.take(path, &place(Some(frame)), "the cameras", Rig::CAMERA_BYTES)?;
+                self.memory_counter.take(path, &place(Some(frame)), "the cameras", Rig::CAMERA_BYTES)?;
                 if cameras.len() == cameras.capacity() {
-                    // The old list and the new one are there together while one is copied to the other.
+                    // The old list and the new one exist at the same time while one is copied to the other.
                     let more = (cameras.len() / 4).max(64);
                     let copied = (size_of::<Camera>() * (cameras.len() + more)) as u64;
-                    self.gauge.take(path, &place(Some(frame)), "the cameras", copied)?;
+                    self.memory_counter.take(path, &place(Some(frame)), "the cameras", copied)?;
                     cameras.reserve_exact(more);
-                    self.gauge.used -= copied;
+                    self.memory_counter.used -= copied;
                 }
                 let camera = cameras.len() as u32;
-                cameras.push(picture.camera);
-                self.known.insert_unique(hash, camera, |&at| hasher.hash_one(key(&cameras[at as usize])));
+                cameras.push(listed.camera);
+                self.known.insert_unique(hash, camera, |&at| hasher.hash_one(camera_bits(&cameras[at as usize])));
                 camera
             }
         };
-        self.are_views_stated &= picture.view.is_some();
-        if !is_timed && !self.untimed.insert((camera, picture.split)) {
+        self.are_views_stated &= listed.view.is_some();
+        if !is_timed && !self.untimed.insert((camera, listed.split)) {
             return Ok(());
         }
-        let mut image = picture.image;
+        let mut image = listed.image;
         if let Some(image) = &mut image {
             image.shrink_to_fit();
             let bytes = image.as_os_str().len() as u64 + Rig::NAME_BYTES;
-            self.gauge.take(path, &place(Some(frame)), "the names of pictures", bytes)?;
+            self.memory_counter.take(path, &place(Some(frame)), "the names of images", bytes)?;
         }
-        let view = picture.view.unwrap_or(0);
-        self.rig.shots.push(Shot { view, camera, time: picture.time, split: picture.split, image });
+        let view = listed.view.unwrap_or(0);
+        self.rig.shots.push(Shot { view, camera, time: listed.time, split: listed.split, image });
         Ok(())
     }
 
-    /// Largest time so far; `least` if none is larger.
+    /// Returns the largest time so far, but at least `least`.
     pub(super) fn latest(&self, least: f64) -> f64 {
         self.rig.shots.iter().filter_map(|shot| shot.time).fold(least, f64::max)
     }
@@ -163,20 +167,20 @@ impl Assembly {
         }
     }
 
-    /// Returns the rig of all pictures.
+    /// Returns the rig of all images.
     ///
     /// # Errors
-    /// No pictures; two pictures of one file with the same view, split and time.
+    /// There are no images, or two images of one file have the same view, split and time.
     pub(super) fn finish(mut self, background: Option<[f32; 3]>, origin: String) -> Result<Rig> {
         if let (true, Some((path, _))) = (self.rig.shots.is_empty(), self.files.first()) {
-            return Err(Error::input(path, "", "at least one picture", "none"));
+            return Err(Error::input(path, "", "at least one image", "none"));
         }
         if !self.are_views_stated {
             self.rig.shots.iter_mut().for_each(|shot| shot.view = shot.camera);
         }
         let shots = &self.rig.shots;
-        // −0 and 0 are one time.
-        let key = |at: usize| {
+        // Adding 0.0 makes −0 and 0 the same time.
+        let shot_key = |at: usize| {
             let shot: &Shot = &shots[at];
             shot.time.map(|time| (shot.view, shot.split, (time + 0.0).to_bits()))
         };
@@ -184,25 +188,25 @@ impl Assembly {
             let end = self.files.get(k + 1).map_or(shots.len(), |next| next.1);
             let mut taken: HashTable<u32> = HashTable::new();
             for at in *first..end {
-                let Some(own) = key(at) else { continue };
+                let Some(own) = shot_key(at) else { continue };
                 let hash = self.hasher.hash_one(own);
-                if let Some(&before) = taken.find(hash, |&other| key(other as usize) == Some(own)) {
+                if let Some(&before) = taken.find(hash, |&other| shot_key(other as usize) == Some(own)) {
                     let (view, time) = (own.0, f64::from_bits(own.2));
                     return Err(Error::input(
                         path,
                         place(Some(at - first)),
-                        "one picture per view and time",
+                        "one image per view and time",
                         format!("view {view} at time {time} again, as in frame {}", before as usize - first),
                     ));
                 }
-                taken.insert_unique(hash, at as u32, |&other| self.hasher.hash_one(key(other as usize)));
+                taken.insert_unique(hash, at as u32, |&other| self.hasher.hash_one(shot_key(other as usize)));
             }
         }
         Ok(Rig { background, origin, ..self.rig })
     }
 }
 
-/// Counts the memory that is kept while cameras are read.
+/// Counter of the memory that is kept while cameras are read, with its limit.
 #[derive(Debug)]
 pub(super) struct MemoryCounter {
     limit: ReadLimit,
@@ -210,10 +214,10 @@ pub(super) struct MemoryCounter {
 }
 
 impl MemoryCounter {
-    /// Counts `bytes` that are about to be kept of the file at `path`; `what` names what they are for.
+    /// Adds `bytes` that are about to be kept for `what` of the file at `path`.
     ///
     /// # Errors
-    /// More memory than allowed.
+    /// The memory limit is exceeded.
     pub(super) fn take(&mut self, path: &Path, place: &str, what: &str, bytes: u64) -> Result<()> {
         let used = self.used.saturating_add(bytes);
         self.limit.check(path, place, what, used)?;
@@ -221,22 +225,23 @@ impl MemoryCounter {
         Ok(())
     }
 
-    /// Counts `bytes` no more.
+    /// Subtracts `bytes` that have been freed.
     pub(super) fn release(&mut self, bytes: u64) {
         self.used = self.used.saturating_sub(bytes);
     }
 }
 
-fn one_sided(timed: bool) -> &'static str {
-    if timed { "none here, but one in the first picture" } else { "one here, but none in the first picture" }
+/// Returns the text for an image that differs from the first image in having a time.
+fn time_mismatch(timed: bool) -> &'static str {
+    if timed { "none here, but one in the first image" } else { "one here, but none in the first image" }
 }
 
-/// What is wrong with a camera, as (expected, found).
+/// Checks that a camera is valid; the error is (expected, found).
 pub(super) fn check(camera: &Camera) -> std::result::Result<(), (String, String)> {
     let Camera { width, height, fx, fy, cx, cy, rotation, translation, near: _ } = camera;
     let side = 1..=MAX_SIDE_PX;
     if !side.contains(width) || !side.contains(height) {
-        return Err((format!("a picture of 1 to {MAX_SIDE_PX} pixels a side"), format!("{width} × {height}")));
+        return Err((format!("an image of 1 to {MAX_SIDE_PX} pixels a side"), format!("{width} × {height}")));
     }
     let usable = |focal: &f64| *focal > 0.0 && *focal <= MAX_FOCAL_PX;
     if !usable(fx) || !usable(fy) {
@@ -249,7 +254,7 @@ pub(super) fn check(camera: &Camera) -> std::result::Result<(), (String, String)
         return Err(("a finite principal point".into(), format!("{cx} and {cy}")));
     }
     let defect = (rotation.transpose() * *rotation - DMat3::IDENTITY).to_cols_array();
-    // `all` rather than a maximum: NaN fails here and is lost there.
+    // `all` rather than a maximum, because a maximum ignores NaN.
     if !defect.iter().all(|x| x.abs() <= ROTATION_TOLERANCE) {
         let worst = defect.iter().fold(0.0, |worst: f64, x| worst.max(x.abs()));
         return Err((
@@ -260,27 +265,28 @@ pub(super) fn check(camera: &Camera) -> std::result::Result<(), (String, String)
     if rotation.determinant() < 0.0 {
         return Err(("a rotation".into(), "a reflection (determinant −1)".into()));
     }
-    // After the rotation, which it is computed with: a bad rotation is named as one.
+    // Checked after the rotation, because some formats compute the translation with it: a bad rotation is reported as
+    // one.
     if !translation.is_finite() {
         return Err(("a finite camera position".into(), format!("{translation}")));
     }
     Ok(())
 }
 
-/// Every value of a camera as bits, −0 as 0.
-fn key(camera: &Camera) -> [u64; 18] {
+/// Returns every value of a camera except `near` as bits, with −0 as 0.
+fn camera_bits(camera: &Camera) -> [u64; 18] {
     let Camera { width, height, fx, fy, cx, cy, rotation, translation, near: _ } = camera;
-    let mut key = [0; 18];
+    let mut bits = [0; 18];
     let values = [*fx, *fy, *cx, *cy].into_iter().chain(rotation.to_cols_array()).chain(translation.to_array());
-    for (to, value) in key.iter_mut().zip(values) {
+    for (to, value) in bits.iter_mut().zip(values) {
         *to = (value + 0.0).to_bits();
     }
-    key[16] = u64::from(*width);
-    key[17] = u64::from(*height);
-    key
+    bits[16] = u64::from(*width);
+    bits[17] = u64::from(*height);
+    bits
 }
 
-/// The camera of a camera-to-world pose in OpenCV axes; `intrinsics` are fx, fy, cx, cy.
+/// Builds a camera from a camera-to-world pose in OpenCV axes; `intrinsics` are fx, fy, cx, cy in pixels.
 pub(super) fn from_camera_to_world(
     (width, height): (u32, u32),
     [fx, fy, cx, cy]: [f64; 4],
@@ -291,7 +297,7 @@ pub(super) fn from_camera_to_world(
     Camera { width, height, fx, fy, cx, cy, rotation, translation: -(rotation * center), near: Camera::NEAR }
 }
 
-/// The view number in a picture's name of the form `…tNNN_vNN…`.
+/// Returns the view number in an image name of the form `…tNNN_vNN…`.
 pub(super) fn view_in_name(name: &str) -> Option<u32> {
     let name = name.rsplit(['/', '\\']).next()?;
     name.match_indices("_v").find_map(|(at, mark)| {

@@ -1,6 +1,6 @@
-//! The two files called `cameras.json`.
+//! Reads the two formats of a file called `cameras.json`.
 //!
-//! *This project's*, one entry per picture:
+//! *This project's*, one entry per image:
 //!
 //! ```json
 //! { "background": [1, 1, 1],
@@ -9,21 +9,22 @@
 //!                 "w2c": [[1,0,0,0],[0,1,0,0],[0,0,1,3],[0,0,0,1]] } ] }
 //! ```
 //!
-//! `w2c` is world to camera, row-major, OpenCV axes; focal lengths and the principal point are in
-//! pixels, the middle of the picture at `width / 2`. Optional: `background` (linear RGB in [0, 1]),
-//! `v` (view number, else by distinct camera), `time` (else every frame), `split` (`train`, `val` or `test`,
-//! else train), `image` (relative to the file). Other keys are ignored.
+//! `w2c` is world to camera, row-major, OpenCV axes. Focal lengths and the principal point are in pixels; the middle of
+//! the image is at `width / 2`. Optional keys: `background` (linear RGB in [0, 1]), `v` (view number; default: one per
+//! distinct camera), `time` (default: every frame), `split` (`train`, `val` or `test`; default: train), `image`
+//! (relative to the file). Other keys are ignored.
 //!
-//! *3DGS's*, one entry per camera, written beside a trained model: `width`, `height`, `fx`, `fy`,
-//! `position` (of the camera), `rotation` (camera to world, row-major, OpenCV axes), `img_name`. It
-//! has no times, so each camera sees every frame unless `--times` says otherwise; it does not tell test from train, so all are train.
+//! *3DGS's*, one entry per camera, written beside a trained model: `width`, `height`, `fx`, `fy`, `position` (of the
+//! camera), `rotation` (camera to world, row-major, OpenCV axes), `img_name`. The file has no times, so each camera
+//! sees every frame unless `--times` gives times. It does not distinguish test from training views, so all are for
+//! training.
 
 use std::path::Path;
 
 use super::CameraOptions;
 use super::assemble::{Assembly, ListedImage, from_camera_to_world, view_in_name};
 use super::fields::{CameraFields, place};
-use super::pictures::each_picture;
+use super::image_list::each_image;
 use super::times::{self, Times};
 use crate::error::Result;
 use crate::files::json::small::Small;
@@ -31,28 +32,29 @@ use crate::files::names::shown_name;
 use crate::limits::ReadLimit;
 use crate::model::{Camera, Rig, Split};
 
-/// Keys of a picture.
-const PICTURE: [&str; 11] = ["w2c", "split", "width", "height", "fx", "fy", "cx", "cy", "time", "image", "v"];
+/// Keys of an image.
+const IMAGE_KEYS: [&str; 11] = ["w2c", "split", "width", "height", "fx", "fy", "cx", "cy", "time", "image", "v"];
 /// Keys of a camera.
-const CAMERA: [&str; 7] = ["width", "height", "fx", "fy", "img_name", "rotation", "position"];
+const CAMERA_KEYS: [&str; 7] = ["width", "height", "fx", "fy", "img_name", "rotation", "position"];
 
-/// Reads this project's own file, of which `outline` is what lies around the pictures.
-pub(super) fn load_per_picture(file: &Path, outline: &Small, memory: ReadLimit) -> Result<Rig> {
+/// Reads this project's own format. `outline` holds the keys outside the list of images.
+pub(super) fn load_per_image(file: &Path, outline: &Small, memory: ReadLimit) -> Result<Rig> {
     let shared = CameraFields::new(file, None, outline)?;
     let background = shared.optional_vector("background")?;
     if background.is_some_and(|rgb| rgb.iter().any(|c| !(0.0..=1.0).contains(c))) {
         return Err(shared.wrong("background", "red, green and blue from 0 to 1"));
     }
     let mut assembly = Assembly::new(memory);
-    assembly.begin(file, shared.list("frames")?)?;
-    each_picture(file, Some("frames"), &PICTURE, |index, frame| {
-        assembly.add(per_picture(file, CameraFields::new(file, Some(index), frame)?)?)
+    assembly.begin(file, shared.list_len("frames")?)?;
+    each_image(file, Some("frames"), &IMAGE_KEYS, |index, frame| {
+        assembly.add(per_image(file, CameraFields::new(file, Some(index), frame)?)?)
     })?;
     let background = background.map(|rgb| rgb.map(|c| c as f32));
     assembly.finish(background, shown_name(file))
 }
 
-fn per_picture(file: &Path, own: CameraFields<'_>) -> Result<ListedImage> {
+/// Builds one image entry of this project's format.
+fn per_image(file: &Path, own: CameraFields<'_>) -> Result<ListedImage> {
     let (rotation, translation) = own.pose("w2c")?;
     let split = match own.optional_text("split")? {
         None | Some("train") => Split::Train,
@@ -80,7 +82,7 @@ fn per_picture(file: &Path, own: CameraFields<'_>) -> Result<ListedImage> {
     })
 }
 
-/// Reads the file of a 3DGS model folder, a list of `count` cameras.
+/// Reads the format of a 3DGS model folder, a list of `count` cameras.
 pub(super) fn load_per_camera(file: &Path, count: usize, options: &CameraOptions) -> Result<Rig> {
     let mut assembly = Assembly::new(options.memory);
     assembly.begin(file, count)?;
@@ -88,26 +90,27 @@ pub(super) fn load_per_camera(file: &Path, count: usize, options: &CameraOptions
     let mut times = Vec::new();
     if options.times != Times::Own {
         let mut names: Vec<Box<str>> = Vec::new();
-        each_picture(file, None, &["img_name"], |index, camera| {
+        each_image(file, None, &["img_name"], |index, camera| {
             let name = match camera.get("img_name") {
                 Some(Small::Text(name)) => name.clone(),
                 _ => "".into(),
             };
-            assembly.gauge().take(file, &place(Some(index)), "the names of pictures", name.len() as u64 + 96)?;
+            assembly.memory_counter().take(file, &place(Some(index)), "the names of images", name.len() as u64 + 96)?;
             names.push(name);
             Ok(())
         })?;
-        let (given, said) = times::give(file, &names, &options.times, assembly.gauge())?;
-        origin += &format!(" ({said})");
+        let (given, source) = times::resolve(file, &names, &options.times, assembly.memory_counter())?;
+        origin += &format!(" ({source})");
         times = given;
     }
-    each_picture(file, None, &CAMERA, |index, camera| {
+    each_image(file, None, &CAMERA_KEYS, |index, camera| {
         let time = times.get(index).copied().flatten();
         assembly.add(ListedImage { time, ..per_camera(file, CameraFields::new(file, Some(index), camera)?)? })
     })?;
     assembly.finish(None, origin)
 }
 
+/// Builds one image entry of the 3DGS format.
 fn per_camera(file: &Path, own: CameraFields<'_>) -> Result<ListedImage> {
     let size @ (width, height) = (own.side("width")?, own.side("height")?);
     let intrinsics = [own.number("fx")?, own.number("fy")?, 0.5 * f64::from(width), 0.5 * f64::from(height)];

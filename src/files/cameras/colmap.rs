@@ -1,11 +1,12 @@
-//! A COLMAP reconstruction: `cameras` and `images`, as `.bin` or `.txt` (<https://colmap.github.io/format.html>); points
-//! are not needed.
+//! Reads a COLMAP reconstruction: `cameras` and `images`, as `.bin` or `.txt` (<https://colmap.github.io/format.html>).
+//! The points are not needed.
 //!
 //! An image has a unit quaternion wxyz and a translation, world to camera in OpenCV axes, the number of its camera, and
-//! its name below `images/` beside `sparse/`. The middle of the first pixel is at 0.5, as here. Cameras must be without
-//! distortion: SIMPLE_PINHOLE, PINHOLE, or another whose coefficients are all 0. `--size` scales focal lengths and principal
-//! point. Pictures in folders called `test` or `val` are held out, all others are for training. Times are at
-//! [`super::times`], those of a folder for each frame at [`super::frames`].
+//! its path below `images/` beside `sparse/`. The center of the first pixel is at 0.5, as in this project. Cameras must
+//! be without distortion: SIMPLE_PINHOLE, PINHOLE, or another model whose distortion coefficients are all 0. `--resolution`
+//! scales the focal lengths and the principal point. Images in folders called `test` or `val` belong to that split, all
+//! others are for training. [`super::times`] finds the times; [`super::frames`] handles data sets with a folder for
+//! each frame.
 
 use std::fs::File;
 use std::io::{BufRead, BufReader, Read};
@@ -15,25 +16,26 @@ use glam::{DMat3, DQuat, DVec3};
 use hashbrown::HashMap;
 
 use super::assemble::{Assembly, ListedImage, MemoryCounter};
-use super::{CameraOptions, MAX_PICTURES, MAX_SIDE_PX, Times, frames, times};
+use super::{CameraOptions, MAX_IMAGES, MAX_SIDE_PX, Times, frames, times};
 use crate::error::{Error, Result, ShowPath, quoted};
 use crate::files::names::shown_name;
 use crate::files::open::open_file;
 use crate::files::text::TextLines;
 use crate::model::{Camera, Rig, Split};
 
-/// Longest name of a picture.
-const MAX_NAME: u64 = 4096;
+/// Maximum length of an image name in bytes.
+const MAX_NAME_BYTES: u64 = 4096;
 /// Bytes of a point that an image sees: two coordinates and a number.
-const POINT: u64 = 24;
-/// Bytes of a camera in its table, and of a picture in its list beside its name, while they grow by being copied to twice
-/// their size.
+const POINT_BYTES: u64 = 24;
+/// Memory of a camera in the table, in bytes, while the table grows by being copied to twice its size.
 const LENS_BYTES: u64 = 4 * size_of::<(u32, Lens)>() as u64;
+/// Memory of an image in the list, without its name, in bytes, while the list grows by being copied to twice its size.
 const IMAGE_BYTES: u64 = 3 * size_of::<ColmapImage>() as u64 + 160;
-/// Furthest that the length of a quaternion may be from 1.
+/// Maximum deviation of the length of a quaternion from 1.
 const UNIT_TOLERANCE: f64 = 1e-3;
 
-/// Models by number: name, parameters, of which those that are distortion begin at.
+/// Camera models in the order of COLMAP's numbers: name, number of parameters, index of the first distortion parameter
+/// (0: not a pinhole model).
 const MODELS: [(&str, usize, usize); 12] = [
     ("SIMPLE_PINHOLE", 3, 3),
     ("PINHOLE", 4, 4),
@@ -49,13 +51,14 @@ const MODELS: [(&str, usize, usize); 12] = [
     ("RAD_TAN_THIN_PRISM_FISHEYE", 16, 0),
 ];
 
-/// fx, fy, cx, cy in pixels of a picture (width, height).
+/// Size (width, height) of the images of a camera, and fx, fy, cx, cy, all in pixels.
 #[derive(Debug, Clone, Copy)]
 struct Lens {
     size: (u32, u32),
     intrinsics: [f64; 4],
 }
 
+/// Image as COLMAP lists it.
 struct ColmapImage {
     quaternion: [f64; 4],
     translation: [f64; 3],
@@ -63,25 +66,25 @@ struct ColmapImage {
     name: Box<str>,
 }
 
-/// Reads the reconstruction that `found` is, or is a file of.
+/// Reads the reconstruction at `found`, which is its folder, a folder that holds it, or one of its files.
 ///
 /// # Errors
-/// Files that are missing, cut short or malformed; a distorted camera; those of the times.
+/// A file is missing, truncated or malformed; a camera has distortion; the times cannot be found.
 pub(super) fn load(found: &Path, options: &CameraOptions) -> Result<Rig> {
-    let folder = folder_of(found)?;
+    let folder = reconstruction_folder(found)?;
     let binary = folder.join("cameras.bin").is_file();
     let file = |name: &str| folder.join(format!("{name}.{}", if binary { "bin" } else { "txt" }));
     let (cameras, images) = (file("cameras"), file("images"));
     let mut assembly = Assembly::new(options.memory);
-    let gauge = assembly.gauge();
-    let lenses = if binary { read_cameras(&cameras, gauge)? } else { parse_cameras(&cameras, gauge)? };
-    let mut listed = if binary { read_images(&images, gauge)? } else { parse_images(&images, gauge)? };
-    // A reconstruction lists its pictures in the order in which it found them.
+    let counter = assembly.memory_counter();
+    let lenses = if binary { read_cameras(&cameras, counter)? } else { parse_cameras(&cameras, counter)? };
+    let mut listed = if binary { read_images(&images, counter)? } else { parse_images(&images, counter)? };
+    // COLMAP lists images in the order in which it registered them.
     listed.sort_by(|a, b| natord::compare(&a.name, &b.name).then_with(|| a.name.cmp(&b.name)));
-    let pictures_in = pictures_folder(&folder);
-    let picture = |image: &ColmapImage| -> Result<ListedImage> {
+    let images_folder = find_images_folder(&folder);
+    let listed_image = |image: &ColmapImage| -> Result<ListedImage> {
         let wrong = |expected: String, found: String| {
-            Error::input(&images, format!("picture {}", quoted(&image.name)), expected, found)
+            Error::input(&images, format!("image {}", quoted(&image.name)), expected, found)
         };
         let lens = lenses
             .get(&image.camera)
@@ -91,7 +94,7 @@ pub(super) fn load(found: &Path, options: &CameraOptions) -> Result<Rig> {
         if (quaternion.length() - 1.0).abs().partial_cmp(&UNIT_TOLERANCE).is_none_or(|order| order.is_gt()) {
             return Err(wrong("a quaternion of length 1".into(), format!("{w} {x} {y} {z}")));
         }
-        let (size, [fx, fy, cx, cy]) = scaled(*lens, options.size);
+        let (size, [fx, fy, cx, cy]) = scale_intrinsics(*lens, options.size);
         Ok(ListedImage {
             camera: Camera {
                 width: size.0,
@@ -106,38 +109,38 @@ pub(super) fn load(found: &Path, options: &CameraOptions) -> Result<Rig> {
             },
             time: None,
             split: split_of(&image.name),
-            image: Some(pictures_in.join(&*image.name)),
+            image: Some(images_folder.join(&*image.name)),
             view: None,
         })
     };
     if let (Some(first), Times::Own) = (frames::find(&folder), &options.times) {
         let frames = options.frames.unwrap_or_else(|| frames::count(&first.0, first.1));
-        if listed.len().saturating_mul(frames) > MAX_PICTURES {
+        if listed.len().saturating_mul(frames) > MAX_IMAGES {
             return Err(Error::usage(format!(
-                "{}: {} cameras × {frames} frames are more than {MAX_PICTURES} pictures",
+                "{}: {} cameras × {frames} frames are more than {MAX_IMAGES} images",
                 folder.shown(),
                 listed.len()
             )));
         }
         let origin = format!("{} (each of {frames} frames)", shown_name(&folder));
-        let pictures = listed.iter().map(picture).collect::<Result<Vec<_>>>()?;
+        let first_frame = listed.iter().map(listed_image).collect::<Result<Vec<_>>>()?;
         assembly.begin(&images, listed.len() * frames)?;
-        frames::repeated(&pictures, &first, frames).try_for_each(|picture| assembly.add(picture))?;
+        frames::repeat_for_frames(&first_frame, &first, frames).try_for_each(|image| assembly.add(image))?;
         return assembly.finish(None, origin);
     }
     let names: Vec<Box<str>> = listed.iter().map(|image| image.name.clone()).collect();
-    let (given, said) = times::give(&images, &names, &options.times, assembly.gauge())?;
+    let (given, source) = times::resolve(&images, &names, &options.times, assembly.memory_counter())?;
     assembly.begin(&images, listed.len())?;
     for (index, image) in listed.iter().enumerate() {
-        assembly.add(ListedImage { time: given.get(index).copied().flatten(), ..picture(image)? })?;
+        assembly.add(ListedImage { time: given.get(index).copied().flatten(), ..listed_image(image)? })?;
     }
     let origin = shown_name(&folder);
-    let origin = if said.is_empty() { origin } else { format!("{origin} ({said})") };
+    let origin = if source.is_empty() { origin } else { format!("{origin} ({source})") };
     assembly.finish(None, origin)
 }
 
-/// The folder that holds the files.
-fn folder_of(found: &Path) -> Result<PathBuf> {
+/// Returns the folder that holds the files: that of `found`, or `0` in it.
+fn reconstruction_folder(found: &Path) -> Result<PathBuf> {
     let holds = |folder: &Path| ["cameras.bin", "cameras.txt"].iter().any(|name| folder.join(name).is_file());
     let folder = if found.is_dir() { found } else { found.parent().unwrap_or(Path::new("")) };
     [folder.to_owned(), folder.join("0")].into_iter().find(|folder| holds(folder)).ok_or_else(|| {
@@ -145,13 +148,14 @@ fn folder_of(found: &Path) -> Result<PathBuf> {
     })
 }
 
-/// Where the pictures are: `images` beside `sparse`, else the folder that holds it.
-fn pictures_folder(folder: &Path) -> PathBuf {
+/// Returns the folder of the images: `images` beside `sparse`, or the data set's folder if there is none.
+fn find_images_folder(folder: &Path) -> PathBuf {
     let below = if folder.ends_with("sparse/0") { 2 } else { usize::from(folder.ends_with("sparse")) };
     let root = folder.ancestors().nth(below).unwrap_or(folder);
     Some(root.join("images")).filter(|images| images.is_dir()).unwrap_or_else(|| root.to_owned())
 }
 
+/// Returns the split of an image by the innermost folder called `test` or `val` in its name; training without one.
 fn split_of(name: &str) -> Split {
     match name
         .split(['/', '\\'])
@@ -165,13 +169,20 @@ fn split_of(name: &str) -> Split {
     }
 }
 
-fn scaled(Lens { size, intrinsics: [fx, fy, cx, cy] }: Lens, asked: Option<(u32, u32)>) -> ((u32, u32), [f64; 4]) {
-    let Some(asked) = asked else { return (size, [fx, fy, cx, cy]) };
-    let (x, y) = (f64::from(asked.0) / f64::from(size.0), f64::from(asked.1) / f64::from(size.1));
-    (asked, [fx * x, fy * y, cx * x, cy * y])
+/// Returns the size and intrinsics of a camera, scale_intrinsics to the size `requested` if there is one.
+fn scale_intrinsics(
+    Lens { size, intrinsics: [fx, fy, cx, cy] }: Lens,
+    requested: Option<(u32, u32)>,
+) -> ((u32, u32), [f64; 4]) {
+    let Some(requested) = requested else { return (size, [fx, fy, cx, cy]) };
+    let (x, y) = (f64::from(requested.0) / f64::from(size.0), f64::from(requested.1) / f64::from(size.1));
+    (requested, [fx * x, fy * y, cx * x, cy * y])
 }
 
-/// A camera of the model called `name`, checked to be without distortion.
+/// Builds a camera from the name, image size and parameters of its COLMAP model.
+///
+/// # Errors
+/// The model is unknown, has distortion or another number of parameters; the size is out of range.
 fn lens(
     wrong: impl Fn(String, String) -> Error,
     name: &str,
@@ -188,12 +199,12 @@ fn lens(
     }
     if distortion == 0 || values[distortion..].iter().any(|&value| value != 0.0) {
         return Err(wrong("a camera without distortion (SIMPLE_PINHOLE or PINHOLE)".into(), name.to_owned()).hint(
-            "undistort the pictures: colmap image_undistorter writes them with a reconstruction that is read here",
+            "undistort the images: colmap image_undistorter writes them with a reconstruction that splatsieve reads",
         ));
     }
     let side = |side: u64| u32::try_from(side).ok().filter(|side| (1..=MAX_SIDE_PX).contains(side));
     let (Some(w), Some(h)) = (side(width), side(height)) else {
-        return Err(wrong(format!("a picture of 1 to {MAX_SIDE_PX} pixels a side"), format!("{width} × {height}")));
+        return Err(wrong(format!("an image of 1 to {MAX_SIDE_PX} pixels a side"), format!("{width} × {height}")));
     };
     let intrinsics = match *values {
         [f, cx, cy] | [f, cx, cy, _] | [f, cx, cy, _, _] if distortion == 3 => [f, f, cx, cy],
@@ -203,7 +214,8 @@ fn lens(
     Ok(Lens { size: (w, h), intrinsics })
 }
 
-fn parse_cameras(path: &Path, gauge: &mut MemoryCounter) -> Result<HashMap<u32, Lens>> {
+/// Reads `cameras.txt`: the cameras by number.
+fn parse_cameras(path: &Path, counter: &mut MemoryCounter) -> Result<HashMap<u32, Lens>> {
     let mut lenses = HashMap::new();
     let mut lines = TextLines::open(path)?;
     while let Some((number, line)) = lines.next_line()? {
@@ -220,13 +232,14 @@ fn parse_cameras(path: &Path, gauge: &mut MemoryCounter) -> Result<HashMap<u32, 
         };
         let values: Vec<f64> =
             values.iter().map(|value| value.parse()).collect::<std::result::Result<_, _>>().map_err(|_| expected())?;
-        gauge.take(path, &format!("line {number}"), "the cameras", LENS_BYTES)?;
+        counter.take(path, &format!("line {number}"), "the cameras", LENS_BYTES)?;
         lenses.insert(id, lens(wrong, model, (width, height), &values)?);
     }
     Ok(lenses)
 }
 
-fn parse_images(path: &Path, gauge: &mut MemoryCounter) -> Result<Vec<ColmapImage>> {
+/// Reads `images.txt`.
+fn parse_images(path: &Path, counter: &mut MemoryCounter) -> Result<Vec<ColmapImage>> {
     let mut images = Vec::new();
     let mut lines = TextLines::open(path)?;
     while let Some((number, line)) = lines.next_line()? {
@@ -251,16 +264,16 @@ fn parse_images(path: &Path, gauge: &mut MemoryCounter) -> Result<Vec<ColmapImag
         }
         let camera = word().and_then(|word| word.parse().ok()).ok_or_else(wrong)?;
         let [w, x, y, z, tx, ty, tz] = values;
-        gauge.take(path, &format!("line {number}"), "the pictures", IMAGE_BYTES + 2 * rest.len() as u64)?;
+        counter.take(path, &format!("line {number}"), "the images", IMAGE_BYTES + 2 * rest.len() as u64)?;
         let name = rest.into();
         images.push(ColmapImage { quaternion: [w, x, y, z], translation: [tx, ty, tz], camera, name });
-        // The points that it sees, on a line that may be empty.
+        // The points that the image sees, on a line that may be empty.
         lines.skip_line()?;
     }
     Ok(images)
 }
 
-/// Little-endian numbers of a file, one after the other.
+/// Reader of little-endian numbers with the position in the file.
 struct Binary<'a> {
     path: &'a Path,
     file: BufReader<File>,
@@ -275,17 +288,21 @@ impl<'a> Binary<'a> {
         Ok(Binary { path, file: BufReader::new(file), at: 0, len })
     }
 
+    /// Returns an error about the bytes at the present position.
     fn wrong(&self, expected: impl Into<String>, found: impl Into<String>) -> Error {
         Error::input(self.path, format!("byte {}", self.at), expected, found)
     }
 
-    fn ends(&self, what: &str) -> Error {
-        self.wrong(what, format!("the end of the file, of {} bytes", self.len)).hint("it is cut short: copy it again")
+    /// Returns the error for a truncated file.
+    fn truncated(&self, what: &str) -> Error {
+        self.wrong(what, format!("the end of the file, after {} bytes", self.len))
+            .hint("it is cut short: copy it again")
     }
 
+    /// Reads `W` bytes; `what` names them in the error.
     fn bytes<const W: usize>(&mut self, what: &str) -> Result<[u8; W]> {
         if self.len - self.at < W as u64 {
-            return Err(self.ends(what));
+            return Err(self.truncated(what));
         }
         let mut bytes = [0; W];
         self.file.read_exact(&mut bytes).map_err(Error::io("read", self.path))?;
@@ -293,14 +310,17 @@ impl<'a> Binary<'a> {
         Ok(bytes)
     }
 
+    /// Reads a `u32`.
     fn u32(&mut self, what: &str) -> Result<u32> {
         self.bytes(what).map(u32::from_le_bytes)
     }
 
+    /// Reads a `u64`.
     fn u64(&mut self, what: &str) -> Result<u64> {
         self.bytes(what).map(u64::from_le_bytes)
     }
 
+    /// Reads `W` values of type `f64`.
     fn f64s<const W: usize>(&mut self, what: &str) -> Result<[f64; W]> {
         let mut values = [0.0; W];
         for value in &mut values {
@@ -309,28 +329,30 @@ impl<'a> Binary<'a> {
         Ok(values)
     }
 
-    /// A text that ends with a zero byte.
+    /// Reads a text that truncated with a zero byte.
     fn text(&mut self, what: &str) -> Result<String> {
         let mut bytes = Vec::new();
-        let most = MAX_NAME.min(self.len - self.at);
+        let most = MAX_NAME_BYTES.min(self.len - self.at);
         (&mut self.file).take(most).read_until(0, &mut bytes).map_err(Error::io("read", self.path))?;
         if bytes.pop() != Some(0) {
-            return Err(self.wrong(what, format!("none that ends within {MAX_NAME} bytes")));
+            return Err(self.wrong(what, format!("a text of more than {MAX_NAME_BYTES} bytes, or one without an end")));
         }
         self.at += bytes.len() as u64 + 1;
-        String::from_utf8(bytes).map_err(|_| self.wrong(what, "a name that is no UTF-8"))
+        String::from_utf8(bytes).map_err(|_| self.wrong(what, "a name that is not UTF-8"))
     }
 
+    /// Skips `bytes`; `None` stands for a number that overflowed and is an error.
     fn skip(&mut self, bytes: Option<u64>, what: &str) -> Result<()> {
-        let Some(bytes) = bytes.filter(|&bytes| bytes <= self.len - self.at) else { return Err(self.ends(what)) };
-        // No file is longer than i64 counts.
+        let Some(bytes) = bytes.filter(|&bytes| bytes <= self.len - self.at) else { return Err(self.truncated(what)) };
+        // File sizes fit into i64.
         self.file.seek_relative(bytes as i64).map_err(Error::io("read", self.path))?;
         self.at += bytes;
         Ok(())
     }
 }
 
-fn read_cameras(path: &Path, gauge: &mut MemoryCounter) -> Result<HashMap<u32, Lens>> {
+/// Reads `cameras.bin`: the cameras by number.
+fn read_cameras(path: &Path, counter: &mut MemoryCounter) -> Result<HashMap<u32, Lens>> {
     let mut file = Binary::open(path)?;
     let mut lenses = HashMap::new();
     for _ in 0..file.u64("a number of cameras")? {
@@ -343,22 +365,23 @@ fn read_cameras(path: &Path, gauge: &mut MemoryCounter) -> Result<HashMap<u32, L
         let values = (0..count).map(|_| Ok(file.f64s::<1>("a parameter")?[0])).collect::<Result<Vec<f64>>>()?;
         let wrong =
             |expected: String, found: String| Error::input(path, format!("byte {at}, camera {id}"), expected, found);
-        gauge.take(path, &format!("byte {at}"), "the cameras", LENS_BYTES)?;
+        counter.take(path, &format!("byte {at}"), "the cameras", LENS_BYTES)?;
         lenses.insert(id, lens(wrong, name, size, &values)?);
     }
     Ok(lenses)
 }
 
-fn read_images(path: &Path, gauge: &mut MemoryCounter) -> Result<Vec<ColmapImage>> {
+/// Reads `images.bin`.
+fn read_images(path: &Path, counter: &mut MemoryCounter) -> Result<Vec<ColmapImage>> {
     let mut file = Binary::open(path)?;
     let mut images = Vec::new();
     for _ in 0..file.u64("a number of images")? {
         file.u32("an image")?;
         let (quaternion, translation) = (file.f64s("a rotation")?, file.f64s("a translation")?);
-        let (camera, name) = (file.u32("a camera")?, file.text("a picture's name")?);
-        gauge.take(path, &format!("byte {}", file.at), "the pictures", IMAGE_BYTES + 2 * name.len() as u64)?;
+        let (camera, name) = (file.u32("a camera")?, file.text("an image's name")?);
+        counter.take(path, &format!("byte {}", file.at), "the images", IMAGE_BYTES + 2 * name.len() as u64)?;
         let points = file.u64("a number of points")?;
-        file.skip(points.checked_mul(POINT), "the points of a picture")?;
+        file.skip(points.checked_mul(POINT_BYTES), "the points of an image")?;
         images.push(ColmapImage { quaternion, translation, camera, name: name.into() });
     }
     Ok(images)

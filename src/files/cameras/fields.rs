@@ -1,4 +1,4 @@
-//! Typed access to the keys of one JSON object, with errors that name the picture and the key.
+//! Typed access to the keys of one JSON object, with errors that name the image and the key.
 
 use std::path::Path;
 
@@ -8,20 +8,23 @@ use super::MAX_SIDE_PX;
 use crate::error::{Error, Result};
 use crate::files::json::small::{Object, Small};
 
-/// What a pose is, for messages.
+/// Description of a pose matrix in error messages.
 pub(super) const POSE: &str = "3 or 4 rows of 4 finite numbers";
 
-/// One JSON object of a camera file: a picture's, or the file's own.
+/// One JSON object of a camera file: that of an image, or the top-level object.
 #[derive(Clone, Copy)]
 pub(super) struct CameraFields<'a> {
     path: &'a Path,
-    /// Index of the picture in the file; none for the file's own keys.
+    /// Index of the image in the file; `None` for the top-level object.
     frame: Option<usize>,
     map: &'a Object,
 }
 
 impl<'a> CameraFields<'a> {
-    /// The keys of `value`, which must be an object.
+    /// Returns access to the keys of `value`.
+    ///
+    /// # Errors
+    /// `value` is not an object.
     pub(super) fn new(path: &'a Path, frame: Option<usize>, value: &'a Small) -> Result<Self> {
         match value {
             Small::Object(map) => Ok(CameraFields { path, frame, map }),
@@ -29,7 +32,7 @@ impl<'a> CameraFields<'a> {
         }
     }
 
-    /// An error about `key`.
+    /// Returns an error about the value of `key`.
     pub(super) fn wrong(&self, key: &str, expected: impl Into<String>) -> Error {
         let found = self.map.get(key).map_or_else(|| "nothing".to_owned(), Small::describe);
         let place = match self.frame {
@@ -39,7 +42,7 @@ impl<'a> CameraFields<'a> {
         Error::input(self.path, place, expected, found)
     }
 
-    /// A finite number, if the key is there and not null.
+    /// Returns a finite number, or `None` if the key is missing or null.
     pub(super) fn optional_number(&self, key: &str) -> Result<Option<f64>> {
         match self.map.get(key) {
             None | Some(Small::Null) => Ok(None),
@@ -50,12 +53,13 @@ impl<'a> CameraFields<'a> {
         }
     }
 
-    /// A finite number.
+    /// Returns a finite number.
     pub(super) fn number(&self, key: &str) -> Result<f64> {
         self.optional_number(key)?.ok_or_else(|| self.wrong(key, "a finite number"))
     }
 
-    /// A picture side in pixels, if the key is there; some writers give it as 800.0.
+    /// Returns an image width or height in pixels, or `None` if the key is missing. Accepts 800.0, as some programs
+    /// write it.
     pub(super) fn optional_side(&self, key: &str) -> Result<Option<u32>> {
         match self.optional_number(key)? {
             None => Ok(None),
@@ -66,12 +70,12 @@ impl<'a> CameraFields<'a> {
         }
     }
 
-    /// A picture side in pixels.
+    /// Returns an image width or height in pixels.
     pub(super) fn side(&self, key: &str) -> Result<u32> {
         self.optional_side(key)?.ok_or_else(|| self.wrong(key, "a number of pixels"))
     }
 
-    /// A text, if the key is there and not null.
+    /// Returns a text, or `None` if the key is missing or null.
     pub(super) fn optional_text(&self, key: &str) -> Result<Option<&'a str>> {
         match self.map.get(key) {
             None | Some(Small::Null) => Ok(None),
@@ -80,7 +84,7 @@ impl<'a> CameraFields<'a> {
         }
     }
 
-    /// A whole number that fits 32 bits, if the key is there and not null.
+    /// Returns a whole number that fits 32 bits, or `None` if the key is missing or null.
     pub(super) fn optional_index(&self, key: &str) -> Result<Option<u32>> {
         match self.map.get(key) {
             None | Some(Small::Null) => Ok(None),
@@ -91,7 +95,7 @@ impl<'a> CameraFields<'a> {
         }
     }
 
-    /// Width and height in pixels.
+    /// Returns width and height in pixels.
     pub(super) fn sides(&self, key: &str) -> Result<[u32; 2]> {
         let side = |value: f64| {
             (value.fract() == 0.0 && (1.0..=f64::from(MAX_SIDE_PX)).contains(&value)).then_some(value as u32)
@@ -100,7 +104,7 @@ impl<'a> CameraFields<'a> {
         found.ok_or_else(|| self.wrong(key, format!("width and height, 1 to {MAX_SIDE_PX} pixels")))
     }
 
-    /// Three numbers, if the key is there.
+    /// Returns three numbers, or `None` if the key is missing or null.
     pub(super) fn optional_vector(&self, key: &str) -> Result<Option<[f64; 3]>> {
         match self.map.get(key) {
             None | Some(Small::Null) => Ok(None),
@@ -108,19 +112,19 @@ impl<'a> CameraFields<'a> {
         }
     }
 
-    /// Three numbers.
+    /// Returns three numbers.
     pub(super) fn vector(&self, key: &str) -> Result<[f64; 3]> {
         self.optional_vector(key)?.ok_or_else(|| self.wrong(key, "3 finite numbers"))
     }
 
-    /// A row-major 3 × 3 matrix.
+    /// Returns a row-major 3 × 3 matrix.
     pub(super) fn matrix3(&self, key: &str) -> Result<DMat3> {
         let rows = self.map.get(key).and_then(Small::elements).filter(|rows| rows.len() == 3);
         rows.and_then(|rows| Some(from_rows([numbers(&rows[0])?, numbers(&rows[1])?, numbers(&rows[2])?])))
             .ok_or_else(|| self.wrong(key, "3 rows of 3 finite numbers"))
     }
 
-    /// The rotation and translation of a row-major 3 × 4 or 4 × 4 pose `[R | t]`.
+    /// Returns the rotation and translation of a row-major 3 × 4 or 4 × 4 pose `[R | t]`.
     pub(super) fn pose(&self, key: &str) -> Result<(DMat3, DVec3)> {
         let rows = self.map.get(key).and_then(Small::elements).filter(|rows| matches!(rows.len(), 3 | 4));
         let rows: Option<Vec<[f64; 4]>> = rows.and_then(|rows| rows.iter().map(numbers).collect());
@@ -134,8 +138,8 @@ impl<'a> CameraFields<'a> {
         Ok((rotation, DVec3::new(rows[0][3], rows[1][3], rows[2][3])))
     }
 
-    /// Number of elements of the list under `key`.
-    pub(super) fn list(&self, key: &str) -> Result<usize> {
+    /// Returns the number of elements of the list_len under `key`.
+    pub(super) fn list_len(&self, key: &str) -> Result<usize> {
         match self.map.get(key) {
             Some(Small::List(_, total)) => Ok(*total),
             _ => Err(self.wrong(key, "a list")),
@@ -143,20 +147,22 @@ impl<'a> CameraFields<'a> {
     }
 }
 
-/// "frame 12", or nothing.
+/// Returns the place of image `frame` in error messages: "frame 12", or an empty text for `None`.
 pub(super) fn place(frame: Option<usize>) -> String {
     frame.map_or_else(String::new, |frame| format!("frame {frame}"))
 }
 
+/// Returns the elements of a list_len of exactly `W` finite numbers.
 fn numbers<const W: usize>(value: &Small) -> Option<[f64; W]> {
-    let list: &[Small; W] = value.elements()?.try_into().ok()?;
+    let elements: &[Small; W] = value.elements()?.try_into().ok()?;
     let mut out = [0.0; W];
-    for (to, from) in out.iter_mut().zip(list) {
+    for (to, from) in out.iter_mut().zip(elements) {
         *to = from.as_f64().filter(|number| number.is_finite())?;
     }
     Some(out)
 }
 
+/// Returns the matrix with these rows.
 fn from_rows(rows: [[f64; 3]; 3]) -> DMat3 {
     DMat3::from_cols_array_2d(&rows).transpose()
 }

@@ -1,11 +1,10 @@
-//! `poses_bounds.npy` of LLFF and DyNeRF: f64 or f32 `[V, 17]`, one row per camera.
+//! Reads `poses_bounds.npy` of LLFF and DyNeRF: f64 or f32 `[V, 17]`, one row per camera.
 //!
-//! A row is a 3 × 5 matrix, row by row, and two depth bounds (unused). The columns are the camera's
-//! down, right and backward axes in the world, its position, and (height, width, focal) in pixels of
-//! the original pictures. The pictures are used at half that size unless another is given, the
-//! focal length scaled with the width; the principal point is the middle. Camera 0 is held out.
-//! Every camera sees every frame; frame i of n is at time i/n, so 1 is never reached (FORMATS:
-//! the DyNeRF loader of 4DGaussians).
+//! A row is a 3 × 5 matrix, row by row, and two depth bounds (unused). The columns of the matrix are the camera's down,
+//! right and backward axes in the world, its position, and (height, width, focal length) in pixels of the original
+//! images. Images are used at half that size unless another is given; the focal length is scaled with the width. The
+//! principal point is the middle of the image. Camera 0 is the test camera. Every camera sees every frame. Frame i of n
+//! is at time i/n, so time 1 is never reached (see FORMATS: the DyNeRF loader of 4DGaussians).
 
 use std::io::{BufReader, Read, Seek};
 use std::path::Path;
@@ -14,7 +13,7 @@ use glam::{DMat3, DVec3};
 use npyz::{NpyFile, Order, TypeChar};
 
 use super::assemble::{Assembly, ListedImage, MemoryCounter, check, from_camera_to_world};
-use super::{CameraOptions, MAX_PICTURES, MAX_SIDE_PX};
+use super::{CameraOptions, MAX_IMAGES, MAX_SIDE_PX};
 use crate::error::ShowPath;
 use crate::error::{Error, Result};
 use crate::files::names::shown_name;
@@ -22,21 +21,24 @@ use crate::files::npy::{HEAD, header_is_sound};
 use crate::files::open::open_file;
 use crate::model::{Camera, Rig, Split};
 
-/// Values per camera.
+/// Number of values per camera.
 const WIDTH: usize = 17;
-/// Frames of the original DyNeRF scenes.
+/// Number of frames of the original DyNeRF scenes.
 const DEFAULT_FRAMES: usize = 300;
 
-/// Reads `file`.
+/// Reads the cameras in `file`, each at every frame.
+///
+/// # Errors
+/// The array or a camera is malformed; cameras times frames exceed the maximum number of images.
 pub(super) fn load(file: &Path, options: &CameraOptions) -> Result<Rig> {
     let mut assembly = Assembly::new(options.memory);
-    let rows = read_rows(file, assembly.gauge())?;
+    let rows = read_rows(file, assembly.memory_counter())?;
     let cameras =
         rows.iter().enumerate().map(|(index, row)| camera(file, index, row, options)).collect::<Result<Vec<_>>>()?;
     let frames = options.frames.unwrap_or(DEFAULT_FRAMES);
-    if frames.saturating_mul(cameras.len()) > MAX_PICTURES {
+    if frames.saturating_mul(cameras.len()) > MAX_IMAGES {
         return Err(Error::usage(format!(
-            "{}: {} cameras × {frames} frames are more than {MAX_PICTURES} pictures",
+            "{}: {} cameras × {frames} frames are more than {MAX_IMAGES} images",
             file.shown(),
             cameras.len()
         )));
@@ -46,22 +48,23 @@ pub(super) fn load(file: &Path, options: &CameraOptions) -> Result<Rig> {
         origin += &format!(" ({DEFAULT_FRAMES} frames, as in the original DyNeRF scenes)");
     }
     assembly.begin(file, frames * cameras.len())?;
-    pictures(&cameras, frames).try_for_each(|picture| assembly.add(picture))?;
+    listed_images(&cameras, frames).try_for_each(|image| assembly.add(image))?;
     assembly.finish(None, origin)
 }
 
-/// One picture per frame and camera, frame after frame.
-fn pictures(cameras: &[Camera], frames: usize) -> impl Iterator<Item = ListedImage> {
-    let picture = move |frame: usize, view: usize| ListedImage {
+/// Returns one image per frame and camera, frame after frame.
+fn listed_images(cameras: &[Camera], frames: usize) -> impl Iterator<Item = ListedImage> {
+    let listed_image = move |frame: usize, view: usize| ListedImage {
         camera: cameras[view].clone(),
         time: Some(frame as f64 / frames as f64),
         split: if view == 0 { Split::Test } else { Split::Train },
         image: None,
         view: Some(view as u32),
     };
-    (0..frames).flat_map(move |frame| (0..cameras.len()).map(move |view| picture(frame, view)))
+    (0..frames).flat_map(move |frame| (0..cameras.len()).map(move |view| listed_image(frame, view)))
 }
 
+/// Builds the camera of row `index`.
 fn camera(file: &Path, index: usize, row: &[f64; WIDTH], options: &CameraOptions) -> Result<Camera> {
     let wrong = |expected: String, found: String| Error::input(file, format!("row {index}"), expected, found);
     let column = |c: usize| DVec3::new(row[c], row[5 + c], row[10 + c]);
@@ -71,7 +74,7 @@ fn camera(file: &Path, index: usize, row: &[f64; WIDTH], options: &CameraOptions
         let expected = format!("height and width of 1 to {MAX_SIDE_PX} whole pixels in columns 4 and 9");
         return Err(wrong(expected, format!("{height} and {width}")));
     }
-    // At least one pixel: half of a picture one pixel high.
+    // Half the size, but at least one pixel, for an image that is one pixel high.
     let half = |side: f64| ((side as u32) / 2).max(1);
     let (width_px, height_px) = options.size.unwrap_or((half(width), half(height)));
     let focal = focal * f64::from(width_px) / width;
@@ -82,15 +85,15 @@ fn camera(file: &Path, index: usize, row: &[f64; WIDTH], options: &CameraOptions
     Ok(camera)
 }
 
-/// The rows of the array in `file`, checked to be `[V, 17]` floats that are all there.
-fn read_rows(file: &Path, gauge: &mut MemoryCounter) -> Result<Vec<[f64; WIDTH]>> {
+/// Reads the rows of the array in `file`. Checks that it holds `[V, 17]` floats and is complete.
+fn read_rows(file: &Path, counter: &mut MemoryCounter) -> Result<Vec<[f64; WIDTH]>> {
     let unreadable = |found: String| Error::input(file, "header", "a NumPy array", found);
     let mut opened = open_file(file)?;
     let bytes = opened.metadata().map_err(Error::io("read the size of", file))?.len();
     let mut head = Vec::new();
     (&mut opened).take(HEAD).read_to_end(&mut head).map_err(Error::io("read", file))?;
     if !header_is_sound(&head, bytes) {
-        return Err(unreadable("a header that no array of numbers has".into()));
+        return Err(unreadable("a header that is not that of an array of numbers".into()));
     }
     opened.rewind().map_err(Error::io("read", file))?;
     let array = NpyFile::new(BufReader::new(opened)).map_err(|error| unreadable(error.to_string()))?;
@@ -109,12 +112,12 @@ fn read_rows(file: &Path, gauge: &mut MemoryCounter) -> Result<Vec<[f64; WIDTH]>
         return Err(Error::input(file, "header", "rows stored one after the other (C order)", "Fortran order")
             .hint("save it again with numpy.ascontiguousarray"));
     }
-    // The length is checked against the bytes at hand before anything of that size is made.
+    // The length is checked against the file size before anything of that size is allocated.
     if real.is_some_and(|size| count.saturating_mul(WIDTH as u64 * size as u64) > bytes) {
         return Err(Error::input(file, "data", format!("{count} rows of {WIDTH}"), format!("{bytes} bytes in all")));
     }
-    // The values as they are stored, as f64 and row by row, and a camera for each.
-    gauge.take(file, "data", &format!("{count} rows of {WIDTH}"), count.saturating_mul(24 * WIDTH as u64 + 256))?;
+    // Counts the values as they are stored, the values as f64 in rows, and a camera for each row.
+    counter.take(file, "data", &format!("{count} rows of {WIDTH}"), count.saturating_mul(24 * WIDTH as u64 + 256))?;
     let truncated =
         |error: std::io::Error| Error::input(file, "data", format!("{count} rows of {WIDTH}"), error.to_string());
     let values: Vec<f64> = match real {

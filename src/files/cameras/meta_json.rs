@@ -1,8 +1,9 @@
-//! `train_meta.json` and `test_meta.json` of Dynamic3DGaussians: for every frame the cameras that took it.
+//! Reads `train_meta.json` and `test_meta.json` of Dynamic3DGaussians: for every frame, a list of the cameras that took
+//! it.
 //!
-//! Keys: `w`, `h`, pixels; by frame and camera `k`, the 3 × 3 matrix of focal lengths and principal point, pixels; `w2c`, world
-//! to camera, row-major, OpenCV axes; `fn`, the picture below `ims`; `cam_id`. There are no times: frame i of T is at
-//! i / (T − 1).
+//! Keys: `w`, `h`, in pixels; by frame and camera: `k`, the 3 × 3 matrix of focal lengths and principal point in
+//! pixels; `w2c`, world to camera, row-major, OpenCV axes; `fn`, the path of the image below `ims`; `cam_id`. There are
+//! no times: frame i of T is at time i / (T − 1).
 
 use std::path::{Path, PathBuf};
 
@@ -10,7 +11,7 @@ use glam::{DMat3, DVec3};
 
 use super::assemble::{Assembly, ListedImage};
 use super::fields::{CameraFields, POSE, place};
-use super::pictures::outline;
+use super::image_list::outline;
 use crate::error::ShowPath;
 use crate::error::{Error, Result};
 use crate::files::json::lists::{Ask, JsonPlace, each_element};
@@ -19,21 +20,21 @@ use crate::files::names::shown_name;
 use crate::limits::ReadLimit;
 use crate::model::{Camera, Rig, Split};
 
-/// The files of a sequence, and what of it they list.
+/// Names of the files of a sequence, and the split that each one lists.
 const FILES: [(&str, Split); 2] = [("train_meta.json", Split::Train), ("test_meta.json", Split::Test)];
 
-/// Keys of lists by frame and camera.
+/// Keys of the lists by frame and camera.
 const KEYS: [&str; 4] = ["k", "w2c", "fn", "cam_id"];
 
-/// Whether a document is such a file.
-pub(super) fn is_one(outline: &Small) -> bool {
+/// Returns whether a document is in this format.
+pub(super) fn is_meta_json(outline: &Small) -> bool {
     ["k", "w2c"].iter().all(|key| matches!(outline.get(key), Some(Small::List(..))))
 }
 
-/// Reads `file`; with what lies beside it, if a folder was asked for.
+/// Reads `file`, and the other file of the sequence beside it if `with_others` is set.
 ///
 /// # Errors
-/// A value that is missing, of another length, or no camera; files of different numbers of frames.
+/// A value is missing, has the wrong length or is not a valid camera; the files have different numbers of frames.
 pub(super) fn load(file: &Path, with_others: bool, memory: ReadLimit) -> Result<Rig> {
     let split = |path: &Path| FILES.iter().find(|(name, _)| path.ends_with(name)).map_or(Split::Train, |found| found.1);
     let mut assembly = Assembly::new(memory);
@@ -51,35 +52,40 @@ pub(super) fn load(file: &Path, with_others: bool, memory: ReadLimit) -> Result<
     assembly.finish(None, shown_name(file))
 }
 
-/// The values under one key, by frame and camera.
+/// Values under one key, by frame and camera.
 #[derive(Debug)]
 struct KeyedValues<T> {
+    /// Values of all frames, one frame after another.
     values: Vec<Option<T>>,
-    /// End of each frame's values.
+    /// End of each frame in `values`.
     ends: Vec<usize>,
 }
 
 impl<T> KeyedValues<T> {
+    /// Table without frames.
     const EMPTY: KeyedValues<T> = KeyedValues { values: Vec::new(), ends: Vec::new() };
 
-    /// Memory of one more value, as lists grow by being copied to twice their length.
+    /// Memory in bytes for one more value: three copies, because a list is copied to twice its length when it grows.
     const BYTES: u64 = 3 * size_of::<Option<T>>() as u64;
 
+    /// Returns the index in `values` of the first value of `frame`.
     fn start(&self, frame: usize) -> usize {
         frame.checked_sub(1).map_or(0, |before| self.ends[before])
     }
 
+    /// Returns the number of values of `frame`.
     fn len(&self, frame: usize) -> usize {
         self.ends[frame] - self.start(frame)
     }
 
+    /// Returns the value of `camera` at `frame`; `None` if there is none.
     fn get(&self, frame: usize, camera: usize) -> Option<&T> {
         (frame < self.ends.len() && camera < self.len(frame))
             .then(|| self.values[self.start(frame) + camera].as_ref())?
     }
 }
 
-/// The values of a file.
+/// Values of one file.
 #[derive(Debug)]
 struct Tables {
     intrinsics: KeyedValues<[f64; 4]>,
@@ -89,7 +95,7 @@ struct Tables {
 }
 
 impl Tables {
-    /// Takes the value of the key number `key` at `frame`.
+    /// Adds the value of key `KEYS[key]` to the current frame.
     fn take(&mut self, own: CameraFields<'_>, key: usize) -> Result<()> {
         match key {
             0 => {
@@ -103,7 +109,7 @@ impl Tables {
         Ok(())
     }
 
-    /// Ends a frame under the key number `key`.
+    /// Ends the current frame of key `KEYS[key]`.
     fn end(&mut self, key: usize) {
         match key {
             0 => self.intrinsics.ends.push(self.intrinsics.values.len()),
@@ -114,12 +120,12 @@ impl Tables {
     }
 }
 
-/// Adds the pictures of a file; returns how many frames it has.
+/// Adds the images of a file and returns its number of frames.
 fn add(assembly: &mut Assembly, file: &Path, split: Split) -> Result<usize> {
     let outline = outline(file)?;
     let shared = CameraFields::new(file, None, &outline)?;
     let (width, height) = (shared.side("w")?, shared.side("h")?);
-    let frames = shared.list("k")?;
+    let frames = shared.list_len("k")?;
     let mut tables = Tables {
         intrinsics: KeyedValues::EMPTY,
         poses: KeyedValues::EMPTY,
@@ -141,7 +147,7 @@ fn add(assembly: &mut Assembly, file: &Path, split: Split) -> Result<usize> {
         }
         let text = if let Small::Text(text) = &value { text.len() as u64 } else { 0 };
         let taken = if inner.is_some() { bytes[key] + text } else { 3 * size_of::<usize>() as u64 };
-        assembly.gauge().take(file, &place(Some(index)), "its cameras", taken)?;
+        assembly.memory_counter().take(file, &place(Some(index)), "its cameras", taken)?;
         used += taken;
         if inner.is_some() {
             let entry = Small::of_entry(name, value);
@@ -179,6 +185,6 @@ fn add(assembly: &mut Assembly, file: &Path, split: Split) -> Result<usize> {
             })?;
         }
     }
-    assembly.gauge().release(used);
+    assembly.memory_counter().release(used);
     Ok(frames)
 }

@@ -1,4 +1,4 @@
-//! Cameras of a data set, from whichever file describes them, as a [`Rig`].
+//! Reads the cameras of a data set, in any supported file format, as a [`Rig`].
 //!
 //! | file | times | splits |
 //! |---|---|---|
@@ -6,23 +6,23 @@
 //! | `cameras.json` of this project (`cameras_json.rs`) | `time` | `split` |
 //! | `cameras.json` of a 3DGS model folder (`cameras_json.rs`) | none: every frame | all train |
 //! | `poses_bounds.npy` (LLFF, DyNeRF; `llff.rs`) | i/n | camera 0 is test |
-//! | `dataset.json` with `camera/` (NeRFies, HyperNeRF; `nerfies.rs`) | `warp_id` by the largest | `val_ids` are test |
+//! | `dataset.json` with `camera/` (NeRFies, HyperNeRF; `nerfies.rs`) | `warp_id` divided by the largest | `val_ids` are test |
 //! | COLMAP's `cameras` and `images`, `.bin` or `.txt` (`colmap.rs`) | from names or a table (`times.rs`) | from folders in names |
-//! | the first of several `colmap_K` with such in `sparse/0`, a folder for each frame (SpacetimeGaussians) | i/n | the first is test |
+//! | the first of several folders `colmap_K`, one for each frame, with a reconstruction in `sparse/0` (SpacetimeGaussians) | i/n | the first camera is test |
 //!
-//! Everything leaves in OpenCV axes, world to camera, in f64, rotations checked to be rotations.
-//! Memory: one record per picture, which is checked against the limit before it is made. JSON and text are read as streams:
-//! once for what lies around the pictures, and once for these.
+//! All cameras are returned in OpenCV axes, world to camera, in f64. Rotation matrices are checked to be rotations.
+//! Memory: one record per image; its size is checked against the limit before it is allocated. JSON and text files are
+//! read as streams: once for the keys outside the list of images, and once for the images.
 
 mod assemble;
 mod cameras_json;
 mod colmap;
 mod fields;
 mod frames;
+mod image_list;
 mod llff;
 mod meta_json;
 mod nerfies;
-mod pictures;
 mod times;
 mod transforms;
 mod virtual_rig;
@@ -38,16 +38,16 @@ use crate::files::json::small::Small;
 use crate::limits::ReadLimit;
 use crate::model::Rig;
 
-use pictures::outline;
+use image_list::outline;
 pub use times::Times;
 pub use virtual_rig::{surrounding_rig, virtual_rig};
 
-/// Largest picture side in pixels: beyond it the width times the height of one picture nears 2³².
+/// Largest image side in pixels. Above it, the number of pixels of one image approaches 2³².
 const MAX_SIDE_PX: u32 = 1 << 15;
-/// Most pictures of a rig.
-const MAX_PICTURES: usize = 1 << 24;
+/// Maximum number of images of a rig.
+const MAX_IMAGES: usize = 1 << 24;
 
-/// What a folder is searched for, first match wins. `transforms*.json` come before `cameras.json`
+/// File names that are searched for in a folder; the first match wins. `transforms*.json` come before `cameras.json`
 /// because a 3DGS `cameras.json` beside them has lost the times.
 const NAMES: [&str; 9] = [
     "transforms_train.json",
@@ -60,49 +60,49 @@ const NAMES: [&str; 9] = [
     "cameras.json",
     "poses_bounds.npy",
 ];
-/// What NeRFies and HyperNeRF call the file that lists their pictures.
+/// Name of the file that lists the images of a NeRFies or HyperNeRF data set.
 const NERFIES: &str = "dataset.json";
 
-/// Where COLMAP puts a reconstruction inside a data set.
+/// Paths, relative to a data set, at which a COLMAP reconstruction is searched for.
 const COLMAP: [&str; 6] = ["sparse/0", "sparse", "cameras.bin", "cameras.txt", "images.bin", "images.txt"];
 
-/// What the camera files may leave open.
+/// Values that a camera file may not contain and the caller supplies.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct CameraOptions {
-    /// Picture (width, height) in pixels where the file names none and the picture is not there to
-    /// be asked. For `poses_bounds.npy`: instead of half the recorded size.
+    /// Image (width, height) in pixels, used if the file states no size and the image file cannot be measured. For
+    /// `poses_bounds.npy`, NeRFies and COLMAP it replaces the default size.
     pub size: Option<(u32, u32)>,
-    /// Frames of what does not count them, a `poses_bounds.npy` (300 if not given) and folders `colmap_K` (as many as follow
-    /// one another).
+    /// Number of frames of formats that do not state it: `poses_bounds.npy` (300 if not given) and folders `colmap_K`
+    /// (if not given, the number of consecutive folders).
     pub frames: Option<usize>,
-    /// Where the times of pictures come from whose file has none.
+    /// Source of the times of images whose camera file has none.
     pub times: Times,
-    /// What the times of `transforms*.json` count.
+    /// Meaning of the times in `transforms*.json`.
     pub clock: Clock,
-    /// Memory that the cameras may take while they are read.
+    /// Maximum memory that reading the cameras may take.
     pub memory: ReadLimit,
 }
 
-/// What the times of `transforms*.json` count.
+/// Meaning of the times in `transforms*.json`.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub enum Clock {
-    /// Anything: they are divided by the largest, as the D-NeRF loaders do.
+    /// Times in any unit; they are divided by the largest, as the D-NeRF loaders do.
     #[default]
     Normalized,
-    /// What the model's time counts.
+    /// Times in the unit of the model's own time; they are used as they are.
     Given,
 }
 
-/// Reads the cameras of `path`: a file, or a folder holding one, recognized by its name and content.
+/// Reads the cameras of `path`: a file, or a folder that holds one. The format is recognized by file name and content.
 ///
 /// # Errors
-/// [`Error::Input`] naming the file and the picture ("frame 12" counts from 0 in file order) when a
-/// value is missing, not finite, out of range, when a rotation is none, or when one view is taken
-/// twice at the same time; [`Error::Usage`] when `options` are out of range.
+/// [`Error::Input`] naming the file and the image ("frame 12" counts from 0 in file order) when a value is missing, not
+/// finite or out of range, when a matrix is not a rotation, or when a view occurs twice at the same time;
+/// [`Error::Usage`] when `options` are out of range.
 pub fn load(path: &Path, options: &CameraOptions) -> Result<Rig> {
     check_options(options)?;
     let Some(file) = locate(path) else {
-        // A path that cannot be looked at at all is the more useful thing to say.
+        // If the path cannot be opened at all, that error is more useful to the user.
         path.metadata().map_err(Error::io("open", path))?;
         let expected = format!("a folder with one of {}, or with COLMAP's sparse/0", NAMES.join(", "));
         return Err(Error::input(path, "", expected, "none of them"));
@@ -125,9 +125,7 @@ pub fn load(path: &Path, options: &CameraOptions) -> Result<Rig> {
     let outline = outline(&file)?;
     match kind(&outline) {
         Some(Kind::Transforms) => timed().and_then(|()| transforms::load(&file, path.is_dir(), options)),
-        Some(Kind::PerPicture) => {
-            timed().and_then(|()| cameras_json::load_per_picture(&file, &outline, options.memory))
-        }
+        Some(Kind::PerImage) => timed().and_then(|()| cameras_json::load_per_image(&file, &outline, options.memory)),
         Some(Kind::PerCamera(count)) => cameras_json::load_per_camera(&file, count, options),
         Some(Kind::PerFrame) => timed().and_then(|()| meta_json::load(&file, path.is_dir(), options.memory)),
         None => Err(Error::input(
@@ -140,10 +138,10 @@ pub fn load(path: &Path, options: &CameraOptions) -> Result<Rig> {
     }
 }
 
-/// Looks for the cameras a model was trained with: `source_path` is what its configuration says.
+/// Searches for the cameras a model was trained with. `source_path` is the path given in its configuration.
 ///
-/// A relative path is tried from the working folder, then from each folder above the model's, the
-/// nearest first. `None` when nothing there holds cameras; never an error.
+/// A relative path is tried from the working folder, then from each parent folder of the model folder, the nearest
+/// first. Returns `None` when no camera file is found; never fails.
 pub fn find(source_path: &str, model_folder: &Path) -> Option<PathBuf> {
     if source_path.is_empty() {
         return None;
@@ -153,12 +151,12 @@ pub fn find(source_path: &str, model_folder: &Path) -> Option<PathBuf> {
     std::iter::once(PathBuf::from(source_path)).chain(beside).find(|path| locate(path).is_some())
 }
 
-/// Whether the pictures of the cameras at `path` get their times from their names.
+/// Returns whether the images of the cameras at `path` get their times from their file names (COLMAP).
 pub fn are_timed_by_name(path: &Path) -> bool {
     locate(path).is_some_and(|file| is_colmap(&file))
 }
 
-/// The camera file `path` stands for: itself, or the first known name inside the folder.
+/// Returns the camera file for `path`: `path` itself, or the first known name inside the folder.
 fn locate(path: &Path) -> Option<PathBuf> {
     if path.is_file() {
         return Some(path.to_owned());
@@ -172,32 +170,35 @@ fn locate(path: &Path) -> Option<PathBuf> {
         .or_else(|| frames::first_in(path))
 }
 
+/// Returns whether `path` ends with one of the names of a COLMAP reconstruction.
 fn is_colmap(path: &Path) -> bool {
     COLMAP.iter().any(|name| path.ends_with(name))
 }
 
+/// Format of a JSON camera file.
 enum Kind {
     /// NeRF: camera to world, OpenGL axes.
     Transforms,
-    /// This project's: one entry per picture.
-    PerPicture,
-    /// 3DGS: one entry per camera, so many.
+    /// This project's `cameras.json`: one entry per image.
+    PerImage,
+    /// 3DGS `cameras.json`: one entry per camera; holds their number.
     PerCamera(usize),
     /// Dynamic3DGaussians: one list of cameras per frame.
     PerFrame,
 }
 
+/// Returns the format of a JSON camera file, recognized by the keys in its `outline`.
 fn kind(outline: &Small) -> Option<Kind> {
     if let Small::List(_, count) = outline {
         return Some(Kind::PerCamera(*count));
     }
-    if meta_json::is_one(outline) {
+    if meta_json::is_meta_json(outline) {
         return Some(Kind::PerFrame);
     }
     let Small::List(first, _) = outline.get("frames")? else { return None };
     let first = first.first()?;
     if first.get("w2c").is_some() {
-        Some(Kind::PerPicture)
+        Some(Kind::PerImage)
     } else if first.get("transform_matrix").is_some() {
         Some(Kind::Transforms)
     } else {
@@ -205,12 +206,11 @@ fn kind(outline: &Small) -> Option<Kind> {
     }
 }
 
+/// Checks that the image size and the number of frames are in range.
 fn check_options(options: &CameraOptions) -> Result<()> {
     let side = 1..=MAX_SIDE_PX;
     if let Some((width, height)) = options.size.filter(|(w, h)| !side.contains(w) || !side.contains(h)) {
-        return Err(Error::usage(format!(
-            "picture size {width}x{height}: each side must be 1 to {MAX_SIDE_PX} pixels"
-        )));
+        return Err(Error::usage(format!("image size {width}x{height}: each side must be 1 to {MAX_SIDE_PX} pixels")));
     }
     if options.frames == Some(0) {
         return Err(Error::usage("frames 0: there must be at least one"));

@@ -1,11 +1,15 @@
-//! NeRFies and HyperNeRF: `dataset.json`, `metadata.json` and a file `camera/ID.json` per picture.
+//! Reads NeRFies and HyperNeRF data sets: `dataset.json`, `metadata.json` and a file `camera/ID.json` per image.
 //!
-//! As the loader of 4DGaussians has them (`scene/hyper_loader.py`), with which models are trained: `orientation` is world
-//! to camera, row by row, in OpenCV axes, `position` the camera's own, both as they are: `scale` and `center` of
-//! `scene.json` are for other programs, and that file is not read. The focal length holds along both axes, the principal
-//! point is the middle; distortion, which that loader passes over, is passed over here. A picture's time is its `warp_id` by the largest. Held out are `val_ids`; where there are none
-//! every fourth picture is for training, from the first, and the one two after each but the last is held out.
-//! Pictures are those of `rgb/2x`, half the cameras' size, unless `--size` says another.
+//! The conventions are those of the loader of 4DGaussians (`scene/hyper_loader.py`), with which models are trained:
+//!
+//! - `orientation` is world to camera, row by row, in OpenCV axes; `position` is the camera's position. Both are used
+//!   as they are: `scale` and `center` of `scene.json` are for other programs, and that file is not read.
+//! - The focal length holds along both axes. The principal point is the middle of the image.
+//! - Distortion is ignored, as in that loader.
+//! - The time of an image is its `warp_id` divided by the largest `warp_id`.
+//! - Images in `val_ids` are test images. If `val_ids` is empty, every fourth image, from the first on, is for
+//!   training, and the image two after each training image but the last is a test image.
+//! - Images are those of `rgb/2x`, half the size in the camera files, unless `--resolution` gives another.
 
 use std::path::Path;
 
@@ -14,7 +18,7 @@ use hashbrown::{HashMap, HashSet};
 use super::CameraOptions;
 use super::assemble::{Assembly, ListedImage, MemoryCounter, from_camera_to_world};
 use super::fields::CameraFields;
-use super::pictures::whole;
+use super::image_list::read_keys;
 use crate::error::{Error, Result, quoted};
 use crate::files::image::measure;
 use crate::files::json::lists::{Ask, JsonPlace, each_element, each_entry};
@@ -22,71 +26,71 @@ use crate::files::json::small::Small;
 use crate::files::names::shown_name;
 use crate::model::{Rig, Split};
 
-/// Keys of a camera's file.
-const CAMERA: [&str; 4] = ["image_size", "focal_length", "orientation", "position"];
-/// Pictures between one for training and the next, where a data set names none to hold out.
+/// Keys of a camera file.
+const CAMERA_KEYS: [&str; 4] = ["image_size", "focal_length", "orientation", "position"];
+/// Distance between training images in a data set that names no test images.
 const TRAIN_EVERY: usize = 4;
 
-/// Reads the data set of which `file` is the `dataset.json`.
+/// Reads the data set whose `dataset.json` is `file`.
 ///
 /// # Errors
-/// Files that are missing or malformed; a picture without a camera or a time.
+/// A file is missing or malformed; an image has no camera or no time.
 pub(super) fn load(file: &Path, options: &CameraOptions) -> Result<Rig> {
     let folder = file.parent().unwrap_or(Path::new(""));
     let mut assembly = Assembly::new(options.memory);
-    let [ids, val, train] = names(file, assembly.gauge())?;
+    let [ids, val, train] = names(file, assembly.memory_counter())?;
     let splits = splits(&ids, &val, &train);
     let metadata = folder.join("metadata.json");
-    let warps = warps(&metadata, &ids, assembly.gauge())?;
+    let warps = warps(&metadata, &ids, assembly.memory_counter())?;
     let latest = f64::from(warps.iter().copied().max().unwrap_or(0).max(1));
     assembly.begin(file, splits.iter().map(Vec::len).sum())?;
     for ((id, warp), splits) in ids.iter().zip(warps).zip(splits) {
         if splits.is_empty() {
             continue;
         }
-        let picture = picture(folder, id, options)?;
+        let listed = listed_image(folder, id, options)?;
         for split in splits {
             let time = f64::from(warp) / latest;
-            assembly.add(ListedImage { time: Some(time), split, ..picture.clone() })?;
+            assembly.add(ListedImage { time: Some(time), split, ..listed.clone() })?;
         }
     }
     assembly.finish(None, shown_name(folder))
 }
 
-/// Keys of the lists of names: all pictures, those held out, those for training.
-const LISTS: [&str; 3] = ["ids", "val_ids", "train_ids"];
-/// Bytes that a name takes beside its text, in its list and in two tables.
+/// Keys of the lists of image names: all images, test images, training images.
+const LIST_KEYS: [&str; 3] = ["ids", "val_ids", "train_ids"];
+/// Bytes that a name takes in addition to its text, in its list and in two tables.
 const NAME_BYTES: u64 = 200;
 
-/// Reads the names of `file`. Those for training may be left out where none are held out.
-fn names(file: &Path, gauge: &mut MemoryCounter) -> Result<[Vec<Box<str>>; 3]> {
-    let outline = whole(file, &LISTS)?;
-    let of = CameraFields::new(file, None, &outline)?;
-    let held_out = of.list(LISTS[1])?;
-    of.list(LISTS[0])?;
+/// Reads the three lists of names of `file`. `train_ids` may be missing if `val_ids` is empty.
+fn names(file: &Path, counter: &mut MemoryCounter) -> Result<[Vec<Box<str>>; 3]> {
+    let outline = read_keys(file, &LIST_KEYS)?;
+    let fields = CameraFields::new(file, None, &outline)?;
+    let held_out = fields.list_len(LIST_KEYS[1])?;
+    fields.list_len(LIST_KEYS[0])?;
     if held_out > 0 {
-        of.list(LISTS[2])?;
+        fields.list_len(LIST_KEYS[2])?;
     }
     let mut names = [const { Vec::new() }; 3];
-    each_element(file, Ask { keys: &LISTS, nested: false, wanted: &[] }, |JsonPlace { key, index, .. }, name| {
+    each_element(file, Ask { keys: &LIST_KEYS, nested: false, wanted: &[] }, |JsonPlace { key, index, .. }, name| {
         if index != names[key].len() {
-            return Err(Error::input(file, format!("key \"{}\"", LISTS[key]), "this key once", "twice"));
+            return Err(Error::input(file, format!("key \"{}\"", LIST_KEYS[key]), "this key once", "twice"));
         }
         let Small::Text(name) = name else {
-            let place = format!("key \"{}\", element {index}", LISTS[key]);
+            let place = format!("key \"{}\", element {index}", LIST_KEYS[key]);
             return Err(Error::input(file, place, "a list of names", name.describe()));
         };
-        gauge.take(file, "", "the names of its pictures", name.len() as u64 + NAME_BYTES)?;
+        counter.take(file, "", "the names of its images", name.len() as u64 + NAME_BYTES)?;
         names[key].push(name);
         Ok(())
     })?;
     Ok(names)
 }
 
-/// Reads the `warp_id` of each picture.
-fn warps(file: &Path, ids: &[Box<str>], gauge: &mut MemoryCounter) -> Result<Vec<u32>> {
-    gauge.take(file, "", "the times of its pictures", 64 * ids.len() as u64)?;
-    // A name may be there twice.
+/// Reads the `warp_id` of each image.
+fn warps(file: &Path, ids: &[Box<str>], counter: &mut MemoryCounter) -> Result<Vec<u32>> {
+    counter.take(file, "", "the times of its images", 64 * ids.len() as u64)?;
+    // A name may occur twice in `ids`.
     let mut places: HashMap<&str, u32> = HashMap::with_capacity(ids.len());
     let mut found = Vec::new();
     for id in ids {
@@ -105,12 +109,12 @@ fn warps(file: &Path, ids: &[Box<str>], gauge: &mut MemoryCounter) -> Result<Vec
     })?;
     let warp = |id: &str| {
         let warp = places.get(id).and_then(|&place| found[place as usize]);
-        warp.ok_or_else(|| Error::input(file, "", format!("the picture {}", quoted(id)), "none of this name"))
+        warp.ok_or_else(|| Error::input(file, "", format!("the image {}", quoted(id)), "none of this name"))
     };
     ids.iter().map(|id| warp(id)).collect()
 }
 
-/// The splits of every picture, mostly one; of some none.
+/// Returns the splits of every image: mostly one, for some images none.
 fn splits(ids: &[Box<str>], val: &[Box<str>], train: &[Box<str>]) -> Vec<Vec<Split>> {
     if val.is_empty() {
         let trained = ids.len().div_ceil(TRAIN_EVERY);
@@ -131,9 +135,11 @@ fn splits(ids: &[Box<str>], val: &[Box<str>], train: &[Box<str>]) -> Vec<Vec<Spl
     ids.iter().map(|id| split(id)).collect()
 }
 
-fn picture(folder: &Path, id: &str, options: &CameraOptions) -> Result<ListedImage> {
+/// Reads the camera of the image called `id`. Its size in pixels comes from `--resolution`, else from the image file, else it
+/// is half the size in the camera file.
+fn listed_image(folder: &Path, id: &str, options: &CameraOptions) -> Result<ListedImage> {
     let file = folder.join("camera").join(format!("{id}.json"));
-    let document = whole(&file, &CAMERA)?;
+    let document = read_keys(&file, &CAMERA_KEYS)?;
     let own = CameraFields::new(&file, None, &document)?;
     let [width, height] = own.sides("image_size")?;
     let image = folder.join("rgb/2x").join(format!("{id}.png"));

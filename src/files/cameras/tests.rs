@@ -1,4 +1,6 @@
-//! Cameras as real data sets write them, and what is said of those that are wrong.
+//! Tests with cameras in the formats of real data sets, and of the error messages for malformed ones.
+
+mod colmap;
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -6,10 +8,10 @@ use std::path::{Path, PathBuf};
 use glam::{DMat3, DVec3};
 use serde_json::{Value, json};
 
-use super::{CameraOptions, Times, find, load};
+use super::{CameraOptions, find, load};
 use crate::model::{Camera, Rig, Split};
 
-/// The trained models in `SPLATSIEVE_DATA`, else `../shared/data`, which must be there.
+/// Returns the folders of the trained models in `SPLATSIEVE_DATA`, else in `../shared/data`, which must exist.
 fn shared_models() -> [PathBuf; 3] {
     let data = std::env::var_os("SPLATSIEVE_DATA")
         .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data"), PathBuf::from);
@@ -17,7 +19,7 @@ fn shared_models() -> [PathBuf; 3] {
     ["deform2", "room2_big", "room2_dynerf"].map(|name| data.join(name))
 }
 
-/// A folder with these files.
+/// Returns a temporary folder with these files.
 fn folder(files: &[(&str, &Value)]) -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
     for (name, content) in files {
@@ -30,7 +32,7 @@ fn load_json(name: &str, content: &Value) -> crate::error::Result<Rig> {
     load(folder(&[(name, content)]).path(), &CameraOptions::default())
 }
 
-/// The message for a file of this name and content, which must contain every part.
+/// Asserts that the error message for a file of this name and content contains every part.
 fn assert_refused(name: &str, content: &Value, parts: &[&str]) {
     let message = load_json(name, content).unwrap_err().to_string();
     for part in parts.iter().chain(&[name]) {
@@ -38,7 +40,7 @@ fn assert_refused(name: &str, content: &Value, parts: &[&str]) {
     }
 }
 
-/// OpenGL camera-to-world: at `eye`, looking along +y of the world, z up.
+/// Returns the OpenGL camera-to-world pose of a camera at `eye`, looking along +y of the world, z up.
 fn along_y(eye: [f64; 3]) -> Value {
     json!([[1, 0, 0, eye[0]], [0, 0, -1, eye[1]], [0, 1, 0, eye[2]], [0, 0, 0, 1]])
 }
@@ -52,7 +54,7 @@ fn transforms(times: &[f64]) -> Value {
     json!({"camera_angle_x": 1.0, "w": 80, "h": 60, "frames": frames})
 }
 
-fn per_picture(times: &[f64]) -> Value {
+fn per_image(times: &[f64]) -> Value {
     let frame = |time: &f64| {
         json!({"v": 4, "time": time, "width": 80, "height": 60, "fx": 70.0, "fy": 71.0, "cx": 39.0, "cy": 31.0,
                "w2c": [[1, 0, 0, 0.5], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1]]})
@@ -60,7 +62,7 @@ fn per_picture(times: &[f64]) -> Value {
     json!({"background": [1, 0.5, 0], "frames": times.iter().map(frame).collect::<Vec<_>>()})
 }
 
-/// A file as NumPy's format 1.0 has it.
+/// Returns a file of NumPy's format 1.0.
 fn npy(dtype: &str, order: &str, shape: &str, rows: &[[f64; 17]]) -> Vec<u8> {
     let header = format!("{{'descr': '{dtype}', 'fortran_order': {order}, 'shape': {shape}, }}");
     let mut bytes = b"\x93NUMPY\x01\0\x76\0".to_vec();
@@ -73,7 +75,7 @@ fn write_npy(path: &Path, rows: &[[f64; 17]]) {
     fs::write(path, npy("<f8", "False", &format!("({}, 17)", rows.len()), rows)).unwrap();
 }
 
-/// A row for a camera at `eye` looking along +y of the world, z up.
+/// Returns a row for a camera at `eye` looking along +y of the world, z up.
 fn llff_row(eye: [f64; 3], height: f64, width: f64, focal: f64) -> [f64; 17] {
     let [x, y, z] = eye;
     // Columns: down −z, right +x, backward −y, position, (height, width, focal).
@@ -81,7 +83,7 @@ fn llff_row(eye: [f64; 3], height: f64, width: f64, focal: f64) -> [f64; 17] {
 }
 
 #[test]
-fn poses_that_differ_in_the_sign_of_a_zero_are_one_camera() {
+fn negative_zero_and_zero_give_the_same_camera() {
     let frame = |zero: f64, time: f64| {
         json!({"v": 4, "time": time, "width": 80, "height": 60, "fx": 70.0, "fy": 71.0, "cx": 39.0, "cy": zero,
                "w2c": [[1, zero, zero, zero], [0, 1, zero, 0], [0, 0, 1, 3], [0, 0, 0, 1]]})
@@ -93,7 +95,7 @@ fn poses_that_differ_in_the_sign_of_a_zero_are_one_camera() {
 
 #[test]
 #[ignore = "needs the trained models"]
-fn transforms_and_cameras_json_of_the_trained_models_give_the_same_cameras() {
+fn transforms_and_cameras_json_give_the_same_cameras() {
     for model in shared_models() {
         let options = CameraOptions::default();
         let transforms = load(&model, &options).unwrap();
@@ -119,12 +121,12 @@ fn transforms_and_cameras_json_of_the_trained_models_give_the_same_cameras() {
             assert_eq!((a.cx, a.cy), (b.cx, b.cy));
         }
         let there = transforms.shots.iter().filter(|s| s.image.as_ref().is_some_and(|image| image.is_file())).count();
-        assert_eq!(there, fs::read_dir(model.join("test")).unwrap().count(), "every picture of test/ is found");
+        assert_eq!(there, fs::read_dir(model.join("test")).unwrap().count(), "every image of test/ is found");
     }
 }
 
 #[test]
-fn a_folder_has_all_its_splits_and_a_file_its_own() {
+fn a_folder_gives_all_splits_and_a_file_one() {
     let folder = folder(&[
         ("transforms_train.json", &transforms(&[0.0, 0.5, 1.0])),
         ("transforms_test.json", &transforms(&[0.25])),
@@ -133,7 +135,7 @@ fn a_folder_has_all_its_splits_and_a_file_its_own() {
     let whole = load(folder.path(), &options).unwrap();
     assert_eq!(whole.shots.len(), 4);
     assert_eq!(whole.shots.iter().map(|s| s.split == Split::Test).collect::<Vec<_>>(), [false, false, false, true]);
-    // A file that is named stands for itself alone, at the times that it has among all.
+    // A file that is named itself contributes only its own images, at the times they have among all splits.
     let alone = |name: &str| load(&folder.path().join(name), &options).unwrap();
     for (name, split) in [("transforms_train.json", Split::Train), ("transforms_test.json", Split::Test)] {
         let own: Vec<_> = whole.shots.iter().filter(|shot| shot.split == split).map(|shot| shot.time).collect();
@@ -143,7 +145,7 @@ fn a_folder_has_all_its_splits_and_a_file_its_own() {
 }
 
 #[test]
-fn val_is_a_split_of_its_own_and_held_out_where_there_is_no_test() {
+fn val_is_held_out_if_there_is_no_test_split() {
     let train = transforms(&[0.0, 0.5, 1.0]);
     let val = transforms(&[0.25, 0.75]);
     let files = [("transforms_train.json", &train), ("transforms_val.json", &val)];
@@ -155,159 +157,13 @@ fn val_is_a_split_of_its_own_and_held_out_where_there_is_no_test() {
     let with_test = [&files[..], &[("transforms_test.json", &test)]].concat();
     let rig = load(folder(&with_test).path(), &CameraOptions::default()).unwrap();
     assert_eq!((count(&rig, Split::Val), count(&rig, Split::Test), rig.held_out()), (2, 1, Some(Split::Test)));
-    let mut document = per_picture(&[0.0]);
+    let mut document = per_image(&[0.0]);
     document["frames"][0]["split"] = json!("val");
     assert_eq!(load_json("cameras.json", &document).unwrap().held_out(), Some(Split::Val));
 }
 
-/// Cameras and pictures as COLMAP writes them: text of `cameras.txt`, and of every picture its number, quaternion and
-/// translation, camera and name.
-fn colmap(folder: &Path, lens: &str, binary: bool) {
-    let images: [(u32, [f64; 7], u32, &str); 3] = [
-        (7, [0.5f64.sqrt(), 0.5f64.sqrt(), 0.0, 0.0, 1.0, 2.0, 3.0], 2, "cam1/frame_0003.png"),
-        (2, [1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 4.0], 2, "cam1/frame_0001.png"),
-        (9, [0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 5.0], 2, "test/frame_0002.png"),
-    ];
-    let sparse = folder.join("sparse/0");
-    fs::create_dir_all(&sparse).unwrap();
-    if !binary {
-        let mut text = "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n".to_owned();
-        for (id, pose, camera, name) in images {
-            let pose = pose.map(|value| value.to_string()).join(" ");
-            text += &format!("{id} {pose} {camera} {name}\n{}\n", if id == 2 { "" } else { "1.5 2.5 -1" });
-        }
-        fs::write(sparse.join("cameras.txt"), format!("# Camera list\n2 {lens}\n")).unwrap();
-        fs::write(sparse.join("images.txt"), text).unwrap();
-        return;
-    }
-    let words: Vec<&str> = lens.split(' ').collect();
-    let model = ["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL"].iter().position(|name| *name == words[0]).unwrap();
-    let mut bytes = [&1u64.to_le_bytes()[..], &2u32.to_le_bytes(), &(model as u32).to_le_bytes()].concat();
-    for side in &words[1..3] {
-        bytes.extend(side.parse::<u64>().unwrap().to_le_bytes());
-    }
-    for value in &words[3..] {
-        bytes.extend(value.parse::<f64>().unwrap().to_le_bytes());
-    }
-    fs::write(sparse.join("cameras.bin"), bytes).unwrap();
-    let mut bytes = 3u64.to_le_bytes().to_vec();
-    for (id, pose, camera, name) in images {
-        bytes.extend(id.to_le_bytes());
-        bytes.extend(pose.iter().flat_map(|value| value.to_le_bytes()));
-        bytes.extend(camera.to_le_bytes());
-        bytes.extend([name.as_bytes(), &[0], &1u64.to_le_bytes(), &[1; 24]].concat());
-    }
-    fs::write(sparse.join("images.bin"), bytes).unwrap();
-}
-
 #[test]
-fn colmap_text_and_binary_give_the_same_cameras_with_times_from_names() {
-    let [text, binary] = [false, true].map(|binary| {
-        let folder = tempfile::tempdir().unwrap();
-        colmap(folder.path(), "PINHOLE 80 60 70 71 39.5 31", binary);
-        let rig = load(folder.path(), &CameraOptions::default()).unwrap();
-        for file in ["sparse", "sparse/0"] {
-            assert_eq!(load(&folder.path().join(file), &CameraOptions::default()).unwrap().shots, rig.shots, "{file}");
-        }
-        rig
-    });
-    assert_eq!(text.cameras, binary.cameras);
-    let [times, splits] =
-        [&text, &binary].map(|rig| rig.shots.iter().map(|shot| (shot.time, shot.split)).collect::<Vec<_>>());
-    assert_eq!(times, splits);
-    // In the natural order of names, whatever COLMAP's.
-    assert_eq!(times, [(Some(0.0), Split::Train), (Some(1.0), Split::Train), (Some(0.5), Split::Test)]);
-    let first = &text.cameras[0];
-    assert_eq!((first.width, first.height, first.fx, first.fy, first.cx, first.cy), (80, 60, 70.0, 71.0, 39.5, 31.0));
-    assert_eq!((first.rotation, first.translation), (DMat3::IDENTITY, DVec3::new(0.0, 0.0, 4.0)));
-    // A quarter turn about x takes y to z.
-    let turned = text.cameras[1].rotation * DVec3::Y;
-    assert!((turned - DVec3::Z).length() < 1e-15, "{turned}");
-    assert!(text.shots[0].image.as_ref().unwrap().ends_with("cam1/frame_0001.png"));
-}
-
-#[test]
-fn a_colmap_folder_for_each_frame_has_the_first_ones_cameras_at_all_of_them() {
-    let root = tempfile::tempdir().unwrap();
-    let first = root.path().join("colmap_3");
-    colmap(&first, "PINHOLE 80 60 70 71 39.5 31", true);
-    let load =
-        |path: &Path, frames: Option<usize>| load(path, &CameraOptions { frames, ..CameraOptions::default() }).unwrap();
-    // A single folder says nothing of times, least of all by the numbers of cameras in names.
-    assert!(load(&first, None).times().is_empty());
-    for k in 4..6 {
-        fs::create_dir(root.path().join(format!("colmap_{k}"))).unwrap();
-    }
-    let rig = load(&first, None);
-    assert_eq!(load(root.path(), None).shots, rig.shots);
-    assert_eq!(rig.times(), [0.0, 1.0 / 3.0, 2.0 / 3.0]);
-    assert_eq!((rig.shots.len(), rig.cameras.len()), (9, 3));
-    let shot = &rig.shots[4];
-    assert!(shot.image.as_ref().unwrap().ends_with("colmap_4/cam1/frame_0003.png"), "{shot:?}");
-    let splits: Vec<Split> = rig.shots[3..6].iter().map(|shot| shot.split).collect();
-    assert_eq!(splits, [Split::Test, Split::Train, Split::Test]);
-    // A model may have been trained on fewer frames, and its data may be elsewhere.
-    assert_eq!(load(&first, Some(50)).times()[49], 0.98);
-}
-
-#[test]
-fn times_of_colmap_come_from_a_table_or_are_none_if_asked() {
-    let folder = tempfile::tempdir().unwrap();
-    colmap(folder.path(), "SIMPLE_PINHOLE 80 60 70 40 30", false);
-    let with = |times: Times| load(folder.path(), &CameraOptions { times, ..CameraOptions::default() });
-    let table = folder.path().join("t.csv");
-    fs::write(&table, "name,time\ncam1/frame_0001.png,0.25\nframe_0003.png, 0.5\nframe_0002,4\n").unwrap();
-    let times: Vec<_> = with(Times::Table(table.clone())).unwrap().shots.iter().map(|shot| shot.time).collect();
-    assert_eq!(times, [Some(0.25), Some(0.5), Some(4.0)]);
-    assert!(with(Times::None).unwrap().times().is_empty());
-    for (text, parts) in [
-        ("frame_0001,0\n", &["t.csv", "frame_0003.png"][..]),
-        ("frame_0001 0\n", &["line 1", "a comma"]),
-        ("a,0\nframe_0001,nan\n", &["line 2", "nan"]),
-        ("a,0\na,1\n", &["line 2", "once"]),
-    ] {
-        fs::write(&table, text).unwrap();
-        let message = with(Times::Table(table.clone())).unwrap_err().to_string();
-        assert!(parts.iter().all(|part| message.contains(part)), "{parts:?} are not in {message:?}");
-    }
-}
-
-#[test]
-fn what_is_wrong_with_a_reconstruction_is_said() {
-    let message = |lens: &str, binary: bool, edit: &dyn Fn(&Path)| {
-        let folder = tempfile::tempdir().unwrap();
-        colmap(folder.path(), lens, binary);
-        edit(&folder.path().join("sparse/0"));
-        load(folder.path(), &CameraOptions::default()).err().map(|error| error.to_string())
-    };
-    let refused = |lens: &str, parts: &[&str]| {
-        for binary in [false, true] {
-            let message = message(lens, binary, &|_| ()).expect(lens);
-            assert!(parts.iter().all(|part| message.contains(part)), "{parts:?} are not in {message:?}");
-        }
-    };
-    assert_eq!(message("SIMPLE_RADIAL 80 60 70 40 30 0", true, &|_| ()), None, "no distortion");
-    refused("SIMPLE_RADIAL 80 60 70 40 30 0.1", &["without distortion", "SIMPLE_RADIAL", "image_undistorter"]);
-    refused("PINHOLE 80 0 70 70 40 30", &["pixels a side", "80 × 0"]);
-    // Cut anywhere, a file is refused and never read past.
-    let folder = tempfile::tempdir().unwrap();
-    colmap(folder.path(), "PINHOLE 80 60 70 71 39.5 31", true);
-    for name in ["cameras.bin", "images.bin"] {
-        let file = folder.path().join("sparse/0").join(name);
-        let whole = fs::read(&file).unwrap();
-        for len in 0..whole.len() {
-            fs::write(&file, &whole[..len]).unwrap();
-            let message = load(folder.path(), &CameraOptions::default()).unwrap_err().to_string();
-            assert!(message.contains(name) && message.contains("byte"), "{len}: {message}");
-        }
-        fs::write(&file, [&u64::MAX.to_le_bytes()[..], &whole[8..]].concat()).unwrap();
-        assert!(load(folder.path(), &CameraOptions::default()).is_err());
-        fs::write(&file, whole).unwrap();
-    }
-}
-
-#[test]
-fn nerfies_cameras_are_those_of_the_loader_that_models_are_trained_with() {
+fn nerfies_cameras_match_the_4dgaussians_loader() {
     let folder = tempfile::tempdir().unwrap();
     let write = |name: &str, value: Value| {
         let path = folder.path().join(name);
@@ -329,7 +185,7 @@ fn nerfies_cameras_are_those_of_the_loader_that_models_are_trained_with() {
     write("dataset.json", json!({"ids": ids, "val_ids": [], "train_ids": []}));
     let rig = load(folder.path(), &CameraOptions::default()).unwrap();
     let camera = &rig.cameras[0];
-    // Half the size; world to camera row by row; scale and center of the scene are not applied.
+    // Half the size; world to camera row by row; `scale` and `center` of the scene are not applied.
     assert_eq!(
         (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy),
         (40, 30, 50.0, 50.0, 20.0, 15.0)
@@ -338,7 +194,7 @@ fn nerfies_cameras_are_those_of_the_loader_that_models_are_trained_with() {
     assert!((rig.cameras[1].center() - DVec3::new(2.0, 5.0, 6.0)).length() < 1e-12, "{}", rig.cameras[1].center());
     let shots: Vec<_> = rig.shots.iter().map(|shot| (shot.time.unwrap(), shot.split)).collect();
     let at = |k: usize| k as f64 / 9.0;
-    // Every fourth, and those two after, of which the last is left out.
+    // Every fourth image is for training; the image two after it is for testing, except after the last training image.
     let expected = [(0, Split::Train), (2, Split::Test), (4, Split::Train), (6, Split::Test), (8, Split::Train)];
     assert_eq!(shots, expected.map(|(k, split)| (at(k), split)));
     write("dataset.json", json!({"ids": ids, "val_ids": [ids[3]], "train_ids": [ids[0], ids[1]]}));
@@ -369,7 +225,7 @@ fn opengl_pose_becomes_an_opencv_camera() {
     assert_eq!(rig.cameras[0], expected);
     assert_eq!(rig.cameras[1].center(), DVec3::new(1.0, -4.0, 1.0));
 
-    // Looking along +x: a pose with which the order of the axis flip and the rotation shows.
+    // Looking along +x: for this pose the order of the axis flip and the rotation matters.
     let mut document = transforms(&[0.0]);
     document["frames"][0]["transform_matrix"] = json!([[0, 0, -1, 7], [-1, 0, 0, 8], [0, 1, 0, 9], [0, 0, 0, 1]]);
     let camera = load_json("transforms.json", &document).unwrap().cameras[0].clone();
@@ -378,7 +234,7 @@ fn opengl_pose_becomes_an_opencv_camera() {
 }
 
 #[test]
-fn frame_keys_win_over_the_files_and_vertical_focal_length_stays_with_its_horizontal() {
+fn keys_of_an_image_override_keys_of_the_file() {
     let mut document = transforms(&[0.0, 1.0]);
     document["fl_y"] = json!(50.0);
     document["frames"][1]["fl_x"] = json!(90.0);
@@ -389,7 +245,7 @@ fn frame_keys_win_over_the_files_and_vertical_focal_length_stays_with_its_horizo
 }
 
 #[test]
-fn times_are_parts_of_the_largest_over_both_files() {
+fn times_are_divided_by_the_largest_of_all_files() {
     let folder =
         folder(&[("transforms_train.json", &transforms(&[0.0, 2.0])), ("transforms_test.json", &transforms(&[4.0]))]);
     assert_eq!(load(folder.path(), &CameraOptions::default()).unwrap().times(), [0.0, 0.5, 1.0]);
@@ -397,10 +253,10 @@ fn times_are_parts_of_the_largest_over_both_files() {
 }
 
 #[test]
-fn missing_size_comes_from_the_picture_then_the_option_else_is_asked_for() {
+fn missing_size_comes_from_the_image_then_the_option() {
     let mut document = transforms(&[0.0]);
     document.as_object_mut().unwrap().remove("h");
-    assert_refused("transforms.json", &document, &["frame 0", "r_000", "--size"]);
+    assert_refused("transforms.json", &document, &["frame 0", "r_000", "--resolution"]);
 
     let folder = folder(&[("transforms.json", &document)]);
     let options = CameraOptions { size: Some((30, 20)), frames: None, ..CameraOptions::default() };
@@ -408,7 +264,7 @@ fn missing_size_comes_from_the_picture_then_the_option_else_is_asked_for() {
     assert_eq!((rig.cameras[0].width, rig.cameras[0].height, rig.cameras[0].cx), (30, 20, 15.0));
     assert_eq!(rig.cameras[0].fx, 15.0 / 0.5f64.tan());
 
-    // The head of a PNG: signature, then IHDR with width and height.
+    // Start of a PNG: signature, then IHDR with width and height.
     let mut png = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR".to_vec();
     png.extend([0, 0, 1, 0, 0, 0, 0, 200, 8, 2, 0, 0, 0]);
     fs::create_dir(folder.path().join("train")).unwrap();
@@ -419,7 +275,7 @@ fn missing_size_comes_from_the_picture_then_the_option_else_is_asked_for() {
 }
 
 #[test]
-fn views_are_numbered_by_name_if_all_names_do_else_by_pose() {
+fn views_are_numbered_by_name_or_by_pose() {
     let mut document = transforms(&[0.0, 1.0]);
     for (i, name) in ["./train/t000_v07", "./train/t001_v03.png"].into_iter().enumerate() {
         document["frames"][i]["file_path"] = json!(name);
@@ -435,8 +291,8 @@ fn views_are_numbered_by_name_if_all_names_do_else_by_pose() {
 }
 
 #[test]
-fn own_cameras_json_says_everything_itself() {
-    let rig = load_json("cameras.json", &per_picture(&[0.0, 0.25])).unwrap();
+fn own_cameras_json_is_read_completely() {
+    let rig = load_json("cameras.json", &per_image(&[0.0, 0.25])).unwrap();
     assert_eq!(rig.background, Some([1.0, 0.5, 0.0]));
     assert_eq!(rig.cameras.len(), 1);
     let Camera { fx, fy, cx, cy, translation, .. } = rig.cameras[0];
@@ -446,7 +302,7 @@ fn own_cameras_json_says_everything_itself() {
 }
 
 #[test]
-fn cameras_of_a_3dgs_folder_see_every_frame_once() {
+fn cameras_of_a_3dgs_folder_see_every_frame() {
     let entry = |id: u32, x: f64| {
         json!({"id": id, "img_name": format!("{id:05}"), "width": 80, "height": 60, "fx": 70.0, "fy": 71.0,
                "position": [x, 0.0, -3.0], "rotation": [[0, 0, 1], [1, 0, 0], [0, 1, 0]]})
@@ -454,13 +310,13 @@ fn cameras_of_a_3dgs_folder_see_every_frame_once() {
     let rig = load_json("cameras.json", &json!([entry(0, 1.0), entry(1, 2.0), entry(2, 1.0)])).unwrap();
     assert_eq!((rig.cameras.len(), rig.shots.len()), (2, 2), "the third repeats the first");
     assert_eq!(rig.cameras[0].center(), DVec3::new(1.0, 0.0, -3.0));
-    // Camera-to-world turns forward (z) to the world's x: so world x must come out forward.
+    // The camera-to-world rotation maps forward (z) to the world's x, so world x must map to forward.
     assert_eq!(rig.cameras[0].rotation * DVec3::X, DVec3::Z);
     assert_eq!(rig.schedule(&[0.0, 1.0, 2.0], None).unwrap().pairs(), 6);
 }
 
 #[test]
-fn dynerf_poses_are_used_at_half_size_with_camera_0_held_out() {
+fn dynerf_has_half_size_and_camera_0_as_test() {
     let folder = tempfile::tempdir().unwrap();
     write_npy(
         &folder.path().join("poses_bounds.npy"),
@@ -483,7 +339,7 @@ fn dynerf_poses_are_used_at_half_size_with_camera_0_held_out() {
 }
 
 #[test]
-fn malformed_arrays_are_refused_whole() {
+fn malformed_pose_arrays_are_refused() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("poses_bounds.npy");
     let refused = |parts: &[&str]| {
@@ -511,7 +367,7 @@ fn malformed_arrays_are_refused_whole() {
         ("<f8", "False", "(34,)", ["[V, 17]", "[34]"]),
         ("<f8", "False", "(0, 17)", ["V at least 1", "[0, 17]"]),
         ("<f8", "False", "(9999999999, 17)", ["9999999999 rows", "bytes"]),
-        ("<f8", "False", "(9999999999, 9999999999)", ["NumPy array", "a header that no array of numbers has"]),
+        ("<f8", "False", "(9999999999, 9999999999)", ["NumPy array", "not that of an array of numbers"]),
         ("<f8", "False", "(3, 17)", ["3 rows", "data"]),
         ("<f8", "True", "(2, 17)", ["Fortran", "ascontiguousarray"]),
         ("|O", "False", "(2, 17)", ["float64 or float32", "O"]),
@@ -527,10 +383,10 @@ fn malformed_arrays_are_refused_whole() {
 }
 
 #[test]
-fn what_is_wrong_with_a_picture_is_said_with_its_number() {
+fn errors_name_the_image_by_its_number() {
     let mut cases: Vec<(&str, Value, Vec<&str>)> = vec![
         ("time", json!("noon"), vec!["frame 1", "\"time\"", "noon"]),
-        ("time", Value::Null, vec!["frame 1", "a time for every picture"]),
+        ("time", Value::Null, vec!["frame 1", "a time for every image"]),
         ("time", json!(0.0), vec![]),
         ("fl_x", json!(0.0), vec!["frame 1", "focal", "0"]),
         ("fl_x", json!(-3), vec!["frame 1", "focal", "-3"]),
@@ -553,22 +409,22 @@ fn what_is_wrong_with_a_picture_is_said_with_its_number() {
         let mut document = transforms(&[0.0, 1.0]);
         document["frames"][1][key] = value;
         if parts.is_empty() {
-            load_json("transforms.json", &document).expect("another view at the same time is a synchronised rig");
+            load_json("transforms.json", &document).expect("another view at the same time is a synchronized rig");
         } else {
             assert_refused("transforms.json", &document, &parts);
         }
     }
-    assert_refused("cameras.json", &per_picture(&[0.0, 0.5, 0.5]), &["frame 2", "view 4", "0.5", "frame 1"]);
-    assert_refused("cameras.json", &per_picture(&[0.0, -0.0]), &["frame 1", "as in frame 0"]);
-    let mut document = per_picture(&[0.0]);
+    assert_refused("cameras.json", &per_image(&[0.0, 0.5, 0.5]), &["frame 2", "view 4", "0.5", "frame 1"]);
+    assert_refused("cameras.json", &per_image(&[0.0, -0.0]), &["frame 1", "as in frame 0"]);
+    let mut document = per_image(&[0.0]);
     document["frames"][0]["split"] = json!("validation");
     assert_refused("cameras.json", &document, &["frame 0", "split", "validation"]);
 }
 
 #[test]
-fn what_holds_no_cameras_is_said_to() {
+fn inputs_without_cameras_are_refused() {
     assert_refused("transforms.json", &json!({"frames": []}), &["non-empty list"]);
-    assert_refused("cameras.json", &json!([]), &["at least one picture"]);
+    assert_refused("cameras.json", &json!([]), &["at least one image"]);
     assert_refused("cameras.json", &json!([3]), &["frame 0", "an object"]);
     assert_refused("cameras.json", &json!("text"), &["text"]);
 
@@ -589,7 +445,7 @@ fn what_holds_no_cameras_is_said_to() {
 }
 
 #[test]
-fn options_out_of_range_are_misuse() {
+fn options_out_of_range_are_usage_errors() {
     for options in [
         CameraOptions { size: Some((0, 10)), frames: None, ..CameraOptions::default() },
         CameraOptions { size: Some((10, 1 << 20)), frames: None, ..CameraOptions::default() },
@@ -601,7 +457,7 @@ fn options_out_of_range_are_misuse() {
 }
 
 #[test]
-fn source_path_is_found_from_any_folder_above_the_model() {
+fn source_path_is_found_from_any_parent_folder() {
     let root = tempfile::tempdir().unwrap();
     let model = root.path().join("output/deep/model");
     fs::create_dir_all(&model).unwrap();

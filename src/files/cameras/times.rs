@@ -1,9 +1,9 @@
-//! Times of pictures whose cameras' file has none: from the numbers in their names, or from a table.
+//! Finds the times of images whose camera file has none: from the numbers in their names, or from a table.
 //!
-//! A picture's number is NNN of a name `…tNNN_vNN…`, else the last number in its file's name: 12 of
-//! `cam03/frame_00012.png`. Its time is (number − least)/(greatest − least), so that the last is at 1, as in the COLMAP
-//! loaders of the trained families. A table is a CSV of `name,time`: the name as the cameras have it, or its last part, with or
-//! without ending; times are taken as they are.
+//! The number of an image is NNN of a name `…tNNN_vNN…`, else the last number in its file name: 12 of
+//! `cam03/frame_00012.png`. Its time is (number − smallest)/(largest − smallest), so that the last image is at 1, as in
+//! the COLMAP loaders of the supported trainers. A table is a CSV of `name,time`. The name is the one in the camera
+//! file, or its last component, with or without extension. Times of a table are used as they are.
 
 use std::path::{Path, PathBuf};
 
@@ -14,25 +14,25 @@ use crate::error::{Error, Result, ShowPath, quoted};
 use crate::files::names::shown_name;
 use crate::files::text::TextLines;
 
-/// Bytes of an entry of a table beside its name, while the table grows by being copied to twice its size.
-const TABLE_ENTRY: u64 = 3 * 40 + 32;
+/// Memory of a table entry without its name, in bytes, while the table grows by being copied to twice its size.
+const TABLE_ENTRY_BYTES: u64 = 3 * 40 + 32;
 
-/// Where times come from.
+/// Source of the times of images.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub enum Times {
-    /// From the names of COLMAP's pictures if all have numbers; of other cameras their own.
+    /// COLMAP: the numbers in the image names, if all names have one. Other formats: the times in the camera file.
     #[default]
     Own,
-    /// From the numbers in names, which all must have.
+    /// The numbers in image names; every name must have one.
     Names,
-    /// There are none: every picture shows every frame.
+    /// No times: every image shows every frame.
     None,
-    /// From a table.
+    /// A CSV table.
     Table(PathBuf),
 }
 
 impl Times {
-    /// As a command line says it: `names`, `none`, or the table's path.
+    /// Parses the value of `--times`: `names`, `none`, or the path of a table.
     pub fn named(text: &str) -> Times {
         match text {
             "names" => Times::Names,
@@ -41,7 +41,7 @@ impl Times {
         }
     }
 
-    /// What [`Times::named`] takes; none of the cameras' own.
+    /// Returns the text that [`Times::named`] parses to this value; `None` for [`Times::Own`].
     pub fn name(&self) -> Option<String> {
         match self {
             Times::Own => None,
@@ -52,26 +52,27 @@ impl Times {
     }
 }
 
-/// Returns the times of the pictures called `names` in `file`, and where they come from, empty if there are none.
+/// Returns the times of the images `names` listed in `file`, and a description of their source. Both are empty if there
+/// are no times.
 ///
 /// # Errors
-/// A name without a number, or that the table does not have; a table that is none.
-pub(super) fn give(
+/// A name has no number, or is missing in the table; the table is malformed.
+pub(super) fn resolve(
     file: &Path,
     names: &[Box<str>],
     times: &Times,
-    gauge: &mut MemoryCounter,
+    counter: &mut MemoryCounter,
 ) -> Result<(Vec<Option<f64>>, String)> {
-    gauge.take(file, "", "the times of its pictures", 40 * names.len() as u64)?;
+    counter.take(file, "", "the times of its images", 40 * names.len() as u64)?;
     let none = || Ok((Vec::new(), String::new()));
     match times {
         Times::None => none(),
         Times::Table(table) => {
-            let known = read_table(table, gauge)?;
+            let known = read_table(table, counter)?;
             let time = |name: &str| {
                 let time = keys(name).find_map(|key| known.get(key)).copied();
                 time.map(Some).ok_or_else(|| {
-                    Error::input(table, "", format!("a line for the picture {}", quoted(name)), "none")
+                    Error::input(table, "", format!("a line for the image {}", quoted(name)), "none")
                         .hint(format!("the names are those of {}", file.shown()))
                 })
             };
@@ -86,30 +87,30 @@ pub(super) fn give(
                 }
                 return Err(Error::input(
                     file,
-                    format!("picture {}", quoted(&names[at])),
+                    format!("image {}", quoted(&names[at])),
                     "a number in its name",
                     "none",
                 )
                 .hint("give a table of names and times: --times TABLE.csv"));
             }
             let bounds = numbers.iter().flatten();
-            let (Some(&least), Some(&greatest)) = (bounds.clone().min(), bounds.max()) else { return none() };
-            let span = (greatest - least).max(1) as f64;
-            let time = |number: Option<u64>| number.map(|number| (number - least) as f64 / span);
+            let (Some(&smallest), Some(&largest)) = (bounds.clone().min(), bounds.max()) else { return none() };
+            let span = (largest - smallest).max(1) as f64;
+            let time = |number: Option<u64>| number.map(|number| (number - smallest) as f64 / span);
             let given = numbers.into_iter().map(time).collect();
-            Ok((given, format!("times from the numbers {least} to {greatest} in names")))
+            Ok((given, format!("times from the numbers {smallest} to {largest} in names")))
         }
     }
 }
 
-/// The number that says when, in a picture's name.
+/// Returns the number in an image name that stands for its time.
 fn number(name: &str) -> Option<u64> {
     let file = name.rsplit(['/', '\\']).next()?;
     let stem = file.rsplit_once('.').map_or(file, |(stem, _)| stem);
     let digits = |text: &str| -> Option<u64> {
         let end = text.rfind(|c: char| c.is_ascii_digit())? + 1;
         let start = text[..end].rfind(|c: char| !c.is_ascii_digit()).map_or(0, |at| {
-            // Past that character, of however many bytes.
+            // Start after that character, which may have several bytes.
             at + text[at..].chars().next().map_or(1, char::len_utf8)
         });
         text[start..end].parse().ok()
@@ -121,14 +122,15 @@ fn number(name: &str) -> Option<u64> {
     digits(before_view.unwrap_or(stem))
 }
 
-/// What a picture may be called in a table.
+/// Returns the names under which an image is searched for in a table: as given, file name, file name without extension.
 fn keys(name: &str) -> impl Iterator<Item = &str> {
     let file = name.rsplit(['/', '\\']).next().unwrap_or(name);
     let stem = |text| Path::new(text).file_stem().and_then(|stem| stem.to_str()).unwrap_or(text);
     [name, file, stem(file)].into_iter()
 }
 
-fn read_table(path: &Path, gauge: &mut MemoryCounter) -> Result<HashMap<String, f64>> {
+/// Reads a CSV table of names and times.
+fn read_table(path: &Path, counter: &mut MemoryCounter) -> Result<HashMap<String, f64>> {
     let mut known = HashMap::new();
     let mut lines = TextLines::open(path)?;
     while let Some((number, line)) = lines.next_line()? {
@@ -142,12 +144,17 @@ fn read_table(path: &Path, gauge: &mut MemoryCounter) -> Result<HashMap<String, 
         let name = name.trim().trim_matches('"');
         match time.trim().parse::<f64>() {
             Ok(time) if time.is_finite() => {
-                gauge.take(path, &format!("line {number}"), "the table of times", name.len() as u64 + TABLE_ENTRY)?;
+                counter.take(
+                    path,
+                    &format!("line {number}"),
+                    "the table of times",
+                    name.len() as u64 + TABLE_ENTRY_BYTES,
+                )?;
                 if known.insert(name.to_owned(), time).is_some_and(|before| before != time) {
                     return Err(wrong("every name once", quoted(name)));
                 }
             }
-            // A header.
+            // Header line of the table.
             Err(_) if at == 0 => (),
             _ => return Err(wrong("a finite time behind the name", quoted(time.trim()))),
         }
@@ -160,7 +167,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_number_of_a_name_is_its_last_or_that_of_its_frame() {
+    fn image_number_is_the_frame_number_or_the_last_number() {
         for (name, expected) in [
             ("cam03/frame_00012.png", Some(12)),
             ("t007_v03.png", Some(7)),

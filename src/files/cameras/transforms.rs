@@ -1,14 +1,13 @@
-//! `transforms*.json` of NeRF and D-NeRF: one camera-to-world pose per picture, in OpenGL axes.
+//! Reads `transforms*.json` of NeRF and D-NeRF: one camera-to-world pose per image, in OpenGL axes.
 //!
-//! Keys, of a frame or of the file (the frame's win): `fl_x fl_y cx cy w h`, or `camera_angle_x`
-//! (and `camera_angle_y`), the field of view in radians. Pixels are square and the principal point is
-//! the middle unless said otherwise. A frame has `file_path`, `transform_matrix` and, if the scene
-//! moves, `time`. Lens distortion (`k1` …) is ignored: pictures are taken to be undistorted.
+//! Keys of an image or of the file (those of the image take precedence): `fl_x fl_y cx cy w h`, or `camera_angle_x`
+//! (and `camera_angle_y`), the field of view in radians. Pixels are square and the principal point is the middle of the
+//! image unless the file states otherwise. An image has `file_path`, `transform_matrix` and, if the scene moves,
+//! `time`. Lens distortion (`k1` …) is ignored: images are assumed to be undistorted.
 //!
-//! Times are divided by the largest of all splits' files, as the D-NeRF loaders do that the models were
-//! trained with (4DGaussians `scene/dataset_readers.py`, `read_timeline`): files that count frames
-//! 0 … T−1 and files that reach 1 give the same times. Models whose time counts something else take them as they are
-//! ([`Clock`]).
+//! Times are divided by the largest time in the files of all splits, as in the D-NeRF loaders with which the models
+//! were trained (4DGaussians `scene/dataset_readers.py`, `read_timeline`): files that count frames 0 … T−1 and files
+//! that reach 1 give the same times. For models whose time has another unit, times are used as they are ([`Clock`]).
 
 use std::path::{Path, PathBuf};
 
@@ -16,7 +15,7 @@ use glam::{DMat3, DVec3};
 
 use super::assemble::{Assembly, ListedImage, from_camera_to_world, view_in_name};
 use super::fields::CameraFields;
-use super::pictures::{each_picture, outline};
+use super::image_list::{each_image, outline};
 use super::{CameraOptions, Clock};
 use crate::error::{Result, ShowPath};
 use crate::files::image::measure;
@@ -24,15 +23,15 @@ use crate::files::json::small::Small;
 use crate::files::names::shown_name;
 use crate::model::{Rig, Split};
 
-/// OpenGL camera axes (x right, y up, z backward) to OpenCV's (x right, y down, z forward).
-const FLIP: DMat3 = DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
+/// Converts OpenGL camera axes (x right, y up, z backward) to OpenCV's (x right, y down, z forward).
+const OPENGL_TO_OPENCV: DMat3 = DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
 
-/// Keys of a picture.
-const PICTURE: [&str; 11] =
+/// Keys of an image.
+const IMAGE_KEYS: [&str; 11] =
     ["file_path", "w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y", "transform_matrix", "time"];
 
-/// Reads `file`; if it stands for its folder, `with_others` of train, val and test beside it. Of those a file that was named
-/// itself takes the largest time alone.
+/// Reads `file`, and the files of the other splits beside it if `with_others` is set, which is the case if the user
+/// named the folder. Otherwise the other files only contribute to the largest time.
 pub(super) fn load(file: &Path, with_others: bool, options: &CameraOptions) -> Result<Rig> {
     let mut files = vec![file.to_owned()];
     let mut latest = 0.0;
@@ -56,6 +55,7 @@ pub(super) fn load(file: &Path, with_others: bool, options: &CameraOptions) -> R
     assembly.finish(None, names.join(" and "))
 }
 
+/// Returns the split that a file name states; training if it states none.
 fn split_of(file: &Path) -> Split {
     let name = file.file_name().unwrap_or_default().to_string_lossy();
     match () {
@@ -65,7 +65,7 @@ fn split_of(file: &Path) -> Split {
     }
 }
 
-/// Those of train, val and test that lie beside `file`, if it is one of them.
+/// Returns the existing files of the other splits beside `file`; empty if `file` is not one of train, val and test.
 fn others(file: &Path) -> Vec<PathBuf> {
     const ALL: [&str; 3] = ["transforms_train.json", "transforms_val.json", "transforms_test.json"];
     let is_own = |name: &&str| file.file_name().is_some_and(|own| own.to_str() == Some(*name));
@@ -76,10 +76,10 @@ fn others(file: &Path) -> Vec<PathBuf> {
     others.filter(|other| other.is_file()).collect()
 }
 
-/// The largest time in a file that need not be in order otherwise.
+/// Returns the largest time in a file. Other errors of the file are not reported here.
 fn latest_in(file: &Path) -> Result<f64> {
     let mut latest = 0.0;
-    each_picture(file, Some("frames"), &["time"], |_, frame| {
+    each_image(file, Some("frames"), &["time"], |_, frame| {
         let time = frame.get("time").and_then(Small::as_f64).filter(|time| time.is_finite());
         latest = time.map_or(latest, |time| time.max(latest));
         Ok(())
@@ -87,18 +87,19 @@ fn latest_in(file: &Path) -> Result<f64> {
     Ok(latest)
 }
 
-/// Adds the pictures of `file`.
+/// Adds the images of `file` to `assembly`.
 fn add(assembly: &mut Assembly, file: &Path, options: &CameraOptions) -> Result<()> {
     let outline = outline(file)?;
     let shared = CameraFields::new(file, None, &outline)?;
-    assembly.begin(file, shared.list("frames")?)?;
+    assembly.begin(file, shared.list_len("frames")?)?;
     let split = split_of(file);
-    each_picture(file, Some("frames"), &PICTURE, |index, frame| {
-        assembly.add(picture(file, shared, CameraFields::new(file, Some(index), frame)?, split, options)?)
+    each_image(file, Some("frames"), &IMAGE_KEYS, |index, frame| {
+        assembly.add(listed_image(file, shared, CameraFields::new(file, Some(index), frame)?, split, options)?)
     })
 }
 
-fn picture(
+/// Builds one image entry from its own keys and the keys `shared` by all images of the file.
+fn listed_image(
     file: &Path,
     shared: CameraFields<'_>,
     own: CameraFields<'_>,
@@ -111,7 +112,7 @@ fn picture(
     let intrinsics = intrinsics(shared, own, size)?;
     let (rotation, center) = own.pose("transform_matrix")?;
     Ok(ListedImage {
-        camera: from_camera_to_world(size, intrinsics, rotation * FLIP, center),
+        camera: from_camera_to_world(size, intrinsics, rotation * OPENGL_TO_OPENCV, center),
         time: own.optional_number("time")?,
         split,
         image,
@@ -119,7 +120,7 @@ fn picture(
     })
 }
 
-/// Picture size in pixels: the file's, else the picture's own, else the option's.
+/// Returns the image size in pixels: from the file, else from the image itself, else from the options.
 fn size(
     shared: CameraFields<'_>,
     own: CameraFields<'_>,
@@ -131,15 +132,15 @@ fn size(
     if let (Some(width), Some(height)) = (side("w")?, side("h")?) {
         return Ok((width, height));
     }
-    // A picture that is missing or unreadable is no error: the size may be given instead.
+    // A missing or unreadable image is not an error, because the options may give the size.
     image.and_then(measure).or(options.size).ok_or_else(|| {
-        let tried = image.map_or_else(String::new, |image| format!(", or the picture {}", image.shown()));
-        own.wrong("w", format!("the picture size as w and h{tried}"))
-            .hint("give --size WIDTHxHEIGHT (800x800 for the original D-NeRF scenes)")
+        let tried = image.map_or_else(String::new, |image| format!(", or the image {}", image.shown()));
+        own.wrong("w", format!("the image size as w and h{tried}"))
+            .hint("give --resolution WIDTHxHEIGHT (800x800 for the original D-NeRF scenes)")
     })
 }
 
-/// fx, fy, cx, cy in pixels.
+/// Returns fx, fy, cx, cy in pixels.
 fn intrinsics(shared: CameraFields<'_>, own: CameraFields<'_>, (width, height): (u32, u32)) -> Result<[f64; 4]> {
     let (width, height) = (f64::from(width), f64::from(height));
     let focal = |fields: CameraFields<'_>, pixels: &str, angle: &str, side: f64| -> Result<Option<f64>> {
@@ -153,7 +154,7 @@ fn intrinsics(shared: CameraFields<'_>, own: CameraFields<'_>, (width, height): 
     for fields in [own, shared] {
         if fx.is_none() {
             fx = focal(fields, "fl_x", "camera_angle_x", width)?;
-            // A vertical focal length of the file must not be paired with a horizontal one of the frame.
+            // The vertical focal length must come from the same place as the horizontal one: the image, or the file.
             fy = focal(fields, "fl_y", "camera_angle_y", height)?;
         }
     }
@@ -164,7 +165,7 @@ fn intrinsics(shared: CameraFields<'_>, own: CameraFields<'_>, (width, height): 
     Ok([fx, fy.unwrap_or(fx), middle("cx", 0.5 * width)?, middle("cy", 0.5 * height)?])
 }
 
-/// The picture a file names, relative to it. D-NeRF leaves the extension out.
+/// Returns the path of the image that `file` calls `name`, relative to `file`. D-NeRF names have no extension.
 fn resolve(file: &Path, name: &str) -> PathBuf {
     let named = file.parent().unwrap_or(Path::new("")).join(name.strip_prefix("./").unwrap_or(name));
     let with = |extension: &str| {

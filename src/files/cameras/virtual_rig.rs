@@ -1,25 +1,27 @@
-//! Stated rigs for scenes that come without cameras: one around a scene that moves, and one that looks at the surface of a
-//! still one from all sides.
+//! Virtual camera rigs for scenes without cameras: one around a moving scene, and one that views the surface of a still
+//! from all sides.
 
 use glam::DVec3;
 
 use crate::model::{Camera, Rig, Shot, Split};
 
-/// Cameras of the rig: as many scoring views as the static models of the README have.
+/// Number of cameras of the rig: as many views as are used to score the static models of the README.
 const CAMERAS: u32 = 12;
-/// Distance from the center in extents. At 60° the picture then spans 2.3 extents, so that a scene of
+/// Distance of the cameras from the center, in extents. At 60° the image then spans 2.3 extents, so that a scene with
 /// equal sides is seen whole from every corner.
 const DISTANCE: f64 = 2.0;
+/// Horizontal field of view of the cameras around a moving scene.
 const FIELD_OF_VIEW_DEGREES: f64 = 60.0;
-/// Near plane in extents: what is seen does not depend on the unit of length.
+/// Near plane in extents, so that visibility does not depend on the unit of length.
 const NEAR: f64 = 0.1;
+/// Image width and height in pixels.
 const SIDE_PX: u32 = 512;
 
-/// Cameras on a Fibonacci sphere of radius 2 × `extent` around `center`, looking at it, every one at
-/// every frame, all for training; [`crate::model::RobustBox`] gives the two numbers.
+/// Returns cameras on a Fibonacci sphere of radius 2 × `extent` around `center`, all looking at the center. Every
+/// camera sees every frame and is for training. [`crate::model::RobustBox`] gives `center` and `extent`.
 ///
-/// Camera k of n looks from latitude asin(1 − (2k + 1)/n) and longitude k·π(3 − √5); z is up in the
-/// pictures. An extent that is zero or not finite counts as 1, a center that is not finite as 0.
+/// Camera k of n is at latitude asin(1 − (2k + 1)/n) and longitude k·π(3 − √5); z points up in the images. An extent
+/// that is zero, negative or not finite counts as 1, a center that is not finite as 0.
 pub fn virtual_rig(center: DVec3, extent: f64) -> Rig {
     let center = if center.is_finite() { center } else { DVec3::ZERO };
     let extent = if extent.is_finite() && extent > 0.0 { extent } else { 1.0 };
@@ -41,35 +43,40 @@ pub fn virtual_rig(center: DVec3, extent: f64) -> Rig {
     }
 }
 
-/// Cameras around a still scene: so many that no part of a surface is seen at a grazing angle alone.
-const AROUND: u32 = 24;
-/// Their distance in radii of what is to be seen, and a field of view that nearly fills the picture with it.
-const AROUND_DISTANCE: f64 = 2.2;
-const AROUND_DEGREES: f64 = 49.0;
-const AROUND_SIDE_PX: u32 = 320;
-/// Part of what is to be seen that lies within its radius: what is further away, mostly floaters and ground, is seen where it
-/// is in front.
-const WITHIN: f64 = 0.9;
+/// Number of cameras around a still; enough that no part of a surface is seen only at a grazing angle.
+const SURROUNDING_CAMERAS: u32 = 24;
+/// Distance of these cameras from the center, in radii of the surface.
+const SURROUNDING_DISTANCE: f64 = 2.2;
+/// Field of view in degrees; the surface nearly fills the image.
+const SURROUNDING_FIELD_OF_VIEW_DEGREES: f64 = 49.0;
+/// Image width and height in pixels around a still.
+const SURROUNDING_SIDE_PX: u32 = 320;
+/// Fraction of the weight that lies within the radius. Gaussians further away, mostly floaters and ground, are seen
+/// only where they are in front.
+const WEIGHT_WITHIN_RADIUS: f64 = 0.9;
 
-/// Cameras on a Fibonacci sphere around the bulk of a still scene's visible surface, all for training: the middle is the
-/// weighted median of `places` axis by axis, the radius the distance within which nine tenths of the weight lie. Weights
-/// are what a Gaussian covers, opacity times the product of its two larger scales, none above the 99th percentile: floaters
-/// are many and thin, and a backdrop is few and huge.
-pub fn surrounding_rig(places: &[DVec3], weights: &[f64]) -> Rig {
-    let mut all: Vec<(DVec3, f64)> = places
+/// Returns cameras on a Fibonacci sphere around most of the visible surface of a still, all for training.
+///
+/// The center is the weighted median of `positions` for each axis. The radius is the distance within which nine tenths
+/// of the weight lie. `weights` are the area of each Gaussian: opacity times the product of its two larger scales.
+/// Weights above the 99th percentile are set to that percentile. The weighting ignores floaters, which are many and
+/// thin, and the limit keeps a backdrop of few huge Gaussians from dominating.
+pub fn surrounding_rig(positions: &[DVec3], weights: &[f64]) -> Rig {
+    let mut all: Vec<(DVec3, f64)> = positions
         .iter()
         .copied()
         .zip(weights.iter().copied())
-        .filter(|(place, weight)| place.is_finite() && *weight > 0.0)
+        .filter(|(position, weight)| position.is_finite() && *weight > 0.0)
         .collect();
     let mut sorted: Vec<f64> = all.iter().map(|&(_, weight)| weight).collect();
     sorted.sort_by(f64::total_cmp);
     let most = sorted.get(sorted.len() * 99 / 100).copied().unwrap_or(1.0);
     all.iter_mut().for_each(|(_, weight)| *weight = weight.min(most));
-    let quantile = |part: f64, of: &dyn Fn(DVec3) -> f64| -> f64 {
-        let mut values: Vec<(f64, f64)> = all.iter().map(|&(place, weight)| (of(place), weight)).collect();
+    let quantile = |fraction: f64, coordinate: &dyn Fn(DVec3) -> f64| -> f64 {
+        let mut values: Vec<(f64, f64)> =
+            all.iter().map(|&(position, weight)| (coordinate(position), weight)).collect();
         values.sort_by(|a, b| a.0.total_cmp(&b.0));
-        let wanted = part * values.iter().map(|value| value.1).sum::<f64>();
+        let wanted = fraction * values.iter().map(|value| value.1).sum::<f64>();
         let mut sum = 0.0;
         let found = values.iter().find(|value| {
             sum += value.1;
@@ -77,29 +84,36 @@ pub fn surrounding_rig(places: &[DVec3], weights: &[f64]) -> Rig {
         });
         found.or(values.last()).map_or(0.0, |value| value.0)
     };
-    let middle = DVec3::from_array([0, 1, 2].map(|axis| quantile(0.5, &|place| place[axis])));
-    let radius = quantile(WITHIN, &|place| place.distance(middle));
+    let middle = DVec3::from_array([0, 1, 2].map(|axis| quantile(0.5, &|position| position[axis])));
+    let radius = quantile(WEIGHT_WITHIN_RADIUS, &|position| position.distance(middle));
     let radius = if radius > 0.0 { radius } else { 1.0 };
-    let distance = AROUND_DISTANCE * radius;
+    let distance = SURROUNDING_DISTANCE * radius;
     let camera = |k: u32| {
-        let eye = middle + distance * on_sphere(k, AROUND);
-        let camera = Camera::look_at(eye, middle, AROUND_DEGREES.to_radians(), (AROUND_SIDE_PX, AROUND_SIDE_PX));
+        let eye = middle + distance * on_sphere(k, SURROUNDING_CAMERAS);
+        let camera = Camera::look_at(
+            eye,
+            middle,
+            SURROUNDING_FIELD_OF_VIEW_DEGREES.to_radians(),
+            (SURROUNDING_SIDE_PX, SURROUNDING_SIDE_PX),
+        );
         Camera { near: NEAR * radius, ..camera }
     };
     let shot = |view| Shot { view, camera: view, time: None, split: Split::Train, image: None };
     Rig {
-        cameras: (0..AROUND).map(camera).collect(),
-        shots: (0..AROUND).map(shot).collect(),
+        cameras: (0..SURROUNDING_CAMERAS).map(camera).collect(),
+        shots: (0..SURROUNDING_CAMERAS).map(shot).collect(),
         background: None,
         origin: format!(
-            "virtual rig: {AROUND} cameras on a Fibonacci sphere of radius {distance:.6} around the surface at ({:.6}, {:.6}, \
-             {:.6}), {AROUND_DEGREES}° field of view, {AROUND_SIDE_PX}×{AROUND_SIDE_PX} pixels",
+            "virtual rig: {SURROUNDING_CAMERAS} cameras on a Fibonacci sphere of radius {distance:.6} around the \
+             surface at ({:.6}, {:.6}, {:.6}), {SURROUNDING_FIELD_OF_VIEW_DEGREES}° field of view, \
+             {SURROUNDING_SIDE_PX}×{SURROUNDING_SIDE_PX} pixels",
             middle.x, middle.y, middle.z
         ),
     }
 }
 
-/// Direction `k` of `n`, evenly over the sphere: latitude asin(1 − (2k + 1)/n), longitude k·π(3 − √5).
+/// Returns direction `k` of `n` evenly distributed over the unit sphere: latitude asin(1 − (2k + 1)/n), longitude k·π(3
+/// − √5).
 fn on_sphere(k: u32, n: u32) -> DVec3 {
     let golden_angle = std::f64::consts::PI * (3.0 - 5f64.sqrt());
     let z = 1.0 - f64::from(2 * k + 1) / f64::from(n);
@@ -112,7 +126,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn virtual_cameras_see_the_center_in_the_middle_of_the_picture() {
+    fn virtual_cameras_look_at_the_center_with_z_up() {
         let center = DVec3::new(3.0, -2.0, 7.0);
         let rig = virtual_rig(center, 1.5);
         assert_eq!(rig.cameras.len(), 12);
@@ -121,7 +135,7 @@ mod tests {
             assert!((seen - DVec3::new(0.0, 0.0, 3.0)).length() < 1e-12, "{seen}");
             assert!((camera.rotation.determinant() - 1.0).abs() < 1e-12);
             let up = camera.rotation * (center + 0.1 * DVec3::Z) + camera.translation;
-            assert!(up.y < 0.0, "z is up in the picture, y is down: {up}");
+            assert!(up.y < 0.0, "z is up in the image, y is down: {up}");
             assert!((camera.fx - 256.0 / 30f64.to_radians().tan()).abs() < 1e-9);
         }
     }
@@ -139,7 +153,7 @@ mod tests {
     }
 
     #[test]
-    fn a_still_scene_is_surrounded_where_its_surface_is_whatever_floats_around_it() {
+    fn floaters_do_not_move_the_rig_around_a_still() {
         let shell: Vec<DVec3> = (0..500).map(|k| DVec3::new(5.0, -2.0, 1.0) + on_sphere(k, 500)).collect();
         let alone = surrounding_rig(&shell, &[1.0; 500]);
         for camera in &alone.cameras {
@@ -148,9 +162,9 @@ mod tests {
             assert!(seen.truncate().length() < 0.1 && seen.z > 1.9, "{seen}");
         }
         let floating = (0..400).map(|k| 80.0 * on_sphere(k, 400));
-        let places: Vec<DVec3> = shell.iter().copied().chain(floating).collect();
+        let positions: Vec<DVec3> = shell.iter().copied().chain(floating).collect();
         let weights: Vec<f64> = (0..900).map(|k| if k < 500 { 1.0 } else { 0.01 }).collect();
-        let rig = surrounding_rig(&places, &weights);
+        let rig = surrounding_rig(&positions, &weights);
         for (a, b) in rig.cameras.iter().zip(&alone.cameras) {
             assert!(a.center().distance(b.center()) < 0.1, "{} {}", a.center(), b.center());
         }

@@ -1,11 +1,11 @@
-//! Checkpoints made by hand, for tests.
+//! Builds checkpoint files from given values, for tests.
 
 use std::io::{Cursor, Write};
 
 use zip::write::FileOptions;
 use zip::{CompressionMethod, ZipWriter};
 
-/// What is pickled.
+/// Value to be pickled.
 #[derive(Debug, Clone)]
 pub(crate) enum Made {
     None,
@@ -21,11 +21,11 @@ pub(crate) enum Made {
     Parameter(MadeTensor),
 }
 
-/// A tensor of f32, or of another class with these bytes.
+/// Tensor of f32, or of another storage class with these bytes.
 #[derive(Debug, Clone)]
 pub(crate) struct MadeTensor {
     pub(crate) class: &'static str,
-    /// One that several tensors name is there once.
+    /// Number of the storage. A storage named by several tensors is stored once.
     pub(crate) storage: usize,
     pub(crate) bytes: Vec<u8>,
     pub(crate) width: usize,
@@ -34,7 +34,7 @@ pub(crate) struct MadeTensor {
     pub(crate) stride: Vec<usize>,
 }
 
-/// Dense, of f32, in the storage of that number.
+/// Returns a dense f32 tensor in the storage of that number.
 pub(crate) fn tensor(storage: usize, shape: &[usize], values: &[f32]) -> MadeTensor {
     let mut stride = vec![1; shape.len()];
     (1..shape.len()).rev().for_each(|axis| stride[axis - 1] = stride[axis] * shape[axis].max(1));
@@ -49,13 +49,13 @@ pub(crate) fn tensor(storage: usize, shape: &[usize], values: &[f32]) -> MadeTen
     }
 }
 
-/// Keys that are texts.
+/// Returns dict items whose keys are texts.
 pub(crate) fn named(items: Vec<(&'static str, Made)>) -> Vec<(Made, Made)> {
     items.into_iter().map(|(key, value)| (Made::Text(key), value)).collect()
 }
 
 impl Made {
-    /// The pickle, of protocol 2, without memo.
+    /// Appends the pickle of this value: protocol 2, without memo.
     fn pickle(&self, out: &mut Vec<u8>) {
         let items = |items: &[(Made, Made)], out: &mut Vec<u8>| {
             out.push(b'(');
@@ -78,13 +78,13 @@ impl Made {
             Made::Text(text) => out.extend([b"X", &(text.len() as u32).to_le_bytes()[..], text.as_bytes()].concat()),
             Made::Tuple(elements) => several(b"(", elements, b't', out),
             Made::List(elements) => several(b"](", elements, b'e', out),
-            Made::Dict(of) => {
+            Made::Dict(entries) => {
                 out.push(b'}');
-                items(of, out);
+                items(entries, out);
             }
-            Made::Ordered(of) => {
+            Made::Ordered(entries) => {
                 out.extend(b"ccollections\nOrderedDict\n)R");
-                items(of, out);
+                items(entries, out);
             }
             Made::Tensor(tensor) => tensor.pickle(out),
             Made::Parameter(tensor) => {
@@ -95,16 +95,17 @@ impl Made {
         }
     }
 
+    /// Collects the storages of all tensors in this value, as (number, bytes).
     fn storages(&self, found: &mut Vec<(usize, Vec<u8>)>) {
         match self {
             Made::Tensor(tensor) | Made::Parameter(tensor) => found.push((tensor.storage, tensor.bytes.clone())),
-            Made::Tuple(elements) | Made::List(elements) => elements.iter().for_each(|of| of.storages(found)),
-            Made::Dict(items) | Made::Ordered(items) => items.iter().for_each(|(_, of)| of.storages(found)),
+            Made::Tuple(elements) | Made::List(elements) => elements.iter().for_each(|element| element.storages(found)),
+            Made::Dict(items) | Made::Ordered(items) => items.iter().for_each(|(_, value)| value.storages(found)),
             _ => (),
         }
     }
 
-    /// The file.
+    /// Returns the bytes of a checkpoint file that holds this value.
     pub(crate) fn file(&self) -> Vec<u8> {
         let mut pickle = b"\x80\x02".to_vec();
         self.pickle(&mut pickle);
@@ -121,12 +122,13 @@ impl Made {
 }
 
 impl MadeTensor {
+    /// Appends the pickle of the tensor.
     fn pickle(&self, out: &mut Vec<u8>) {
-        let numbers = |of: &[usize]| Made::Tuple(of.iter().map(|&x| Made::Int(x as i64)).collect());
+        let numbers = |values: &[usize]| Made::Tuple(values.iter().map(|&x| Made::Int(x as i64)).collect());
         out.extend(b"ctorch._utils\n_rebuild_tensor_v2\n((");
         Made::Text("storage").pickle(out);
         out.extend(format!("ctorch\n{}\n", self.class).bytes());
-        // Keys are numbers, as texts.
+        // Storage keys are numbers written as texts.
         let key = self.storage.to_string();
         out.extend([b"X", &(key.len() as u32).to_le_bytes()[..], key.as_bytes()].concat());
         Made::Text("cuda:0").pickle(out);
@@ -139,7 +141,7 @@ impl MadeTensor {
     }
 }
 
-/// An archive of stored files, in a folder.
+/// Returns a zip archive of uncompressed files in the folder `made`.
 pub(crate) fn zip(files: &[(String, Vec<u8>)]) -> Vec<u8> {
     let mut archive = ZipWriter::new(Cursor::new(Vec::new()));
     for (name, bytes) in files {

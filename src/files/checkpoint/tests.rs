@@ -7,11 +7,11 @@ use super::made::{Made, MadeTensor, named, tensor, zip};
 use super::*;
 use crate::files::checkpoint::write::{GaussianRows, write_like};
 
-struct Place(tempfile::TempDir);
+struct TempCheckpoint(tempfile::TempDir);
 
-impl Place {
-    fn new() -> Place {
-        Place(tempfile::tempdir().unwrap())
+impl TempCheckpoint {
+    fn new() -> TempCheckpoint {
+        TempCheckpoint(tempfile::tempdir().unwrap())
     }
 
     fn open(&self, bytes: &[u8]) -> Result<Checkpoint> {
@@ -24,7 +24,7 @@ impl Place {
         self.0.path().join("left.pt")
     }
 
-    fn left(&self, from: &Checkpoint, kept: &[u32], rows: &[GaussianRows]) -> Result<Checkpoint> {
+    fn reduced(&self, from: &Checkpoint, kept: &[u32], rows: &[GaussianRows]) -> Result<Checkpoint> {
         let path = self.path();
         write_like(from, kept, rows, &path)?;
         Checkpoint::open(&path, ReadLimit::NONE)
@@ -35,7 +35,8 @@ fn ramp(n: usize) -> Vec<f32> {
     (0..n).map(|i| i as f32 + 0.5).collect()
 }
 
-/// Two tensors of four rows, one of them a parameter and transposed, one with no rows; two that share a storage.
+/// Returns a pair of dicts: tensors of four rows, one of them a transposed parameter, a tensor without rows of
+/// Gaussians, two tensors that share a storage, a mask and other values.
 fn model() -> Made {
     let transposed = MadeTensor { stride: vec![1, 4], ..tensor(1, &[4, 3], &ramp(12)) };
     let [first, second] =
@@ -70,9 +71,9 @@ fn values(checkpoint: &Checkpoint, part: usize, name: &str) -> Vec<f32> {
 }
 
 #[test]
-fn tensors_have_their_values_whatever_their_strides_and_storages() {
-    let place = Place::new();
-    let checkpoint = place.open(&model().file()).unwrap();
+fn tensor_values_are_independent_of_strides_and_storages() {
+    let temp = TempCheckpoint::new();
+    let checkpoint = temp.open(&model().file()).unwrap();
     assert_eq!(values(&checkpoint, 0, "means"), ramp(12));
     let turned: Vec<f32> = (0..4).flat_map(|row| (0..3).map(move |c| (row + 4 * c) as f32 + 0.5)).collect();
     assert_eq!(values(&checkpoint, 0, "turned"), turned);
@@ -85,9 +86,9 @@ fn tensors_have_their_values_whatever_their_strides_and_storages() {
 }
 
 #[test]
-fn every_type_of_numbers_becomes_f32() {
-    let place = Place::new();
-    let of = |class, width, bytes: Vec<u8>| {
+fn every_float_type_is_converted_to_f32() {
+    let temp = TempCheckpoint::new();
+    let checkpoint_of_type = |class, width, bytes: Vec<u8>| {
         let shape = vec![bytes.len() / width];
         Made::Tensor(MadeTensor { class, width, bytes, ..tensor(0, &shape, &[]) }).file()
     };
@@ -98,51 +99,51 @@ fn every_type_of_numbers_becomes_f32() {
         ("DoubleStorage", 8, 0.1f64.to_le_bytes().to_vec(), vec![0.1]),
         ("FloatStorage", 4, 0.1f32.to_le_bytes().to_vec(), vec![0.1]),
     ] {
-        let checkpoint = place.open(&of(class, width, bytes)).unwrap();
+        let checkpoint = temp.open(&checkpoint_of_type(class, width, bytes)).unwrap();
         let tensor = checkpoint.float_tensor(checkpoint.pickle().root(), "t").unwrap();
         assert_eq!(checkpoint.floats(&tensor, "t").unwrap(), expected, "{class}");
     }
-    let checkpoint = place.open(&of("FloatStorage", 4, f32::NAN.to_le_bytes().repeat(3))).unwrap();
+    let checkpoint = temp.open(&checkpoint_of_type("FloatStorage", 4, f32::NAN.to_le_bytes().repeat(3))).unwrap();
     let tensor = checkpoint.float_tensor(checkpoint.pickle().root(), "t").unwrap();
     let error = checkpoint.floats(&tensor, "t").unwrap_err().to_string();
     assert!(error.contains("NaN in row 0"), "{error}");
 }
 
 #[test]
-fn rows_that_stay_keep_their_values_and_everything_else_its_bytes() {
-    let place = Place::new();
-    let checkpoint = place.open(&model().file()).unwrap();
-    let of = |part, name, changed: &[u32], values: &[f32]| GaussianRows {
+fn kept_rows_and_everything_else_are_unchanged() {
+    let temp = TempCheckpoint::new();
+    let checkpoint = temp.open(&model().file()).unwrap();
+    let rows_of = |part, name, changed: &[u32], values: &[f32]| GaussianRows {
         tensor: find(&checkpoint, part, name),
         changed: changed.to_vec(),
         values: values.to_vec(),
     };
     let rows = [
-        of(0, "means", &[1], &[-1.0, -2.0, -3.0]),
-        of(0, "turned", &[0], &[-4.0, -5.0, -6.0]),
-        of(1, "first", &[], &[]),
-        of(1, "second", &[1], &[]),
-        of(1, "mask", &[], &[]),
+        rows_of(0, "means", &[1], &[-1.0, -2.0, -3.0]),
+        rows_of(0, "turned", &[0], &[-4.0, -5.0, -6.0]),
+        rows_of(1, "first", &[], &[]),
+        rows_of(1, "second", &[1], &[]),
+        rows_of(1, "mask", &[], &[]),
     ];
-    let left = place.left(&checkpoint, &[1, 3], &rows).unwrap();
-    assert_eq!(values(&left, 0, "means"), [3.5, 4.5, 5.5, -1.0, -2.0, -3.0]);
-    assert_eq!(values(&left, 0, "turned"), [-4.0, -5.0, -6.0, 3.5, 7.5, 11.5]);
-    // Columns come first in what is stored, as before.
-    assert_eq!(find(&left, 0, "turned").stride, [1, 2]);
-    assert_eq!(values(&left, 0, "net"), ramp(4));
-    assert_eq!(values(&left, 1, "first"), [3.5, 4.5, 5.5, 9.5, 10.5, 11.5]);
-    assert_eq!(values(&left, 1, "second"), [15.5, 16.5, 17.5, 0.0, 0.0, 0.0]);
-    assert_eq!(left.storage("4").unwrap(), [0, 1]);
-    assert_eq!(left.storage("3").unwrap().len(), 4 * 12);
-    // Only numbers differ between the pickles, and the files are the same ones in the same order.
+    let reduced = temp.reduced(&checkpoint, &[1, 3], &rows).unwrap();
+    assert_eq!(values(&reduced, 0, "means"), [3.5, 4.5, 5.5, -1.0, -2.0, -3.0]);
+    assert_eq!(values(&reduced, 0, "turned"), [-4.0, -5.0, -6.0, 3.5, 7.5, 11.5]);
+    // The stored order stays column-major, as before.
+    assert_eq!(find(&reduced, 0, "turned").stride, [1, 2]);
+    assert_eq!(values(&reduced, 0, "net"), ramp(4));
+    assert_eq!(values(&reduced, 1, "first"), [3.5, 4.5, 5.5, 9.5, 10.5, 11.5]);
+    assert_eq!(values(&reduced, 1, "second"), [15.5, 16.5, 17.5, 0.0, 0.0, 0.0]);
+    assert_eq!(reduced.storage("4").unwrap(), [0, 1]);
+    assert_eq!(reduced.storage("3").unwrap().len(), 4 * 12);
+    // Only numbers differ between the pickles; the archives hold the same files in the same order.
     let texts = |checkpoint: &Checkpoint| {
-        let of = |id| match checkpoint.pickle().node(id) {
+        let describe = |id| match checkpoint.pickle().node(id) {
             Node::Int(..) => "a number".to_owned(),
             other => format!("{other:?}"),
         };
-        checkpoint.pickle().ids().map(of).collect::<Vec<_>>()
+        checkpoint.pickle().ids().map(describe).collect::<Vec<_>>()
     };
-    assert_eq!(texts(&left), texts(&checkpoint));
+    assert_eq!(texts(&reduced), texts(&checkpoint));
     let names = |checkpoint: &Checkpoint| {
         let mut names = Vec::new();
         checkpoint
@@ -153,11 +154,11 @@ fn rows_that_stay_keep_their_values_and_everything_else_its_bytes() {
             .unwrap();
         names
     };
-    assert_eq!(names(&left), names(&checkpoint));
-    // Bytes follow from the content.
-    let bytes = fs::read(place.path()).unwrap();
-    place.left(&checkpoint, &[1, 3], &rows).unwrap();
-    assert_eq!(fs::read(place.path()).unwrap(), bytes);
+    assert_eq!(names(&reduced), names(&checkpoint));
+    // The same content gives the same bytes.
+    let bytes = fs::read(temp.path()).unwrap();
+    temp.reduced(&checkpoint, &[1, 3], &rows).unwrap();
+    assert_eq!(fs::read(temp.path()).unwrap(), bytes);
     for (at, name) in [(0, "made/data.pkl"), (2, "made/data/0")] {
         let mut archive = ZipArchive::new(Cursor::new(&bytes[..])).unwrap();
         let file = archive.by_index(at).unwrap();
@@ -171,15 +172,15 @@ fn rows_that_stay_keep_their_values_and_everything_else_its_bytes() {
 }
 
 #[test]
-fn all_rows_are_the_same_values_again() {
-    let place = Place::new();
-    let checkpoint = place.open(&model().file()).unwrap();
+fn keeping_all_rows_keeps_all_bytes() {
+    let temp = TempCheckpoint::new();
+    let checkpoint = temp.open(&model().file()).unwrap();
     let rows = [(0, "means"), (0, "turned"), (1, "mask")].map(|(part, name)| GaussianRows {
         tensor: find(&checkpoint, part, name),
         changed: Vec::new(),
         values: Vec::new(),
     });
-    let left = place.left(&checkpoint, &[0, 1, 2, 3], &rows).unwrap();
+    let reduced = temp.reduced(&checkpoint, &[0, 1, 2, 3], &rows).unwrap();
     let all = |checkpoint: &Checkpoint| {
         let mut files = Vec::new();
         checkpoint
@@ -190,84 +191,85 @@ fn all_rows_are_the_same_values_again() {
             .unwrap();
         files.into_iter().filter(|file| file.1).collect::<Vec<_>>()
     };
-    assert_eq!(all(&left), all(&checkpoint));
+    assert_eq!(all(&reduced), all(&checkpoint));
 }
 
 #[test]
-fn a_shape_that_two_tensors_share_is_refused_where_one_has_to_change() {
-    let place = Place::new();
+fn a_shared_shape_is_refused_if_one_tensor_changes() {
+    let temp = TempCheckpoint::new();
     let file =
         Made::Tuple(vec![Made::Tensor(tensor(0, &[3, 3], &ramp(9))), Made::Tensor(tensor(1, &[3, 3], &ramp(9)))]);
     let whole = file.file();
-    let checkpoint = place.open(&whole).unwrap();
+    let checkpoint = temp.open(&whole).unwrap();
     let mut files = Vec::new();
     checkpoint
         .files(|name, _, bytes| {
-            files.push((inside(name).to_owned(), bytes));
+            files.push((without_first_folder(name).to_owned(), bytes));
             Ok(())
         })
         .unwrap();
-    // Remembers the first shape, and recalls it in place of the second.
+    // Stores the first shape in the memo, and uses it in place of the second.
     let shape = [&b"(J\x03\0\0\0J\x03\0\0\0t"[..]].concat();
     let pickle = &mut files[0].1;
     let found: Vec<usize> = (0..pickle.len() - shape.len()).filter(|&at| pickle[at..].starts_with(&shape)).collect();
     pickle.splice(found[1]..found[1] + shape.len(), [b'h', 9]);
     pickle.splice(found[0] + shape.len()..found[0] + shape.len(), [b'q', 9]);
-    let checkpoint = place.open(&zip(&files)).unwrap();
+    let checkpoint = temp.open(&zip(&files)).unwrap();
     let id = |k: usize| checkpoint.pickle().elements(checkpoint.pickle().root()).unwrap()[k];
-    let of = |k| GaussianRows { tensor: checkpoint.tensor(id(k)).unwrap(), changed: Vec::new(), values: Vec::new() };
-    let error = place.left(&checkpoint, &[0], &[of(0)]).unwrap_err().to_string();
+    let rows_of =
+        |k| GaussianRows { tensor: checkpoint.tensor(id(k)).unwrap(), changed: Vec::new(), values: Vec::new() };
+    let error = temp.reduced(&checkpoint, &[0], &[rows_of(0)]).unwrap_err().to_string();
     assert!(error.contains("several share") && error.contains("clone()"), "{error}");
-    // Both: they agree.
-    place.left(&checkpoint, &[0], &[of(0), of(1)]).unwrap();
+    // If both tensors change, they still agree.
+    temp.reduced(&checkpoint, &[0], &[rows_of(0), rows_of(1)]).unwrap();
 }
 
 #[test]
-fn what_is_not_all_there_is_named() {
-    let place = Place::new();
-    let said = |of: MadeTensor| {
-        let checkpoint = place.open(&Made::Tensor(of).file()).unwrap();
+fn incomplete_tensors_and_files_are_named() {
+    let temp = TempCheckpoint::new();
+    let message = |tensor: MadeTensor| {
+        let checkpoint = temp.open(&Made::Tensor(tensor).file()).unwrap();
         checkpoint.float_tensor(checkpoint.pickle().root(), "means").unwrap_err().to_string()
     };
-    let of = || tensor(0, &[4, 3], &ramp(12));
+    let valid = || tensor(0, &[4, 3], &ramp(12));
     for wrong in [
-        MadeTensor { shape: vec![5, 3], ..of() },
-        MadeTensor { offset: 1, ..of() },
-        MadeTensor { shape: vec![1 << 20, 1 << 10], stride: vec![0, 0], ..of() },
-        MadeTensor { shape: vec![i32::MAX as usize; 4], stride: vec![i32::MAX as usize; 4], ..of() },
-        MadeTensor { bytes: Vec::new(), ..of() },
+        MadeTensor { shape: vec![5, 3], ..valid() },
+        MadeTensor { offset: 1, ..valid() },
+        MadeTensor { shape: vec![1 << 20, 1 << 10], stride: vec![0, 0], ..valid() },
+        MadeTensor { shape: vec![i32::MAX as usize; 4], stride: vec![i32::MAX as usize; 4], ..valid() },
+        MadeTensor { bytes: Vec::new(), ..valid() },
     ] {
-        let error = said(wrong);
+        let error = message(wrong);
         assert!(error.contains("means") && error.contains("data/0"), "{error}");
     }
-    let no_rank = said(MadeTensor { stride: vec![1], ..of() });
+    let no_rank = message(MadeTensor { stride: vec![1], ..valid() });
     assert!(no_rank.contains("_rebuild_tensor_v2"), "{no_rank}");
-    // The storage's file is not there.
-    let checkpoint = place.open(&Made::Tensor(of()).file()).unwrap();
+    // The file of the storage is missing.
+    let checkpoint = temp.open(&Made::Tensor(valid()).file()).unwrap();
     let mut files = Vec::new();
     checkpoint
         .files(|name, _, bytes| {
-            files.push((inside(name).to_owned(), bytes));
+            files.push((without_first_folder(name).to_owned(), bytes));
             Ok(())
         })
         .unwrap();
     files.retain(|(name, _)| name != "data/0");
-    let checkpoint = place.open(&zip(&files)).unwrap();
+    let checkpoint = temp.open(&zip(&files)).unwrap();
     let error = checkpoint.float_tensor(checkpoint.pickle().root(), "means").unwrap_err().to_string();
     assert!(error.contains("no file data/0"), "{error}");
-    let error = place.open(&zip(&files[1..])).unwrap_err().to_string();
+    let error = temp.open(&zip(&files[1..])).unwrap_err().to_string();
     assert!(error.contains("no data.pkl"), "{error}");
 }
 
 #[test]
-fn a_file_cut_anywhere_is_refused_and_a_flipped_bit_is_never_unnoticed() {
-    let place = Place::new();
+fn truncated_and_damaged_files_never_give_wrong_values() {
+    let temp = TempCheckpoint::new();
     let whole = model().file();
     for length in (0..whole.len()).step_by(7) {
-        let error = place.open(&whole[..length]).expect_err("a cut file must be refused").to_string();
+        let error = temp.open(&whole[..length]).expect_err("a cut file must be refused").to_string();
         assert!(error.contains("a.pt"), "{error}");
     }
-    let expected = values(&place.open(&whole).unwrap(), 0, "means");
+    let expected = values(&temp.open(&whole).unwrap(), 0, "means");
     let root = |checkpoint: &Checkpoint| -> Option<TensorView> {
         let pickle = checkpoint.pickle();
         checkpoint.tensor(pickle.item(*pickle.elements(pickle.root())?.first()?, "means")?)
@@ -275,7 +277,7 @@ fn a_file_cut_anywhere_is_refused_and_a_flipped_bit_is_never_unnoticed() {
     for at in (0..whole.len()).step_by(3) {
         let mut bytes = whole.clone();
         bytes[at] ^= 1 << (at % 8);
-        let Ok(checkpoint) = place.open(&bytes) else { continue };
+        let Ok(checkpoint) = temp.open(&bytes) else { continue };
         let Some(tensor) = root(&checkpoint) else { continue };
         if let Ok(tensor) = checkpoint.float_tensor(tensor.id, "means")
             && let Ok(found) = checkpoint.floats(&tensor, "means")
@@ -288,28 +290,29 @@ fn a_file_cut_anywhere_is_refused_and_a_flipped_bit_is_never_unnoticed() {
 proptest! {
     #[test]
     fn hostile_pickles_are_read_or_refused(pickle in proptest::collection::vec(any::<u8>(), 0..300), flips in proptest::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 0..4)) {
-        let place = Place::new();
-        let look = |bytes: &[u8]| {
-            let Ok(checkpoint) = place.open(bytes) else { return };
+        let temp = TempCheckpoint::new();
+        let read_and_rewrite = |bytes: &[u8]| {
+            let Ok(checkpoint) = temp.open(bytes) else { return };
             for tensor in checkpoint.tensors() {
                 if let Ok(tensor) = checkpoint.float_tensor(tensor.id, "t") {
                     _ = checkpoint.floats(&tensor, "t");
                 }
                 if !tensor.shape.is_empty() {
-                    _ = place.left(&checkpoint, &[], &[GaussianRows { tensor, changed: Vec::new(), values: Vec::new() }]);
+                    let rows = [GaussianRows { tensor, changed: Vec::new(), values: Vec::new() }];
+                    _ = temp.reduced(&checkpoint, &[], &rows);
                 }
             }
         };
-        look(&zip(&[("data.pkl".to_owned(), pickle)]));
+        read_and_rewrite(&zip(&[("data.pkl".to_owned(), pickle)]));
         let mut files = Vec::new();
-        place.open(&model().file()).unwrap().files(|name, _, bytes| {
-            files.push((inside(name).to_owned(), bytes));
+        temp.open(&model().file()).unwrap().files(|name, _, bytes| {
+            files.push((without_first_folder(name).to_owned(), bytes));
             Ok(())
         }).unwrap();
         for (at, to) in flips {
             let at = at.index(files[0].1.len());
             files[0].1[at] = to;
         }
-        look(&zip(&files));
+        read_and_rewrite(&zip(&files));
     }
 }

@@ -1,9 +1,10 @@
-//! A PyTorch checkpoint with fewer rows.
+//! Writes a copy of a PyTorch checkpoint with fewer rows.
 //!
-//! In: an open checkpoint, and which of its tensors have a row per Gaussian. Out: a checkpoint of the same tree, of which these
-//! have fewer rows; names, order, types, devices and everything else are as they were, byte for byte. The pickle is not
-//! written anew: the numbers in it that have to change are. Memory: the pickle, and one storage as it was and as it becomes.
-//! Bytes depend on the content alone: files are dated 1980-01-01.
+//! In: an open checkpoint, and the list of its tensors that have a row per Gaussian. Out: a checkpoint with the same
+//! structure, in which these tensors have fewer rows. Names, order, types, devices and everything else stay the same,
+//! byte for byte. The pickle is not rebuilt: only the numbers in it that have to change are replaced. Memory: the
+//! pickle, and one storage before and after the change. The output bytes depend only on the content: files in the
+//! archive are dated 1980-01-01.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
@@ -19,24 +20,24 @@ use crate::files::checkpoint;
 use crate::files::checkpoint::{Checkpoint, NodeId, Pickle, TensorView};
 use crate::files::zip_output::ZipOutput;
 
-/// Where the bytes of a file begin is a multiple of so many, as PyTorch has it.
+/// Alignment of the contents of each file in the archive, in bytes, as in PyTorch.
 const ALIGNMENT: u16 = 64;
 
-/// A tensor whose first axis counts Gaussians, and what becomes of it.
+/// Tensor whose first axis counts Gaussians, and the changes to its rows.
 #[derive(Debug)]
 pub(crate) struct GaussianRows {
-    /// The tensor.
+    /// Tensor in the checkpoint that is copied.
     pub(crate) tensor: TensorView,
-    /// Rows of the result with other values than the row they come from, increasing.
+    /// Rows of the result whose values differ from those of the row they come from, increasing.
     pub(crate) changed: Vec<u32>,
-    /// Their values, `[changed, elements of a row]`, the last index fastest; empty: zeros.
+    /// New values of the changed rows, `[changed, elements of a row]`, last index fastest; empty: zeros.
     pub(crate) values: Vec<f32>,
 }
 
-/// How a storage is made up anew.
+/// Part of a rewritten storage that holds one tensor.
 struct StoragePart<'a> {
     tensor: &'a TensorView,
-    /// None: all of its elements stay.
+    /// Changes to the rows; `None`: all elements are kept.
     rows: Option<&'a GaussianRows>,
     shape: Vec<usize>,
     stride: Vec<usize>,
@@ -44,10 +45,11 @@ struct StoragePart<'a> {
     len: usize,
 }
 
-/// Writes `checkpoint` with the rows `kept` (increasing) of the tensors `rows` to `path`.
+/// Writes `checkpoint` to `path`, keeping only the rows `kept` (increasing) of the tensors `rows`.
 ///
 /// # Errors
-/// A tensor whose values are not all there; tensors that share what has to differ between them; a failed write.
+/// A tensor has elements outside its storage; two tensors share a shape or stride in the pickle that must differ
+/// between them; the file cannot be written.
 pub(crate) fn write_like(checkpoint: &Checkpoint, kept: &[u32], rows: &[GaussianRows], path: &Path) -> Result<()> {
     let by_node: BTreeMap<NodeId, &GaussianRows> =
         rows.iter().filter(|rows| !rows.tensor.shape.is_empty()).map(|rows| (rows.tensor.id, rows)).collect();
@@ -60,13 +62,13 @@ pub(crate) fn write_like(checkpoint: &Checkpoint, kept: &[u32], rows: &[Gaussian
             .check(tensor)
             .map_err(|found| checkpoint.wrong(&format!("data/{}", tensor.storage), "values for all elements", found))?;
         let rows = by_node.get(&tensor.id).copied();
-        let of_storage = parts.entry(&tensor.storage).or_default();
-        if of_storage.first().is_some_and(|first: &StoragePart<'_>| first.tensor.kind != tensor.kind) {
+        let storage_parts = parts.entry(&tensor.storage).or_default();
+        if storage_parts.first().is_some_and(|first: &StoragePart<'_>| first.tensor.kind != tensor.kind) {
             return Err(checkpoint.wrong(&format!("data/{}", tensor.storage), "values of one type", "of several"));
         }
-        let offset = of_storage.last().map_or(0, |last| last.offset + last.len);
+        let offset = storage_parts.last().map_or(0, |last| last.offset + last.len);
         let part = StoragePart::new(tensor, rows, kept.len(), offset);
-        of_storage.push(part);
+        storage_parts.push(part);
     }
     let mut expected: BTreeMap<NodeId, (Vec<usize>, Vec<usize>, usize)> = BTreeMap::new();
     for (key, parts) in &parts {
@@ -95,7 +97,7 @@ pub(crate) fn write_like(checkpoint: &Checkpoint, kept: &[u32], rows: &[Gaussian
         let bytes = match what {
             checkpoint::CheckpointFile::Pickle => {
                 let written = checkpoint.pickle().with_numbers(&bytes, &numbers);
-                confirm(checkpoint, &written, &all, &expected)?;
+                check_pickle(checkpoint, &written, &all, &expected)?;
                 written
             }
             checkpoint::CheckpointFile::Storage(key) => match parts.get(key) {
@@ -119,6 +121,7 @@ pub(crate) fn write_like(checkpoint: &Checkpoint, kept: &[u32], rows: &[Gaussian
 }
 
 impl<'a> StoragePart<'a> {
+    /// Returns the shape and strides of `tensor` with `kept` rows, placed `offset` elements into the new storage.
     fn new(tensor: &'a TensorView, rows: Option<&'a GaussianRows>, kept: usize, offset: usize) -> StoragePart<'a> {
         let mut shape = tensor.shape.clone();
         if let (Some(_), Some(first)) = (rows, shape.first_mut()) {
@@ -126,17 +129,17 @@ impl<'a> StoragePart<'a> {
         }
         let row: usize = tensor.shape.iter().skip(1).product();
         let mut stride = tensor.stride.clone();
-        // Rows one after the other, and in each of them every place once: it stays so. Everything else keeps the order of its
-        // axes, without the gaps.
+        // A tensor whose rows follow one another without gaps keeps its strides. Every other tensor keeps the order of
+        // its axes, but loses its gaps.
         let is_dense = stride.first() == Some(&row) && {
-            let of_row = TensorView {
+            let row_view = TensorView {
                 offset: 0,
                 shape: tensor.shape[1..].to_vec(),
                 stride: stride[1..].to_vec(),
                 ..tensor.clone()
             };
             let mut seen = vec![false; row];
-            of_row.each(|at| {
+            row_view.each(|at| {
                 if let Some(seen) = seen.get_mut(at) {
                     *seen = true;
                 }
@@ -155,7 +158,7 @@ impl<'a> StoragePart<'a> {
         StoragePart { tensor, rows, shape, stride, offset, len }
     }
 
-    /// Adds its bytes, taken from those of the storage as it was.
+    /// Appends the bytes of this part, taken from `stored`, the bytes of the old storage.
     fn write(&self, stored: &[u8], kept: &[u32], out: &mut Vec<u8>) {
         let (bytes, start) = (self.tensor.kind.bytes(), out.len());
         out.resize(start + self.len * bytes, 0);
@@ -173,8 +176,8 @@ impl<'a> StoragePart<'a> {
             });
             return;
         };
-        // Places of the elements of a row, counted from its first one.
-        let of_row = |tensor: &TensorView| {
+        // Offsets of the elements of a row from its first element.
+        let row_offsets = |tensor: &TensorView| {
             let mut places = Vec::new();
             let row = TensorView {
                 offset: 0,
@@ -185,7 +188,7 @@ impl<'a> StoragePart<'a> {
             row.each(|at| places.push(at));
             places
         };
-        let (from_row, to_row) = (of_row(self.tensor), of_row(&to));
+        let (from_row, to_row) = (row_offsets(self.tensor), row_offsets(&to));
         let (from_step, to_step) = (self.tensor.stride[0], self.stride[0]);
         for (place, &row) in kept.iter().enumerate() {
             let from = self.tensor.offset + row as usize * from_step;
@@ -203,9 +206,9 @@ impl<'a> StoragePart<'a> {
     }
 }
 
-/// Confirms that the pickle as it will be written has every tensor as it is meant: two may share a shape of which one was to
-/// stay.
-fn confirm(
+/// Checks that every tensor in the pickle to be written has the expected shape, strides and offset. This fails if two
+/// tensors share a shape and only one of them changes.
+fn check_pickle(
     checkpoint: &Checkpoint,
     written: &[u8],
     all: &[TensorView],

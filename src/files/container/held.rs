@@ -1,44 +1,46 @@
-//! Tiles of a container that stay in memory once they have been decoded.
+//! Decoded tiles of a container that are kept in memory.
 //!
-//! In: the values of tiles, as they are decoded. Out: the same, to any thread, as long as the container is open. Memory:
-//! what is allowed and no more; [`HeldTiles::BYTES_PER_SLOT`] for every tile, held or not. What is held is never given
-//! up: passes go over all frames, so that the tile that was not used for longest is the next to be asked for.
+//! In: the values of tiles as they are decoded. Out: the same values, to any thread, as long as the container is open.
+//! Memory: the bytes allowed and no more, plus [`HeldTiles::BYTES_PER_SLOT`] for every tile, held or not. Held tiles
+//! are never evicted: every pass goes over all frames, so the least recently used tile is the next one to be needed.
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Mutex, OnceLock, PoisonError};
 
 use crate::error::Result;
 
+/// Values of a tile, once they have been decoded.
 type TileSlot = OnceLock<Box<[f32]>>;
 
-/// Locks that tiles share while they are decoded: more than there are threads, so that hardly two wait for one another.
-const TURNS: usize = 256;
+/// Number of locks that tiles share while they are decoded: more than there are threads, so that threads rarely wait
+/// for one another.
+const LOCKS: usize = 256;
 
-/// The tiles held, each with a place of its own, so that nobody who reads one waits for another.
+/// Tiles kept in memory. Each has its own slot, so that readers of a decoded tile never wait.
 pub(super) struct HeldTiles {
     slots: Vec<TileSlot>,
-    /// Held by whoever decodes the tile of a slot, by its number modulo theirs.
-    turns: Vec<Mutex<()>>,
-    /// Bytes allowed.
+    /// Lock `slot % LOCKS` is held by the thread that decodes the tile of a slot.
+    locks: Vec<Mutex<()>>,
+    /// Maximum number of bytes of values.
     capacity: AtomicU64,
-    /// Bytes of these that are free.
+    /// Bytes of `capacity` that are still free.
     left: AtomicU64,
-    /// Whether a tile did not fit: then nobody asks how large the next would be.
+    /// Whether a tile did not fit. From then on the sizes of further tiles are not looked up.
     full: AtomicBool,
 }
 
 impl HeldTiles {
-    /// Memory of a tile's place.
+    /// Memory of one slot.
     pub(super) const BYTES_PER_SLOT: u64 = size_of::<TileSlot>() as u64;
 
-    /// Room for no tile yet.
+    /// Returns `slots` empty slots; [`HeldTiles::allow`] grants memory for values.
     pub(super) fn new(slots: usize) -> HeldTiles {
         let slots = (0..slots).map(|_| TileSlot::new()).collect();
-        let turns = (0..TURNS).map(|_| Mutex::default()).collect();
-        HeldTiles { slots, turns, capacity: AtomicU64::new(0), left: AtomicU64::new(0), full: AtomicBool::new(false) }
+        let locks = (0..LOCKS).map(|_| Mutex::default()).collect();
+        HeldTiles { slots, locks, capacity: AtomicU64::new(0), left: AtomicU64::new(0), full: AtomicBool::new(false) }
     }
 
-    /// Allows values of `bytes` altogether, if that is more than before.
+    /// Raises the limit to `bytes`. A limit below the present one has no effect.
     pub(super) fn allow(&self, bytes: u64) {
         let before = self.capacity.fetch_max(bytes, Ordering::Relaxed);
         self.left.fetch_add(bytes.saturating_sub(before), Ordering::Relaxed);
@@ -47,8 +49,12 @@ impl HeldTiles {
         }
     }
 
-    /// The values of the tile of slot `at`, which `decode` writes the first time to room for as many as `count` says; none
-    /// if they do not fit. Of threads that come at the same time one decodes and the others wait for it.
+    /// Returns the values of the tile in slot `at`, or `None` if they do not fit. On the first call, `count` returns
+    /// the number of values and `decode` writes them. If several threads ask at the same time, one decodes and the
+    /// others wait.
+    ///
+    /// # Errors
+    /// An error of `count` or `decode`; the tile is not held then.
     pub(super) fn get_or_decode(
         &self,
         at: usize,
@@ -62,13 +68,14 @@ impl HeldTiles {
         if self.full.load(Ordering::Relaxed) {
             return Ok(None);
         }
-        let _turn = self.turns[at % TURNS].lock().unwrap_or_else(PoisonError::into_inner);
+        let _lock = self.locks[at % LOCKS].lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(values) = slot.get() {
             return Ok(Some(values));
         }
         let count = count()?;
         let bytes = 4 * count as u64;
-        // Relaxed, as all here: numbers that guard no other memory; the slots guard theirs.
+        // Relaxed ordering suffices for these counters: they guard no other memory, and the slots guard their own
+        // values.
         let take = |left: u64| left.checked_sub(bytes);
         if self.left.fetch_update(Ordering::Relaxed, Ordering::Relaxed, take).is_err() {
             self.full.store(true, Ordering::Relaxed);
@@ -82,7 +89,7 @@ impl HeldTiles {
         Ok(Some(slot.get_or_init(|| values)))
     }
 
-    /// Whether the tile of `slot` is held.
+    /// Returns whether the tile in `slot` is held.
     pub(super) fn has(&self, slot: usize) -> bool {
         self.slots[slot].get().is_some()
     }
@@ -102,13 +109,13 @@ mod tests {
     }
 
     #[test]
-    fn what_fits_stays_what_does_not_is_left_alone_and_more_may_be_allowed() {
+    fn tiles_are_held_up_to_a_limit_that_may_grow() {
         let held = HeldTiles::new(3);
         assert_eq!(decode(&held, 0, 1), None);
         held.allow(20);
         assert_eq!(decode(&held, 0, 3), Some(&[0.0; 3][..]));
         assert_eq!(decode(&held, 1, 3), None);
-        assert_eq!(decode(&held, 2, 1), None, "it would fit, but nobody asks any more");
+        assert_eq!(decode(&held, 2, 1), None, "it would fit, but sizes are no longer looked up");
         held.allow(12);
         assert_eq!(decode(&held, 1, 3), None, "less than before is no more");
         held.allow(24);
@@ -118,7 +125,7 @@ mod tests {
     }
 
     #[test]
-    fn threads_that_come_at_once_decode_a_tile_once() {
+    fn concurrent_threads_decode_a_tile_once() {
         let held = HeldTiles::new(1);
         held.allow(1000);
         let decoded = AtomicU64::new(0);
@@ -139,7 +146,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_decoded_takes_no_room() {
+    fn a_tile_that_fails_to_decode_takes_no_memory() {
         let held = HeldTiles::new(2);
         held.allow(8);
         assert!(held.get_or_decode(0, || Ok(2), |_| Err(Error::usage("unreadable"))).is_err());

@@ -1,4 +1,4 @@
-//! An open container: its columns, what is held of it, and what decoding takes.
+//! An open container: its columns, the tiles it holds in memory, and the buffers for decoding.
 
 use std::ops::{Deref, DerefMut};
 use std::path::{Path, PathBuf};
@@ -12,21 +12,22 @@ use crate::limits::ReadLimit;
 use crate::model::{Columns, HIGHEST_DEGREE, SequenceInfo, sh_coefficients};
 use crate::source::Count;
 
-/// An open container with all columns of a Gaussian model.
+/// Open container with all columns of a Gaussian model.
 pub struct Container {
     pub(super) path: PathBuf,
     pub(super) reader: Reader,
     pub(super) info: SequenceInfo,
-    /// Place of each column in the container, in the order of [`Columns::all`].
+    /// Attributes in the order of [`Columns::all`], each with the index of its column in the container.
     pub(super) places: Vec<(Columns, u32)>,
-    /// One for each thread at most, shared by all readers.
+    /// Decoding buffers, at most one for each thread, shared by all readers.
     pub(super) scratch: Mutex<Vec<TileScratch>>,
-    /// Made when the first tile may be held.
+    /// Tiles held in memory; created when the first tile may be held.
     pub(super) held: OnceLock<HeldTiles>,
+    /// Number of states (Gaussian × frame) read so far.
     pub(super) states: Count,
 }
 
-/// What decoding a tile takes besides what is kept of it.
+/// Buffers for decoding a tile.
 #[derive(Default)]
 pub(super) struct TileScratch {
     pub(super) buffer: TileBuffer,
@@ -35,26 +36,26 @@ pub(super) struct TileScratch {
     pub(super) plane: Vec<f32>,
 }
 
-/// A [`TileScratch`] on loan.
-pub(super) struct Lent<'a> {
+/// [`TileScratch`] in use; returned to the container when dropped.
+pub(super) struct ScratchGuard<'a> {
     from: &'a Mutex<Vec<TileScratch>>,
     scratch: TileScratch,
 }
 
 impl Container {
-    /// Opens the container and checks that it holds Gaussians: position, rotation, log_scale,
-    /// opacity_logit and sh, each of its width.
+    /// Opens the container and checks that it holds Gaussians: columns position, rotation, log_scale, opacity_logit and
+    /// sh, each of the right width.
     ///
     /// # Errors
-    /// Those of [`Reader::open`]; other columns.
+    /// The errors of [`Reader::open`]; a column is missing or has another width.
     pub fn open(path: &Path) -> Result<Container> {
         Self::open_within(path, ReadLimit::NONE)
     }
 
-    /// [`Container::open`] with at most `memory` for what is known of frames and tiles.
+    /// Opens the container like [`Container::open`], with at most `memory` for the index of frames and tiles.
     ///
     /// # Errors
-    /// Those of [`Container::open`]; a container that needs more memory.
+    /// The errors of [`Container::open`]; a container that needs more memory.
     pub fn open_within(path: &Path, memory: ReadLimit) -> Result<Container> {
         let reader = Reader::open_within(path, memory.bytes())?;
         let layout = reader.layout();
@@ -108,24 +109,24 @@ impl Container {
         })
     }
 
-    /// The reader underneath.
+    /// Returns the reader of the container format.
     pub fn reader(&self) -> &Reader {
         &self.reader
     }
 
-    /// Where it lies.
+    /// Returns the path of the file.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Hash that covers every tile, as 16 hexadecimal digits.
+    /// Returns a hash that covers every tile, as 16 hexadecimal digits.
     pub fn digest(&self) -> String {
         format!("{:016x}", self.reader.digest())
     }
 
-    /// Lets the values of tiles stay in memory once they have been decoded, in at most `bytes`, as long as this lives:
-    /// whoever reads them later does not read the file again. Nothing is held at first; more may be allowed at any time,
-    /// less has no effect. Values read are the same.
+    /// Allows decoded tiles to stay in memory, in at most `bytes`, as long as the container is open, so that later
+    /// passes do not read the file again. Nothing is held at first. The limit may be raised at any time; a lower one
+    /// has no effect. Values are the same with and without it.
     pub fn hold_decoded(&self, bytes: u64) {
         let own = self.slots() as u64 * HeldTiles::BYTES_PER_SLOT;
         if bytes > own {
@@ -133,8 +134,8 @@ impl Container {
         }
     }
 
-    /// Bytes that holding every tile takes ([`Container::hold_decoded`]), at most: less where tiles of a column that
-    /// varies are constant.
+    /// Returns the maximum number of bytes for holding every tile ([`Container::hold_decoded`]). Fewer are used if
+    /// tiles of a varying column are constant.
     pub fn decoded_bytes(&self) -> u64 {
         let values = |&(column, _): &(Columns, u32)| {
             let frames = if self.info.varying.contains(column) { self.info.times.len() } else { 1 };
@@ -143,12 +144,13 @@ impl Container {
         4 * self.places.iter().map(values).sum::<u64>() + self.slots() as u64 * HeldTiles::BYTES_PER_SLOT
     }
 
-    /// Tiles that differ: of a column that does not vary those of one frame block.
+    /// Returns the number of distinct tiles: a column that does not vary has those of one frame block.
     pub(super) fn slots(&self) -> usize {
         self.slot(self.places.len(), 0, 0)
     }
 
-    /// Place among the tiles that differ of that of column `index` of `places`; of one more, their number.
+    /// Returns the index of a tile of column `index` of `places` among the distinct tiles. For `index` = number of
+    /// columns it is the number of distinct tiles.
     pub(super) fn slot(&self, index: usize, gaussian_block: u32, frame_block: u32) -> usize {
         let blocks = self.reader.layout().gaussian_blocks() as usize;
         let rows = |column| if self.info.varying.contains(column) { self.reader.frame_blocks() as usize } else { 1 };
@@ -157,8 +159,11 @@ impl Container {
         (before + if varies { frame_block as usize } else { 0 }) * blocks + gaussian_block as usize
     }
 
-    /// The values `[frames, width, len]` of a tile of column `index` of `places` (one frame of a constant tile), if they
-    /// are held or can be from now on.
+    /// Returns the values `[frames, width, len]` of a tile of column `index` of `places` (one frame for a constant
+    /// tile) if they are held or can be held from now on, else `None`.
+    ///
+    /// # Errors
+    /// The tile cannot be read or decoded.
     pub(super) fn held(&self, index: usize, at: TileId) -> Result<Option<&[f32]>> {
         let Some(held) = self.held.get() else { return Ok(None) };
         held.get_or_decode(
@@ -181,12 +186,12 @@ impl Container {
         )
     }
 
-    /// Whether a tile of column `index` of `places` is held.
+    /// Returns whether a tile of column `index` of `places` is held.
     pub(super) fn is_held(&self, index: usize, gaussian_block: u32, frame_block: u32) -> bool {
         self.held.get().is_some_and(|held| held.has(self.slot(index, gaussian_block, frame_block)))
     }
 
-    /// The tiles of `columns` that would have to be read.
+    /// Returns the tiles of `columns` in the given blocks that would have to be read from the file.
     pub(super) fn unheld(
         &self,
         columns: Columns,
@@ -200,26 +205,27 @@ impl Container {
         self.places.iter().enumerate().filter(needed).map(at)
     }
 
-    pub(super) fn scratch(&self) -> Lent<'_> {
+    /// Returns a decoding buffer, reusing one that is free.
+    pub(super) fn scratch(&self) -> ScratchGuard<'_> {
         let scratch = self.scratch.lock().unwrap_or_else(PoisonError::into_inner).pop();
-        Lent { from: &self.scratch, scratch: scratch.unwrap_or_default() }
+        ScratchGuard { from: &self.scratch, scratch: scratch.unwrap_or_default() }
     }
 }
 
-impl Deref for Lent<'_> {
+impl Deref for ScratchGuard<'_> {
     type Target = TileScratch;
     fn deref(&self) -> &TileScratch {
         &self.scratch
     }
 }
 
-impl DerefMut for Lent<'_> {
+impl DerefMut for ScratchGuard<'_> {
     fn deref_mut(&mut self) -> &mut TileScratch {
         &mut self.scratch
     }
 }
 
-impl Drop for Lent<'_> {
+impl Drop for ScratchGuard<'_> {
     fn drop(&mut self) {
         self.from.lock().unwrap_or_else(PoisonError::into_inner).push(std::mem::take(&mut self.scratch));
     }

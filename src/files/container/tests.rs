@@ -13,15 +13,20 @@ use crate::source::ReadPlan;
 const COUNT: usize = 2 * GAUSSIAN_BLOCK + 77;
 const FRAMES: usize = 2 * FRAME_BLOCK + 5;
 
-/// Every way of storing a tile: positions are noise in the first block of Gaussians (no zstd shrinks it) and curves
-/// in the others; opacities move in the second frame block alone; rotations stand still in the last block of
-/// Gaussians; scales and colors never change.
-struct Made(SequenceInfo);
+/// Source that covers every encoding of a tile: positions are noise in the first Gaussian block (zstd cannot compress
+/// it) and curves in the others; opacities change only in the second frame block; rotations are constant in the last
+/// Gaussian block; scales and colors never change.
+struct EncodingSource(SequenceInfo);
 
-impl Made {
-    fn new() -> Made {
+impl EncodingSource {
+    fn new() -> EncodingSource {
         let varying = Columns::POSITION | Columns::ROTATION | Columns::OPACITY;
-        Made(SequenceInfo { count: COUNT, times: (0..FRAMES).map(|t| t as f64).collect(), sh_degree: 1, varying })
+        EncodingSource(SequenceInfo {
+            count: COUNT,
+            times: (0..FRAMES).map(|t| t as f64).collect(),
+            sh_degree: 1,
+            varying,
+        })
     }
 
     fn pack(&self, compression: Compression) -> (tempfile::TempDir, Container) {
@@ -45,41 +50,44 @@ impl Made {
         (noise(key) as f32 * 1e-9 + if moves { 0.05 * frame as f32 } else { 0.0 }).sin()
     }
 
-    /// What reading `want` of `ids` at `frame` must give, by the formula.
+    /// Returns the values of the columns `want` of `ids` at `frame`, computed from the formula.
     fn expected(&self, ids: &Ids<'_>, frame: usize, want: Columns) -> Gaussians {
         let mut out = Gaussians::zeros(0, 1);
         for column in want.iter() {
             let to = out.column_mut(column);
             to.resize(ids.len());
             for c in 0..to.width() {
-                to.plane_mut(c).iter_mut().zip(ids.iter()).for_each(|(x, id)| *x = Made::value(column, id, c, frame));
+                to.plane_mut(c)
+                    .iter_mut()
+                    .zip(ids.iter())
+                    .for_each(|(x, id)| *x = EncodingSource::value(column, id, c, frame));
             }
         }
         out
     }
 }
 
-impl FrameSource for Made {
+impl FrameSource for EncodingSource {
     fn info(&self) -> &SequenceInfo {
         &self.0
     }
 
     fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>> {
-        Ok(Box::new(MadeReader(self, ids.iter().map(|id| id as u32).collect())))
+        Ok(Box::new(EncodingReader(self, ids.iter().map(|id| id as u32).collect())))
     }
 }
 
-struct MadeReader<'a>(&'a Made, Vec<u32>);
+struct EncodingReader<'a>(&'a EncodingSource, Vec<u32>);
 
-impl BlockReader for MadeReader<'_> {
+impl BlockReader for EncodingReader<'_> {
     fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
-        let made = self.0.expected(&Ids::List(&self.1), frame, want);
-        want.iter().for_each(|column| *out.column_mut(column) = made.column(column).clone());
+        let source = self.0.expected(&Ids::List(&self.1), frame, want);
+        want.iter().for_each(|column| *out.column_mut(column) = source.column(column).clone());
         Ok(())
     }
 }
 
-/// A tile, the short last one, a part of one, parts of two, and Gaussians from everywhere in no order.
+/// Returns a tile, the short last tile, a part of a tile, parts of two tiles, and scattered Gaussians in no order.
 fn blocks(scattered: &[u32]) -> [Ids<'_>; 5] {
     let tile = GAUSSIAN_BLOCK;
     [
@@ -92,21 +100,21 @@ fn blocks(scattered: &[u32]) -> [Ids<'_>; 5] {
 }
 
 #[test]
-fn frames_read_the_same_whatever_a_reader_holds_and_in_whatever_order() {
-    let made = Made::new();
+fn frames_are_independent_of_order_and_of_held_frames() {
+    let source = EncodingSource::new();
     let scattered = [COUNT as u32 - 1, 5, 6, 7, 2000, 4, 1024, 1023];
     for compression in [Compression::Zstd(1), Compression::Raw] {
-        let (_folder, container) = made.pack(compression);
+        let (_folder, container) = source.pack(compression);
         for ids in blocks(&scattered) {
             for held in [1, 3, FRAME_BLOCK, usize::MAX] {
                 let mut reader = container.open(ids.clone()).unwrap();
                 reader.expect(&ReadPlan::every().holding(held));
                 for k in 0..3 * FRAMES / 2 {
                     let frame = if k < FRAMES { k } else { hash_id(k as u64) as usize % FRAMES };
-                    let want = if k % 7 == 0 { Columns::all() } else { made.info().varying };
+                    let want = if k % 7 == 0 { Columns::all() } else { source.info().varying };
                     let mut got = Gaussians::zeros(0, 1);
                     reader.read(frame, want, &mut got).unwrap();
-                    let expected = made.expected(&ids, frame, want);
+                    let expected = source.expected(&ids, frame, want);
                     assert!(got == expected, "{compression:?}, {ids:?}, holding {held}: frame {frame} is wrong");
                 }
             }
@@ -115,11 +123,11 @@ fn frames_read_the_same_whatever_a_reader_holds_and_in_whatever_order() {
 }
 
 #[test]
-fn a_reader_keeps_no_more_than_it_may_and_nothing_that_is_read_once() {
-    let made = Made::new();
-    let varying = made.info().varying.width(1);
+fn a_reader_keeps_no_more_than_allowed() {
+    let source = EncodingSource::new();
+    let varying = source.info().varying.width(1);
     let scattered: Vec<u32> = (0..COUNT as u32).step_by(3).collect();
-    let (_folder, container) = made.pack(Compression::Zstd(1));
+    let (_folder, container) = source.pack(Compression::Zstd(1));
     for ids in blocks(&scattered) {
         for held in [1, 3, FRAME_BLOCK] {
             let mut reader = TileReader::new(&container, &ids);
@@ -145,7 +153,7 @@ fn a_reader_keeps_no_more_than_it_may_and_nothing_that_is_read_once() {
     }
 }
 
-/// Tiles of the model's columns that reading every frame takes, and their stored bytes.
+/// Returns the number of tiles that a pass over every frame takes, and their stored bytes.
 fn all_tiles(container: &Container) -> (u64, u64) {
     let (reader, mut found) = (container.reader(), (0, 0));
     for &(column, place) in &container.places {
@@ -160,53 +168,54 @@ fn all_tiles(container: &Container) -> (u64, u64) {
     found
 }
 
-/// Reads every frame block by block, as a scan does, and compares.
-fn scan(made: &Made, container: &Container) {
+/// Reads every frame in Gaussian blocks, as a scan does, and compares positions.
+fn scan(source: &EncodingSource, container: &Container) {
     (0..COUNT.div_ceil(GAUSSIAN_BLOCK)).into_par_iter().for_each(|block| {
         let ids = Ids::Range(block * GAUSSIAN_BLOCK..COUNT.min((block + 1) * GAUSSIAN_BLOCK));
         let mut reader = container.open(ids.clone()).unwrap();
         let mut got = Gaussians::zeros(0, 1);
         for frame in 0..FRAMES {
-            let want = if frame == 0 { Columns::all() } else { made.info().varying };
+            let want = if frame == 0 { Columns::all() } else { source.info().varying };
             reader.read(frame, want, &mut got).unwrap();
-            assert!(got.position == made.expected(&ids, frame, Columns::POSITION).position, "{ids:?}, frame {frame}");
+            assert!(got.position == source.expected(&ids, frame, Columns::POSITION).position, "{ids:?}, frame {frame}");
         }
     });
 }
 
 #[test]
-fn a_scan_reads_each_stored_byte_of_its_tiles_once_and_what_never_changes_once_per_block() {
-    let made = Made::new();
+fn a_scan_reads_each_stored_byte_once() {
+    let source = EncodingSource::new();
     for compression in [Compression::Zstd(1), Compression::Raw] {
-        let (_folder, container) = made.pack(compression);
+        let (_folder, container) = source.pack(compression);
         assert_eq!(container.reads(), Reads::default());
         let (tiles, bytes) = all_tiles(&container);
         let once = Reads { bytes, tiles, states: (COUNT * FRAMES) as u64 };
-        scan(&made, &container);
+        scan(&source, &container);
         assert_eq!(container.reads(), once, "{compression:?}");
-        // Now that raw tiles have been verified, too.
-        scan(&made, &container);
+        // Raw tiles have been verified by the first scan.
+        scan(&source, &container);
         assert_eq!(container.reads() - once, once, "{compression:?}, again");
     }
 }
 
 #[test]
-fn of_wanted_frames_those_of_a_frame_block_take_its_tiles_once_unless_memory_forces_more() {
-    let made = Made::new();
+fn each_tile_is_read_once_for_all_planned_frames() {
+    let source = EncodingSource::new();
     let scattered = [COUNT as u32 - 1, 5, 6, 7, 2000, 4, 1024, 1023];
     let wanted = [0, 3, 9, 30, 31, 33, 64, 65, 68];
     for compression in [Compression::Zstd(1), Compression::Raw] {
         for ids in blocks(&scattered) {
             let blocks: std::collections::BTreeSet<usize> = ids.iter().map(|id| id / GAUSSIAN_BLOCK).collect();
-            // Frames of the three frame blocks: 5, 1, 3; decoded together 2 at most, 3 + 1 + 2 times.
+            // The three frame blocks have 5, 1 and 3 of these frames. With at most 2 frames decoded together they are
+            // read 3 + 1 + 2 times.
             for (held, times) in [(usize::MAX, 3), (5, 3), (2, 6)] {
-                let (_folder, container) = made.pack(compression);
+                let (_folder, container) = source.pack(compression);
                 let mut reader = container.open(ids.clone()).unwrap();
                 reader.expect(&ReadPlan::new(wanted).holding(held));
                 let mut got = Gaussians::zeros(0, 1);
                 for frame in wanted {
                     reader.read(frame, Columns::POSITION, &mut got).unwrap();
-                    assert!(got.position == made.expected(&ids, frame, Columns::POSITION).position);
+                    assert!(got.position == source.expected(&ids, frame, Columns::POSITION).position);
                 }
                 let tiles = container.reads().tiles;
                 assert!(
@@ -220,13 +229,13 @@ fn of_wanted_frames_those_of_a_frame_block_take_its_tiles_once_unless_memory_for
 }
 
 #[test]
-fn tiles_that_are_held_are_read_once_by_whomever_and_hold_the_same_values() {
-    let made = Made::new();
+fn held_tiles_are_read_once_and_have_the_same_values() {
+    let source = EncodingSource::new();
     let scattered = [COUNT as u32 - 1, 5, 6, 7, 2000, 4, 1024, 1023];
     for compression in [Compression::Zstd(1), Compression::Raw] {
-        let whole = made.pack(compression).1.decoded_bytes();
+        let whole = source.pack(compression).1.decoded_bytes();
         for capacity in [0, whole / 3, whole] {
-            let (_folder, container) = made.pack(compression);
+            let (_folder, container) = source.pack(compression);
             container.hold_decoded(capacity);
             for ids in blocks(&scattered) {
                 for wanted in [ReadPlan::every(), ReadPlan::every().holding(1), ReadPlan::new([7, 8, 40])] {
@@ -235,16 +244,16 @@ fn tiles_that_are_held_are_read_once_by_whomever_and_hold_the_same_values() {
                     for frame in [0, 7, 8, 40, FRAMES - 1, 7] {
                         let mut got = Gaussians::zeros(0, 1);
                         reader.read(frame, Columns::all(), &mut got).unwrap();
-                        let expected = made.expected(&ids, frame, Columns::all());
+                        let expected = source.expected(&ids, frame, Columns::all());
                         assert!(got == expected, "{compression:?}, {ids:?}, {capacity} bytes: frame {frame} is wrong");
                     }
                 }
             }
-            scan(&made, &container);
+            scan(&source, &container);
             let read = container.reads().bytes;
             let (_, all) = all_tiles(&container);
             assert!(capacity < whole || read == all, "{read} bytes read, of {all}");
-            scan(&made, &container);
+            scan(&source, &container);
             let again = container.reads().bytes - read;
             assert!(
                 if capacity == whole { again == 0 } else { again > 0 },

@@ -1,4 +1,5 @@
-//! Reading some Gaussians of a container: each tile once for all frames that are wanted of it, as far as memory goes.
+//! Reads some Gaussians of a container. Each tile is decoded once for all frames that are needed from it, as far as
+//! memory allows.
 
 use std::ops::Range;
 
@@ -9,10 +10,11 @@ use crate::error::{Error, Result, ShowPath};
 use crate::model::{Columns, Gaussians};
 use crate::source::{BlockReader, Ids, ReadPlan};
 
-/// Bytes of the map that a reader touches, at most, before it releases what it no longer needs.
-const TOUCHED: u64 = 1 << 20;
+/// Maximum number of bytes of the memory map that a reader touches before it releases pages that it no longer needs.
+const MAX_TOUCHED_BYTES: u64 = 1 << 20;
 
-/// Gaussians that lie side by side in a tile and in the block read.
+/// Gaussians that are adjacent both in a tile and in the reader's block: `len` of them, from `from` in the tile, `to`
+/// in the block.
 struct TileRun {
     gaussian_block: u32,
     from: usize,
@@ -20,10 +22,10 @@ struct TileRun {
     len: usize,
 }
 
-/// What a reader keeps of a column.
+/// Data that a reader keeps of one column.
 pub(super) enum KeptColumn {
     Nothing,
-    /// The one tile that a reader of just its Gaussians needs in a frame block: decompressed, or raw in the file.
+    /// Frame block, and the one tile that holds exactly the reader's Gaussians: decompressed, or raw in the file.
     Tile(u32, TileFrames),
     Values(FrameValues),
 }
@@ -31,15 +33,16 @@ pub(super) enum KeptColumn {
 /// Values at some frames of a frame block.
 #[derive(Default)]
 pub(super) struct FrameValues {
+    /// Frames of the frame block.
     block: Range<usize>,
-    /// Increasing; none if one frame stands for all of the block.
+    /// Frames whose values are stored, increasing; empty if one frame stands for the whole block.
     frames: Vec<usize>,
-    /// `[frames, width, len]`.
+    /// Values, `[frames, width, len]`.
     pub(super) values: Vec<f32>,
 }
 
 impl FrameValues {
-    /// Which of the frames kept stands for `frame`.
+    /// Returns the index in `frames` of the values for `frame`.
     fn place(&self, frame: usize) -> Option<usize> {
         match self.frames[..] {
             [] if self.block.contains(&frame) => Some(0),
@@ -48,32 +51,34 @@ impl FrameValues {
     }
 }
 
-/// Reads some Gaussians of a container.
+/// Reader of some Gaussians of a container.
 ///
-/// Memory per Gaussian: 4 bytes × width × frames held for each column that varies, `frames held` being those wanted of a
-/// frame block or what [`ReadPlan::holding`] allows; 8 × width more where that is a whole block. Of raw tiles that are read
-/// whole as much, in the map, if a whole block may be held, else nothing. Nothing if just one frame is held, nothing of
-/// columns that do not vary, nothing of tiles that the container holds.
+/// Memory per Gaussian: 4 bytes × width × frames held for each column that varies. "Frames held" are the needed frames
+/// of a frame block, at most the limit of [`ReadPlan::holding`]. Add 8 bytes × width if this is a whole block. Raw
+/// tiles that are read whole take as much of the memory map if a whole block may be held, else nothing. There is no
+/// such memory if only one frame is held, for columns that do not vary, and for tiles that the container holds.
 pub(super) struct TileReader<'a> {
     source: &'a Container,
     len: usize,
     runs: Vec<TileRun>,
-    /// Whether the Gaussians are those of one tile, in its order.
+    /// Whether the Gaussians are exactly those of one tile, in its order.
     pub(super) whole: bool,
-    wanted: ReadPlan,
-    /// The last frame block for which the system was told of what comes next.
-    told: Option<u32>,
-    /// By place in [`Container::places`].
+    /// Frames that will be read.
+    plan: ReadPlan,
+    /// Last frame block for which the operating system was told which tiles come next.
+    announced_block: Option<u32>,
+    /// Data kept of each column, in the order of [`Container::places`].
     pub(super) kept: Vec<KeptColumn>,
-    /// The frame block that `staying` belongs to.
+    /// Frame block of the raw tiles in `raw_in_use`.
     entered: u32,
     /// Raw tiles in use, to be released when another frame block is entered.
-    staying: Touched,
+    raw_in_use: Touched,
     /// Tiles that have been decoded, to be released soon.
-    passing: Touched,
+    decoded: Touched,
 }
 
 impl<'a> TileReader<'a> {
+    /// Returns a reader of the Gaussians `ids`.
     pub(super) fn new(source: &'a Container, ids: &Ids<'_>) -> TileReader<'a> {
         let block = source.reader.layout().gaussian_block as usize;
         let mut runs: Vec<TileRun> = Vec::new();
@@ -84,7 +89,7 @@ impl<'a> TileReader<'a> {
                 _ => runs.push(TileRun { gaussian_block: tile, from, to, len: 1 }),
             }
         }
-        // Each tile is decoded once, in whatever order the Gaussians were asked for.
+        // Sorted, so that each tile is decoded once for Gaussians in any order.
         runs.sort_by_key(|run| run.gaussian_block);
         let whole = match runs[..] {
             [TileRun { gaussian_block, from: 0, len, .. }] => {
@@ -98,22 +103,23 @@ impl<'a> TileReader<'a> {
             len: ids.len(),
             runs,
             whole,
-            wanted: ReadPlan::every(),
-            told: None,
+            plan: ReadPlan::every(),
+            announced_block: None,
             kept: source.places.iter().map(|_| KeptColumn::Nothing).collect(),
             entered: 0,
-            staying: Touched::default(),
-            passing: Touched::default(),
+            raw_in_use: Touched::default(),
+            decoded: Touched::default(),
         }
     }
 
+    /// Returns the index of the frame block that contains `frame`.
     fn frame_block(&self, frame: usize) -> u32 {
         (frame / self.source.reader.layout().frame_block as usize) as u32
     }
 
     /// Writes column `index` at `frame` to `out`, `[width, len]`.
     fn read_column(&mut self, index: usize, frame: usize, out: &mut [f32]) -> Result<()> {
-        if !self.keep(index, frame)? {
+        if !self.try_keep(index, frame)? {
             return self.decode(index, &[frame], out);
         }
         match &mut self.kept[index] {
@@ -130,11 +136,11 @@ impl<'a> TileReader<'a> {
         Ok(())
     }
 
-    /// Sees to it that column `index` at `frame` is kept; gives false if keeping it is not worth it or it is held by the
-    /// container: then it goes where it is wanted by [`TileReader::decode`].
-    fn keep(&mut self, index: usize, frame: usize) -> Result<bool> {
+    /// Makes the reader keep column `index` at `frame`, if that is worth its memory. Returns false if it is not, or if
+    /// the container holds the tiles; [`TileReader::decode`] then writes the values to their destination.
+    fn try_keep(&mut self, index: usize, frame: usize) -> Result<bool> {
         let frame_block = self.frame_block(frame);
-        if self.hold(index, frame_block)? {
+        if self.try_hold(index, frame_block)? {
             return Ok(false);
         }
         match &self.kept[index] {
@@ -149,39 +155,39 @@ impl<'a> TileReader<'a> {
         let reader = &self.source.reader;
         let block = reader.layout().frame_range(frame_block, self.source.info.times.len() as u64);
         let block = block.start as usize..block.end as usize;
-        let mut frames = self.wanted.between(frame, block.end);
+        let mut frames = self.plan.between(frame, block.end);
         if frames.len() == 1 {
             return Ok(false);
         }
         if self.whole {
             let at = TileId { column: place, gaussian_block: self.runs[0].gaussian_block, frame_block };
             let raw = reader.tile_info(at)?.encoding == Encoding::Raw;
-            let all = self.wanted.held() >= block.len();
-            // Decompressed, a tile is as large as all of its frames.
+            let all = self.plan.held() >= block.len();
+            // A decompressed tile is as large as all of its frames.
             if raw || all && 2 * frames.len() > block.len() {
                 let mut tile = match std::mem::replace(&mut self.kept[index], KeptColumn::Nothing) {
                     KeptColumn::Tile(_, tile) => tile,
                     _ => TileFrames::default(),
                 };
-                // Releasing a raw tile frame by frame costs more than copying from the file does.
+                // Releasing a raw tile frame by frame costs more than copying from the file.
                 let touched = match (raw, all) {
-                    (true, true) => Some(&mut self.staying),
+                    (true, true) => Some(&mut self.raw_in_use),
                     (true, false) => None,
-                    (false, _) => Some(&mut self.passing),
+                    (false, _) => Some(&mut self.decoded),
                 };
                 reader.load(at, &mut self.source.scratch().buffer, &mut tile, touched)?;
                 self.kept[index] = KeptColumn::Tile(frame_block, tile);
                 return Ok(true);
             }
         }
-        if self.wanted.held() == 1 {
+        if self.plan.held() == 1 {
             return Ok(false);
         }
         let mut kept = match std::mem::replace(&mut self.kept[index], KeptColumn::Nothing) {
             KeptColumn::Values(kept) => kept,
             _ => FrameValues::default(),
         };
-        frames.truncate(self.wanted.held());
+        frames.truncate(self.plan.held());
         let constant = self.is_constant(place, frame_block)?;
         if constant {
             frames.truncate(1);
@@ -195,9 +201,9 @@ impl<'a> TileReader<'a> {
         Ok(true)
     }
 
-    /// Has the container hold all tiles of column `index` that are needed in a frame block, as far as it may; gives
-    /// whether it does.
-    fn hold(&self, index: usize, frame_block: u32) -> Result<bool> {
+    /// Makes the container hold all tiles of column `index` that are needed in a frame block. Returns whether it holds
+    /// them.
+    fn try_hold(&self, index: usize, frame_block: u32) -> Result<bool> {
         if self.source.held.get().is_none() {
             return Ok(false);
         }
@@ -211,7 +217,7 @@ impl<'a> TileReader<'a> {
         Ok(true)
     }
 
-    /// Whether no Gaussian's value changes within the frame block.
+    /// Returns whether no value of the column changes within the frame block.
     fn is_constant(&self, column: u32, frame_block: u32) -> Result<bool> {
         for run in &self.runs {
             let at = TileId { column, gaussian_block: run.gaussian_block, frame_block };
@@ -222,17 +228,18 @@ impl<'a> TileReader<'a> {
         Ok(true)
     }
 
-    /// Writes column `index` at `frames`, increasing and of one frame block, to `out`: `[frames, width, len]`.
+    /// Writes column `index` at `frames`, which are increasing and in one frame block, to `out`: `[frames, width,
+    /// len]`.
     fn decode(&mut self, index: usize, frames: &[usize], out: &mut [f32]) -> Result<()> {
         let (source, reader) = (self.source, &self.source.reader);
         let layout = reader.layout();
         let (column, place) = source.places[index];
         let width = column.width(source.info.sh_degree);
         let frame_block = self.frame_block(frames[0]);
-        // One frame of many is rather copied from the file than mapped and released.
+        // A single frame of many is copied from the file, which is cheaper than mapping and releasing its pages.
         let in_place = frames.len() > 1 || !source.info.varying.contains(column);
         let mut lent = source.scratch();
-        let TileScratch { buffer, frames: tile, plane: room } = &mut *lent;
+        let TileScratch { buffer, frames: tile, plane: plane_buffer } = &mut *lent;
         for runs in self.runs.chunk_by(|a, b| a.gaussian_block == b.gaussian_block) {
             let gaussian_block = runs[0].gaussian_block;
             let range = layout.gaussian_range(gaussian_block);
@@ -240,18 +247,18 @@ impl<'a> TileReader<'a> {
             let at = TileId { column: place, gaussian_block, frame_block };
             let held = source.held(index, at)?;
             if held.is_none() {
-                reader.load(at, buffer, tile, in_place.then_some(&mut self.passing))?;
+                reader.load(at, buffer, tile, in_place.then_some(&mut self.decoded))?;
             }
             for (&frame, out) in frames.iter().zip(out.chunks_exact_mut(width * self.len)) {
                 let within = frame % layout.frame_block as usize;
                 let plane = match held {
-                    // One frame stands for all of a constant tile.
+                    // A constant tile has one frame for all frames.
                     Some(values) => &values[(within * width * len) % values.len()..][..width * len],
                     None if self.whole => {
                         reader.read_frame(tile, within, out)?;
                         continue;
                     }
-                    None => reader.frame(tile, within, room)?,
+                    None => reader.frame(tile, within, plane_buffer)?,
                 };
                 for (from, to) in plane.chunks_exact(len).zip(out.chunks_exact_mut(self.len)) {
                     for run in runs {
@@ -259,15 +266,15 @@ impl<'a> TileReader<'a> {
                     }
                 }
             }
-            if self.passing.bytes() > TOUCHED {
-                reader.release(&mut self.passing);
+            if self.decoded.bytes() > MAX_TOUCHED_BYTES {
+                reader.release(&mut self.decoded);
             }
         }
         Ok(())
     }
 
-    /// Leaves the frame block before that of `frame`, if there was one: what was used of it in the map is released.
-    fn enter(&mut self, frame: usize) {
+    /// Releases the raw tiles of the previous frame block if `frame` belongs to another one.
+    fn enter_frame_block(&mut self, frame: usize) {
         let frame_block = self.frame_block(frame);
         if frame_block != self.entered {
             for kept in &mut self.kept {
@@ -275,29 +282,31 @@ impl<'a> TileReader<'a> {
                     *kept = KeptColumn::Nothing;
                 }
             }
-            self.source.reader.release(&mut self.staying);
+            self.source.reader.release(&mut self.raw_in_use);
             self.entered = frame_block;
         }
     }
 
-    /// Tells the system of the tiles of `want` that come next, once per frame block. A reader that decodes a block
-    /// again and again would have their bytes take the place of those it still needs.
-    fn tell(&mut self, frame: usize, want: Columns) {
+    /// Tells the operating system, once per frame block, which tiles of the columns `want` come next. Does nothing for
+    /// a reader that holds less than a frame block: it decodes a block several times, and read-ahead would evict pages
+    /// that it still needs.
+    fn announce_next_tiles(&mut self, frame: usize, want: Columns) {
         let (source, reader) = (self.source, &self.source.reader);
         let frame_block = self.frame_block(frame);
-        if self.told == Some(frame_block) || self.wanted.held() < reader.layout().frame_block as usize {
+        if self.announced_block == Some(frame_block) || self.plan.held() < reader.layout().frame_block as usize {
             return;
         }
-        let now = self.told.is_none().then_some((frame_block, want));
-        self.told = Some(frame_block);
+        let now = self.announced_block.is_none().then_some((frame_block, want));
+        self.announced_block = Some(frame_block);
         let end = reader.layout().frame_range(frame_block, self.source.info.times.len() as u64).end as usize;
-        let next = self.wanted.next(end).map(|next| (self.frame_block(next), want & source.info.varying));
+        let next = self.plan.next(end).map(|next| (self.frame_block(next), want & source.info.varying));
         for (frame_block, columns) in now.into_iter().chain(next) {
             let runs = self.runs.chunk_by(|a, b| a.gaussian_block == b.gaussian_block);
             reader.expect(runs.flat_map(|runs| source.unheld(columns, runs[0].gaussian_block, frame_block)));
         }
     }
 
+    /// Checks that there is a frame `frame`.
     fn check(&self, frame: usize) -> Result<()> {
         match frame < self.source.info.times.len() {
             true => Ok(()),
@@ -310,8 +319,8 @@ impl BlockReader for TileReader<'_> {
     fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
         self.check(frame)?;
         if self.len > 0 && !want.is_empty() {
-            self.tell(frame, want);
-            self.enter(frame);
+            self.announce_next_tiles(frame, want);
+            self.enter_frame_block(frame);
             self.source.states.add(self.len as u64);
         }
         for index in 0..self.kept.len() {
@@ -325,28 +334,28 @@ impl BlockReader for TileReader<'_> {
                 self.read_column(index, frame, target.planes_mut())?;
             }
         }
-        self.source.reader.release(&mut self.passing);
+        self.source.reader.release(&mut self.decoded);
         Ok(())
     }
 
-    fn expect(&mut self, wanted: &ReadPlan) {
-        self.wanted = wanted.clone();
+    fn expect(&mut self, plan: &ReadPlan) {
+        self.plan = plan.clone();
         self.kept.fill_with(|| KeptColumn::Nothing);
-        self.source.reader.release(&mut self.staying);
+        self.source.reader.release(&mut self.raw_in_use);
     }
 
     fn prepare(&mut self, frame: usize, want: Columns) -> Result<()> {
         self.check(frame)?;
         if self.len > 0 {
-            // Whoever prepares has what comes next brought.
-            self.told = Some(self.frame_block(frame));
-            self.enter(frame);
+            // The caller of `prepare` fetches the next tiles itself.
+            self.announced_block = Some(self.frame_block(frame));
+            self.enter_frame_block(frame);
             for index in 0..self.kept.len() {
                 if want.contains(self.source.places[index].0) {
-                    self.keep(index, frame)?;
+                    self.try_keep(index, frame)?;
                 }
             }
-            self.source.reader.release(&mut self.passing);
+            self.source.reader.release(&mut self.decoded);
         }
         Ok(())
     }
@@ -354,7 +363,7 @@ impl BlockReader for TileReader<'_> {
 
 impl Drop for TileReader<'_> {
     fn drop(&mut self) {
-        self.passing.append(&mut self.staying);
-        self.source.reader.release(&mut self.passing);
+        self.decoded.append(&mut self.raw_in_use);
+        self.source.reader.release(&mut self.decoded);
     }
 }

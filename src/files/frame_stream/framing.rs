@@ -1,36 +1,39 @@
-//! The fixed parts of a frame stream, bytes in, values out (format/STREAM.md).
+//! Conversion of the fixed parts of a frame stream between bytes and values (format/STREAM.md).
 
 use crate::error::quoted;
 use crate::model::{Columns, sh_coefficients};
 
-/// Every frame has the same Gaussians; or says itself how many it has.
+/// Versions of the format: in version 1 every frame has the same Gaussians, in version 2 every frame states their
+/// number.
 const VERSIONS: [u32; 2] = [1, 2];
-const FRAME: [u8; 4] = *b"FRAM";
-const END: [u8; 4] = *b"DONE";
+/// Mark before a frame.
+const FRAME_MAGIC: [u8; 4] = *b"FRAM";
+/// Mark at the end of the stream.
+const END_MAGIC: [u8; 4] = *b"DONE";
 
-/// What a stream says of itself before its first frame.
+/// Header of a stream, before its first frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct StreamHeader {
-    /// N, Gaussians in every frame; below 2³²; 0 of frames that do not know one another.
+    /// N, number of Gaussians in every frame; below 2³². 0 for unlinked frames.
     pub count: usize,
-    /// Degree of the spherical harmonics, 0 to 3.
+    /// SH degree, 0 to 3.
     pub sh_degree: usize,
-    /// Columns that come with every frame; the others come once.
+    /// Attributes that are stored with every frame; the others are stored once.
     pub varying: Columns,
-    /// Whether every frame says itself how many Gaussians it has, and nothing which is which (version 2).
+    /// Whether every frame states its number of Gaussians and Gaussians have no ids across frames (version 2).
     pub is_unlinked: bool,
 }
 
-/// What stands before the columns of a frame, or ends the stream.
+/// Mark before the attributes of a frame, or at the end of the stream.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum FrameMark {
-    /// A frame's number, time stamp and bytes.
+    /// Number of the frame, its time stamp and the length of its attributes in bytes.
     Frame { index: u32, time: f64, bytes: u64 },
-    /// Number of frames.
+    /// Number of frames in the stream.
     End(u32),
 }
 
-/// What is wrong with a field: its offset within its part, what it must be, what it is.
+/// Description of an illegal field: offset in bytes within its part, expected and found value.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Illegal {
     pub(crate) offset: u64,
@@ -39,24 +42,26 @@ pub(crate) struct Illegal {
     pub(crate) hint: &'static str,
 }
 
-/// Something else has written into the stream, or frames have another length than they say.
-const FOREIGN: &str = "whatever the exporter prints must go to standard error, never into the stream";
+/// Hint for errors that arise if other output got into the stream, or if frames have another length than stated.
+const FOREIGN_OUTPUT: &str = "whatever the exporter prints must go to standard error, never into the stream";
 
 impl StreamHeader {
+    /// Length of the header in bytes.
     pub(crate) const BYTES: usize = 32;
-    /// First bytes of every stream, chosen like the container's.
+    /// First bytes of every stream, chosen like those of the container.
     pub(crate) const MAGIC: [u8; 8] = *b"\x89GSTR\r\n\x1a";
 
-    /// Bytes of the columns of one frame, where all have the same Gaussians.
+    /// Returns the number of bytes of the varying attributes of one frame, if all frames have the same Gaussians.
     pub fn frame_bytes(&self) -> u64 {
         self.gaussian_bytes() * self.count as u64
     }
 
-    /// Bytes of what comes of a Gaussian with every frame.
+    /// Returns the number of bytes of one Gaussian in a frame.
     pub(crate) fn gaussian_bytes(&self) -> u64 {
         4 * self.varying.width(self.sh_degree) as u64
     }
 
+    /// Returns the header as stored.
     pub(crate) fn to_bytes(self) -> [u8; Self::BYTES] {
         let mut bytes = [0; Self::BYTES];
         bytes[..8].copy_from_slice(&Self::MAGIC);
@@ -67,12 +72,16 @@ impl StreamHeader {
         bytes
     }
 
+    /// Reads a header.
+    ///
+    /// # Errors
+    /// The first field that violates STREAM.md.
     pub(crate) fn from_bytes(bytes: &[u8; Self::BYTES]) -> Result<Self, Illegal> {
         let illegal = |offset, expected: &str, found: String, hint| {
             Err(Illegal { offset, expected: expected.to_owned(), found, hint })
         };
         if bytes[..8] != Self::MAGIC {
-            return illegal(0, "a frame stream (format/STREAM.md)", quoted(&shown(&bytes[..8])), FOREIGN);
+            return illegal(0, "a frame stream (format/STREAM.md)", quoted(&escaped(&bytes[..8])), FOREIGN_OUTPUT);
         }
         let version = u32_at(bytes, 8);
         if !VERSIONS.contains(&version) {
@@ -105,12 +114,14 @@ impl StreamHeader {
 }
 
 impl FrameMark {
+    /// Length of a mark in bytes.
     pub(crate) const BYTES: usize = 24;
 
+    /// Returns the mark as stored.
     pub(crate) fn to_bytes(self) -> [u8; Self::BYTES] {
         let (mark, index, time, length) = match self {
-            FrameMark::Frame { index, time, bytes } => (FRAME, index, time, bytes),
-            FrameMark::End(frames) => (END, frames, 0.0, 0),
+            FrameMark::Frame { index, time, bytes } => (FRAME_MAGIC, index, time, bytes),
+            FrameMark::End(frames) => (END_MAGIC, frames, 0.0, 0),
         };
         let mut bytes = [0; Self::BYTES];
         bytes[..4].copy_from_slice(&mark);
@@ -120,7 +131,11 @@ impl FrameMark {
         bytes
     }
 
-    /// The mark that follows `frames` complete frames, the last of them at time `before`, in a stream of `header`.
+    /// Reads the mark that follows `frames` complete frames, the last of them at time `before`, in a stream with
+    /// `header`.
+    ///
+    /// # Errors
+    /// The first field that violates STREAM.md.
     pub(crate) fn from_bytes(
         bytes: &[u8; Self::BYTES],
         header: &StreamHeader,
@@ -130,7 +145,7 @@ impl FrameMark {
         let illegal = |offset, expected: String, found: String, hint| Err(Illegal { offset, expected, found, hint });
         let index = u32_at(bytes, 4);
         match [bytes[0], bytes[1], bytes[2], bytes[3]] {
-            END => {
+            END_MAGIC => {
                 if index != frames {
                     let found = format!("an end mark after {index}");
                     return illegal(
@@ -145,7 +160,7 @@ impl FrameMark {
                 }
                 Ok(FrameMark::End(frames))
             }
-            FRAME => {
+            FRAME_MAGIC => {
                 let time = f64::from_bits(u64_at(bytes, 8));
                 let length = u64_at(bytes, 16);
                 if index != frames {
@@ -164,26 +179,28 @@ impl FrameMark {
                         && length / header.gaussian_bytes() <= u64::from(u32::MAX);
                     if !fits {
                         let expected = format!("bytes of fewer than 2^32 Gaussians, {} each", header.gaussian_bytes());
-                        return illegal(16, expected, format!("{length} bytes"), FOREIGN);
+                        return illegal(16, expected, format!("{length} bytes"), FOREIGN_OUTPUT);
                     }
                 } else if length != header.frame_bytes() {
                     return illegal(16, expected_length(header), found_length(header, length), SAME_IN_EVERY_FRAME);
                 }
                 Ok(FrameMark::Frame { index, time, bytes: length })
             }
-            _ => illegal(0, format!("frame {frames} or the end mark"), quoted(&shown(&bytes[..4])), FOREIGN),
+            _ => illegal(0, format!("frame {frames} or the end mark"), quoted(&escaped(&bytes[..4])), FOREIGN_OUTPUT),
         }
     }
 }
 
+/// Hint for frames of another length than the header states.
 const SAME_IN_EVERY_FRAME: &str = "every frame must hold the same Gaussians in the same columns";
 
+/// Returns the length of a frame by the header, for messages.
 fn expected_length(header: &StreamHeader) -> String {
     let names: Vec<&str> = header.varying.iter().map(Columns::name).collect();
     format!("{} bytes: {} Gaussians of {}", header.frame_bytes(), header.count, names.join(", "))
 }
 
-/// A length that is not the header's, read as what it would be: other Gaussians, or other columns.
+/// Describes a wrong frame length: as another number of Gaussians if it is a multiple, else as impossible.
 fn found_length(header: &StreamHeader, length: u64) -> String {
     let per_gaussian = 4 * header.varying.width(header.sh_degree) as u64;
     if length.checked_rem(per_gaussian) == Some(0) {
@@ -192,18 +209,20 @@ fn found_length(header: &StreamHeader, length: u64) -> String {
     format!("{length} bytes, which no number of Gaussians of these columns has")
 }
 
-/// Bytes for people: text as it is, anything else escaped.
-fn shown(bytes: &[u8]) -> String {
+/// Returns bytes as text for messages; bytes that are not printable ASCII are escaped.
+fn escaped(bytes: &[u8]) -> String {
     bytes.escape_ascii().to_string()
 }
 
+/// Returns the little-endian `u32` at byte `at`.
 fn u32_at(bytes: &[u8], at: usize) -> u32 {
     u32::from_le_bytes(std::array::from_fn(|i| bytes[at + i]))
 }
 
+/// Returns the little-endian `u64` at byte `at`.
 fn u64_at(bytes: &[u8], at: usize) -> u64 {
     u64::from_le_bytes(std::array::from_fn(|i| bytes[at + i]))
 }
 
-/// Values of the column set for one Gaussian cannot overflow a u64 with any legal header.
+/// Proves that the number of bytes of a frame fits into `u64` for every legal header.
 const _: () = assert!((u32::MAX as u64).checked_mul(4 * (11 + 3 * sh_coefficients(3)) as u64).is_some());

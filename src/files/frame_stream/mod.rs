@@ -1,8 +1,8 @@
-//! A frame stream, as another program pipes it in (format/STREAM.md).
+//! Reads a frame stream that another program writes to a pipe (format/STREAM.md).
 //!
-//! In: bytes from anywhere. Out: the columns that hold for all frames, then frame after frame. Memory: the constant
-//! columns and the frame that is read, both refused before they are read if they exceed the limit; nothing is allocated
-//! for more than 1 MiB beyond twice the bytes received.
+//! In: bytes from any source. Out: the attributes that are constant over all frames, then one frame after another.
+//! Memory: the constant attributes and the current frame; both are refused before they are read if they exceed the
+//! limit. At most 1 MiB is allocated beyond twice the bytes received.
 
 mod framing;
 #[cfg(test)]
@@ -17,13 +17,13 @@ use crate::model::{Column, Columns, Gaussians};
 pub use framing::StreamHeader;
 pub(crate) use framing::{FrameMark, Illegal};
 
-/// Least bytes to make room for at a time.
-const PIECE_BYTES: u64 = 1 << 20;
+/// Minimum number of bytes allocated at a time.
+const MIN_ALLOCATION_BYTES: u64 = 1 << 20;
 
-/// A stream whose header and constant columns have arrived.
+/// Stream whose header and constant attributes have arrived.
 #[derive(Debug)]
 pub struct FrameStream<R> {
-    bytes: Counted<R>,
+    bytes: CountingReader<R>,
     header: StreamHeader,
     constant: Gaussians,
     frames: u32,
@@ -32,25 +32,25 @@ pub struct FrameStream<R> {
     memory: ReadLimit,
 }
 
-/// A source of bytes with the number of those that have come.
+/// Source of bytes that counts the bytes received.
 #[derive(Debug)]
-struct Counted<R> {
+struct CountingReader<R> {
     from: R,
-    /// What messages call it.
+    /// Name of the stream in messages.
     name: PathBuf,
     received: u64,
 }
 
 impl<R: Read> FrameStream<R> {
-    /// Reads the header and the columns that hold for every frame. Messages call the stream `name`.
+    /// Reads the header and the attributes that are constant over all frames. Messages call the stream `name`.
     ///
     /// # Errors
-    /// A header that STREAM.md refuses; a stream that ends within; constant columns that exceed `memory`.
+    /// The header violates STREAM.md; the stream ends early; the constant attributes exceed `memory`.
     pub fn open(from: R, name: &Path, memory: ReadLimit) -> Result<FrameStream<R>> {
-        let mut bytes = Counted { from, name: name.to_owned(), received: 0 };
+        let mut bytes = CountingReader { from, name: name.to_owned(), received: 0 };
         let mut header = [0; StreamHeader::BYTES];
-        let got = bytes.fill(&mut header)?;
-        // What is no stream at all is better told by its first bytes than by its length.
+        let got = bytes.read_up_to(&mut header)?;
+        // If the first bytes are not those of a stream, the error names them instead of the missing length.
         if got < header.len() && (got == 0 || header[..got.min(8)] == StreamHeader::MAGIC[..got.min(8)]) {
             return Err(bytes.ended("the header of a frame stream", None));
         }
@@ -60,53 +60,53 @@ impl<R: Read> FrameStream<R> {
         let announced = 4 * columns.width(header.sh_degree) as u64 * header.count as u64;
         memory.check(name, "byte 16", &format!("the constant columns of {} Gaussians", header.count), announced)?;
         for column in columns.iter() {
-            if !bytes.column(header.count, constant.column_mut(column))? {
+            if !bytes.read_attribute(header.count, constant.column_mut(column))? {
                 return Err(bytes.ended(&format!("the constant column {}", column.name()), None));
             }
         }
         Ok(FrameStream { bytes, header, constant, frames: 0, last_time: None, ended: false, memory })
     }
 
-    /// What the stream said of itself.
+    /// Returns the header of the stream.
     pub fn header(&self) -> &StreamHeader {
         &self.header
     }
 
-    /// The columns that hold for every frame; the others are empty.
+    /// Returns the attributes that are constant over all frames; the others are empty.
     pub fn constant(&self) -> &Gaussians {
         &self.constant
     }
 
-    /// The columns that do not vary; [`FrameStream::constant`] has none afterwards.
+    /// Returns the constant attributes and leaves [`FrameStream::constant`] empty.
     pub fn take_constant(&mut self) -> Gaussians {
         std::mem::take(&mut self.constant)
     }
 
-    /// Bytes that have come so far.
+    /// Returns the number of bytes received so far.
     pub fn received(&self) -> u64 {
         self.bytes.received
     }
 
-    /// Reads the next frame: writes the columns that come with every frame into `out`, whose others are left
-    /// alone, and gives its time; none after the end mark.
+    /// Reads the next frame: writes the attributes that vary into `out`, leaves the others unchanged, and returns the
+    /// time of the frame; `None` after the end mark.
     ///
     /// # Errors
-    /// Everything STREAM.md calls one, with the frame and the byte; a frame that exceeds the memory limit; a failed
-    /// read. The stream is of no use afterwards.
+    /// Every violation of STREAM.md, with the frame and the byte; a frame that exceeds the memory limit; a failed read.
+    /// The stream cannot be used afterwards.
     pub fn next_frame(&mut self, out: &mut Gaussians) -> Result<Option<f64>> {
         if self.ended {
             return Ok(None);
         }
         let (start, frame) = (self.bytes.received, self.frames);
         let mut mark = [0; FrameMark::BYTES];
-        if self.bytes.fill(&mut mark)? < mark.len() {
+        if self.bytes.read_up_to(&mut mark)? < mark.len() {
             return Err(self.bytes.ended(&format!("frame {frame} or the end mark"), Some(frame)));
         }
         let mark = FrameMark::from_bytes(&mark, &self.header, frame, self.last_time)
             .map_err(|illegal| self.bytes.error(start, Some(frame), illegal))?;
         let FrameMark::Frame { time, bytes, .. } = mark else {
             self.ended = true;
-            return self.expect_nothing().map(|()| None);
+            return self.expect_end().map(|()| None);
         };
         self.memory.check(&self.bytes.name, &place(start + 16, Some(frame)), "one frame", bytes)?;
         let count = match self.header.is_unlinked {
@@ -114,7 +114,7 @@ impl<R: Read> FrameStream<R> {
             false => self.header.count,
         };
         for column in self.header.varying.iter() {
-            if !self.bytes.column(count, out.column_mut(column))? {
+            if !self.bytes.read_attribute(count, out.column_mut(column))? {
                 let expected = format!("the rest of frame {frame} (column {})", column.name());
                 return Err(self.bytes.ended(&expected, Some(frame)));
             }
@@ -127,10 +127,11 @@ impl<R: Read> FrameStream<R> {
         Ok(Some(time))
     }
 
-    fn expect_nothing(&mut self) -> Result<()> {
+    /// Checks that no bytes follow the end mark.
+    fn expect_end(&mut self) -> Result<()> {
         let mut more = [0];
         let place = format!("byte {}", self.bytes.received);
-        if self.bytes.fill(&mut more)? == 0 {
+        if self.bytes.read_up_to(&mut more)? == 0 {
             return Ok(());
         }
         Err(Error::input(&self.bytes.name, place, "nothing after the end mark", "more bytes")
@@ -138,9 +139,9 @@ impl<R: Read> FrameStream<R> {
     }
 }
 
-impl<R: Read> Counted<R> {
-    /// Reads until `into` is full or the stream ends; gives the number of bytes that came.
-    fn fill(&mut self, into: &mut [u8]) -> Result<usize> {
+impl<R: Read> CountingReader<R> {
+    /// Reads until `into` is full or the stream ends. Returns the number of bytes read.
+    fn read_up_to(&mut self, into: &mut [u8]) -> Result<usize> {
         let mut got = 0;
         while got < into.len() {
             match self.from.read(&mut into[got..]) {
@@ -154,47 +155,49 @@ impl<R: Read> Counted<R> {
         Ok(got)
     }
 
-    /// Reads a column of `len` Gaussians; whether all of it came.
-    fn column(&mut self, len: usize, column: &mut Column) -> Result<bool> {
+    /// Reads one attribute of `len` Gaussians. Returns false if the stream ends early.
+    fn read_attribute(&mut self, len: usize, column: &mut Column) -> Result<bool> {
         if column.len() != len {
-            let Some(planes) = self.grow(len * column.width())? else { return Ok(false) };
+            let Some(planes) = self.read_new_values(len * column.width())? else { return Ok(false) };
             *column = Column::from_planes(column.width(), planes);
             return Ok(true);
         }
-        self.values(column.planes_mut())
+        self.read_values(column.planes_mut())
     }
 
-    /// Reads `count` values for which there is no room yet; none if the stream ends before.
-    fn grow(&mut self, count: usize) -> Result<Option<Vec<f32>>> {
+    /// Reads `count` values into a buffer that grows with the bytes received. Returns `None` if the stream ends early.
+    fn read_new_values(&mut self, count: usize) -> Result<Option<Vec<f32>>> {
         let mut values: Vec<f32> = Vec::new();
         while values.len() < count {
             let start = values.len();
-            let more = (self.received.max(PIECE_BYTES) / 4).min((count - start) as u64) as usize;
+            let more = (self.received.max(MIN_ALLOCATION_BYTES) / 4).min((count - start) as u64) as usize;
             values.reserve_exact(more);
             values.resize(start + more, 0.0);
-            if !self.values(&mut values[start..])? {
+            if !self.read_values(&mut values[start..])? {
                 return Ok(None);
             }
         }
         Ok(Some(values))
     }
 
-    fn values(&mut self, values: &mut [f32]) -> Result<bool> {
+    /// Reads little-endian values until `values` is full. Returns false if the stream ends early.
+    fn read_values(&mut self, values: &mut [f32]) -> Result<bool> {
         let bytes: &mut [u8] = bytemuck::cast_slice_mut(values);
         let expected = bytes.len();
-        let all = self.fill(bytes)? == expected;
+        let all = self.read_up_to(bytes)? == expected;
         for value in values {
             *value = f32::from_bits(u32::from_le(value.to_bits()));
         }
         Ok(all)
     }
 
+    /// Returns the error for an illegal field of the part that begins at byte `start`.
     fn error(&self, start: u64, frame: Option<u32>, illegal: Illegal) -> Error {
         let Illegal { offset, expected, found, hint } = illegal;
         Error::input(&self.name, place(start + offset, frame), expected, found).hint(hint)
     }
 
-    /// The stream ended where `expected` should have come, after `frames` complete ones.
+    /// Returns the error for a stream that ended before `expected` arrived, after `frames` complete frames.
     fn ended(&self, expected: &str, frames: Option<u32>) -> Error {
         let found = match frames {
             None => "the end of the stream, before its first frame".to_owned(),
@@ -204,10 +207,11 @@ impl<R: Read> Counted<R> {
             }
         };
         Error::input(&self.name, place(self.received, frames), expected, found)
-            .hint("the exporter stopped early; what it says on standard error tells why")
+            .hint("the exporter stopped early; its messages on standard error may tell why")
     }
 }
 
+/// Returns the place of a byte in messages.
 fn place(byte: u64, frame: Option<u32>) -> String {
     frame.map_or(format!("byte {byte}"), |frame| format!("frame {frame}, byte {byte}"))
 }

@@ -6,7 +6,7 @@ use crate::source::{FrameSource, Ids};
 const N: usize = 150;
 const T: usize = 4;
 
-/// Bytes of a small scene as a stream, and where each of its frames starts.
+/// Returns a small scene, its bytes as a stream, and the offset of each of its frames.
 fn written() -> (Scene, Vec<u8>, Vec<usize>) {
     let scene = Scene::new(N, T);
     let info = scene.info();
@@ -23,6 +23,7 @@ fn written() -> (Scene, Vec<u8>, Vec<usize>) {
     (scene, bytes, (0..=T).map(|t| first + t * frame).collect())
 }
 
+/// Returns the frame states of the scene.
 fn states(scene: &Scene) -> Vec<Gaussians> {
     let mut reader = scene.open(Ids::Range(0..N)).unwrap();
     (0..T)
@@ -34,7 +35,7 @@ fn states(scene: &Scene) -> Vec<Gaussians> {
         .collect()
 }
 
-/// Frames of a stream with all their columns, and their times.
+/// Returns the frames of a stream with all their attributes, and their times.
 fn read(bytes: impl Read) -> Result<Vec<(f64, Gaussians)>> {
     let mut stream = FrameStream::open(bytes, Path::new("test"), ReadLimit::NONE)?;
     let mut state = stream.constant().clone();
@@ -46,16 +47,17 @@ fn read(bytes: impl Read) -> Result<Vec<(f64, Gaussians)>> {
     Ok(frames)
 }
 
+/// Returns the error message for a stream.
 fn refusal(bytes: &[u8]) -> String {
     let error = read(bytes).unwrap_err();
     assert!(matches!(error, Error::Input(_)), "{error}");
     error.to_string()
 }
 
-/// Gives a few bytes at a time, as pipes do.
-struct Drips<'a>(&'a [u8], usize);
+/// Reader that returns a few bytes at a time, as pipes do, and is interrupted now and then.
+struct SlowReader<'a>(&'a [u8], usize);
 
-impl Read for Drips<'_> {
+impl Read for SlowReader<'_> {
     fn read(&mut self, into: &mut [u8]) -> std::io::Result<usize> {
         self.1 = self.1 % 7 + 1;
         if self.1 == 3 {
@@ -67,15 +69,15 @@ impl Read for Drips<'_> {
 }
 
 #[test]
-fn what_is_written_is_read_bit_for_bit_however_it_drips() {
+fn streams_are_read_bit_for_bit_in_pieces_of_any_size() {
     let (scene, bytes, _) = written();
     let expected: Vec<(f64, Gaussians)> = scene.info().times.iter().copied().zip(states(&scene)).collect();
     assert_eq!(read(&bytes[..]).unwrap(), expected);
-    assert_eq!(read(Drips(&bytes, 0)).unwrap(), expected);
+    assert_eq!(read(SlowReader(&bytes, 0)).unwrap(), expected);
 }
 
 #[test]
-fn odd_bits_and_columns_that_all_vary_or_none_survive() {
+fn nan_bits_and_any_set_of_varying_attributes_survive() {
     for varying in [Columns::empty(), Columns::all(), Columns::SH] {
         let mut state = Gaussians::zeros(2, 0);
         for (i, bits) in [0x7fc0_1234, 0x8000_0000, 0xff80_0000, 1].into_iter().enumerate() {
@@ -94,7 +96,7 @@ fn odd_bits_and_columns_that_all_vary_or_none_survive() {
 }
 
 #[test]
-fn no_gaussians_and_no_frames_are_a_stream() {
+fn a_stream_may_have_no_gaussians_or_no_frames() {
     let header = StreamHeader { count: 0, sh_degree: 3, varying: Columns::POSITION, is_unlinked: false };
     for frames in [0, 2] {
         let state = Gaussians::zeros(0, 3);
@@ -108,7 +110,7 @@ fn no_gaussians_and_no_frames_are_a_stream() {
 }
 
 #[test]
-fn a_stream_cut_anywhere_is_refused_with_the_number_of_its_complete_frames() {
+fn truncated_streams_name_the_number_of_complete_frames() {
     let (_, bytes, starts) = written();
     for cut in (0..bytes.len()).step_by(97).chain(starts.iter().copied()).chain([bytes.len() - 1]) {
         let message = refusal(&bytes[..cut]);
@@ -123,15 +125,15 @@ fn a_stream_cut_anywhere_is_refused_with_the_number_of_its_complete_frames() {
     }
 }
 
-/// The stream with bytes of its `frame`-th mark replaced.
-fn with(frame: usize, offset: usize, field: &[u8]) -> Vec<u8> {
+/// Returns the stream with bytes of the mark of frame `frame` replaced.
+fn with_mark_bytes(frame: usize, offset: usize, field: &[u8]) -> Vec<u8> {
     let (_, mut bytes, starts) = written();
     bytes[starts[frame] + offset..][..field.len()].copy_from_slice(field);
     bytes
 }
 
 #[test]
-fn every_illegal_field_is_named_with_its_frame_and_byte() {
+fn illegal_fields_are_named_with_frame_and_byte() {
     let (_, bytes, starts) = written();
     let frame = starts[1] - starts[0] - FrameMark::BYTES;
     let header = |offset: usize, field: &[u8]| {
@@ -148,16 +150,16 @@ fn every_illegal_field_is_named_with_its_frame_and_byte() {
         (header(20, &[1]), "byte 16".into(), "fewer than 2^32"),
         (header(24, &[32]), "byte 24".into(), "0x20"),
         (header(28, &[1]), "byte 28".into(), "reserved"),
-        (with(2, 0, b"step"), at(2, 0), "step"),
-        (with(2, 4, &[1]), at(2, 4), "expected frame 2, found frame 1"),
-        (with(1, 4, &[3]), at(1, 4), "expected frame 1, found frame 3"),
-        (with(1, 8, &f64::NAN.to_le_bytes()), at(1, 8), "NaN"),
-        (with(2, 8, &(1.0f64 / 3.0).to_le_bytes()), at(2, 8), "above 0.333"),
-        (with(2, 8, &(-1.0f64).to_le_bytes()), at(2, 8), "found -1"),
-        (with(1, 16, &(frame as u64 + 32).to_le_bytes()), at(1, 16), "as 151 Gaussians have"),
-        (with(1, 16, &(frame as u64 + 12).to_le_bytes()), at(1, 16), "no number of Gaussians"),
-        (with(T, 4, &[3]), at(T, 4), "4 frames, which arrived"),
-        (with(T, 12, &[3]), at(T, 8), "reserved"),
+        (with_mark_bytes(2, 0, b"step"), at(2, 0), "step"),
+        (with_mark_bytes(2, 4, &[1]), at(2, 4), "expected frame 2, found frame 1"),
+        (with_mark_bytes(1, 4, &[3]), at(1, 4), "expected frame 1, found frame 3"),
+        (with_mark_bytes(1, 8, &f64::NAN.to_le_bytes()), at(1, 8), "NaN"),
+        (with_mark_bytes(2, 8, &(1.0f64 / 3.0).to_le_bytes()), at(2, 8), "above 0.333"),
+        (with_mark_bytes(2, 8, &(-1.0f64).to_le_bytes()), at(2, 8), "found -1"),
+        (with_mark_bytes(1, 16, &(frame as u64 + 32).to_le_bytes()), at(1, 16), "as 151 Gaussians have"),
+        (with_mark_bytes(1, 16, &(frame as u64 + 12).to_le_bytes()), at(1, 16), "no number of Gaussians"),
+        (with_mark_bytes(T, 4, &[3]), at(T, 4), "4 frames, which arrived"),
+        (with_mark_bytes(T, 12, &[3]), at(T, 8), "reserved"),
     ];
     for (bytes, place, part) in cases {
         let message = refusal(&bytes);
@@ -166,7 +168,7 @@ fn every_illegal_field_is_named_with_its_frame_and_byte() {
 }
 
 #[test]
-fn frames_swapped_lost_or_repeated_are_refused() {
+fn swapped_lost_or_repeated_frames_are_refused() {
     let (_, bytes, starts) = written();
     let part = |from: usize, to: usize| &bytes[starts[from]..starts[to]];
     let (head, end) = (&bytes[..starts[0]], &bytes[starts[T]..]);
@@ -183,7 +185,7 @@ fn frames_swapped_lost_or_repeated_are_refused() {
 }
 
 #[test]
-fn text_printed_into_a_frame_or_after_the_end_is_found() {
+fn text_printed_into_the_stream_is_refused() {
     let (_, bytes, starts) = written();
     let mut within = bytes.clone();
     within.splice(starts[1] + 100..starts[1] + 100, *b"epoch 7\n");
@@ -194,8 +196,8 @@ fn text_printed_into_a_frame_or_after_the_end_is_found() {
 }
 
 #[test]
-fn a_header_that_promises_too_much_costs_no_memory() {
-    // 2³² − 1 Gaussians of which nothing comes: 240 GiB if they were believed.
+fn a_huge_count_in_the_header_allocates_no_memory() {
+    // The header states 2³² − 1 Gaussians, 240 GiB, but no data follows.
     let header =
         StreamHeader { count: u32::MAX as usize, sh_degree: 3, varying: Columns::POSITION, is_unlinked: false };
     let message = refusal(&[&header.to_bytes()[..], &[0; 5000]].concat());
@@ -203,7 +205,7 @@ fn a_header_that_promises_too_much_costs_no_memory() {
 }
 
 #[test]
-fn the_writer_refuses_what_a_reader_would() {
+fn the_writer_refuses_illegal_frames() {
     let header = StreamHeader { count: 3, sh_degree: 0, varying: Columns::POSITION, is_unlinked: false };
     let state = Gaussians::zeros(3, 0);
     let mut stream = StreamWriter::new(Vec::new(), Path::new("test"), header, &state).unwrap();

@@ -1,7 +1,7 @@
-//! Pictures as files: what a screen shows, or the very values.
+//! Writes renders as image files: 8-bit as shown on a screen, or the exact values.
 //!
-//! In: an [`Image`]. Out: an 8-bit RGB `.png`, or a `.npy` of float32 `[height, width, 3]`, not clamped; for pages a JPEG.
-//! Memory: for a PNG or JPEG 3 bytes per pixel, for an array none of its own.
+//! In: an [`Image`]. Out: an 8-bit RGB `.png`, or a `.npy` of float32 `[height, width, 3]`, not clamped; for HTML pages
+//! a JPEG. Memory: 3 bytes per pixel for a PNG or JPEG, no extra memory for an array.
 
 use std::fs::File;
 use std::io::{self, BufWriter, Write};
@@ -14,7 +14,7 @@ use npyz::{WriteOptions, WriterBuilder};
 use crate::error::{Error, Result};
 use crate::render::Image;
 
-/// How a picture is stored.
+/// File format of an image.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ImageFormat {
     /// 8 bits per channel, clamped.
@@ -24,7 +24,7 @@ pub enum ImageFormat {
 }
 
 impl ImageFormat {
-    /// The end of a file's name, which is also how its format is recognized.
+    /// Returns the extension of file names, by which the format is also recognized.
     pub fn extension(self) -> &'static str {
         match self {
             ImageFormat::Png => "png",
@@ -32,7 +32,7 @@ impl ImageFormat {
         }
     }
 
-    /// The format a file's name asks for, in letters of either case.
+    /// Returns the format for the extension of a file name, ignoring case; `None` for other extensions.
     pub fn from_path(path: &Path) -> Option<ImageFormat> {
         let extension = path.extension()?;
         [ImageFormat::Png, ImageFormat::Npy]
@@ -44,22 +44,23 @@ impl ImageFormat {
 /// Writes `image` to `path`.
 ///
 /// # Errors
-/// A failed write; a PNG without pixels, which the format does not know.
+/// The file cannot be written; a PNG has no pixels, which the format does not allow.
 pub fn write_image(image: &Image, format: ImageFormat, path: &Path) -> Result<()> {
     let mut out = BufWriter::new(File::create(path).map_err(Error::io("create", path))?);
     write(&mut out, image, format).and_then(|()| out.flush()).map_err(Error::io("write", path))
 }
 
-/// The bytes that [`write_image`] writes.
+/// Returns the bytes that [`write_image`] writes.
 ///
 /// # Errors
-/// A PNG without pixels, which the format does not know.
+/// A PNG has no pixels, which the format does not allow.
 pub fn image_bytes(image: &Image, format: ImageFormat) -> io::Result<Vec<u8>> {
     let mut out = Vec::new();
     write(&mut out, image, format)?;
     Ok(out)
 }
 
+/// Writes `image` in `format` to `out`.
 fn write(out: &mut impl Write, image: &Image, format: ImageFormat) -> io::Result<()> {
     match format {
         ImageFormat::Png => write_png(out, image),
@@ -67,32 +68,33 @@ fn write(out: &mut impl Write, image: &Image, format: ImageFormat) -> io::Result
     }
 }
 
+/// Writes an 8-bit RGB PNG.
 fn write_png(out: &mut impl Write, image: &Image) -> io::Result<()> {
     let mut encoder = png::Encoder::new(out, image.width, image.height);
     encoder.set_color(png::ColorType::Rgb);
     encoder.set_depth(png::BitDepth::Eight);
-    let mut writer = encoder.write_header().map_err(of_png)?;
-    writer.write_image_data(&rgb(image)).map_err(of_png)?;
-    writer.finish().map_err(of_png)
+    let mut writer = encoder.write_header().map_err(png_error_to_io)?;
+    writer.write_image_data(&rgb(image)).map_err(png_error_to_io)?;
+    writer.finish().map_err(png_error_to_io)
 }
 
-/// A failure of the system as it was, by which a full disk is known.
-pub(crate) fn of_png(error: png::EncodingError) -> io::Error {
+/// Converts a PNG error. I/O errors are passed on unchanged, so that callers can recognize a full disk.
+pub(crate) fn png_error_to_io(error: png::EncodingError) -> io::Error {
     match error {
         png::EncodingError::IoError(error) => error,
         other => other.into(),
     }
 }
 
-/// What a screen shows, 8 bits a channel.
+/// Returns the pixels with 8 bits per channel, clamped to [0, 1].
 pub(crate) fn rgb(image: &Image) -> Vec<u8> {
     image.data.iter().map(|&value| byte(value)).collect()
 }
 
-/// A JPEG of `quality` from 1 to 100, for pages that hold many pictures.
+/// Returns a JPEG of `quality` from 1 to 100, for pages that hold many renders.
 ///
 /// # Errors
-/// A picture without pixels, or of more than 65535 each way.
+/// The image has no pixels, or more than 65535 along a side.
 pub fn jpeg_bytes(image: &Image, quality: u8) -> io::Result<Vec<u8>> {
     let mut out = Vec::new();
     let mut encoder = JpegEncoder::new_with_quality(&mut out, quality);
@@ -100,11 +102,12 @@ pub fn jpeg_bytes(image: &Image, quality: u8) -> io::Result<Vec<u8>> {
     Ok(out)
 }
 
-/// The nearest of the 256 steps from 0 to 1, halves upward; NaN is 0.
+/// Returns the nearest of 256 steps from 0 to 1, rounding halves up; NaN gives 0.
 fn byte(value: f32) -> u8 {
     (value.clamp(0.0, 1.0) * 255.0).round() as u8
 }
 
+/// Writes a float32 array `[height, width, 3]`.
 fn write_npy(out: &mut impl Write, image: &Image) -> io::Result<()> {
     let shape = [u64::from(image.height), u64::from(image.width), 3];
     let mut array = WriteOptions::<f32>::new().default_dtype().shape(&shape).writer(out).begin_nd()?;
@@ -128,7 +131,7 @@ mod tests {
     }
 
     #[test]
-    fn an_array_keeps_values_that_no_screen_shows() {
+    fn an_array_keeps_values_outside_zero_to_one() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("x.npy");
         let image = Image { width: 2, height: 1, data: vec![-1.0, 0.25, 7.5, 1e-30, 0.0, 1.0] };
@@ -139,7 +142,7 @@ mod tests {
     }
 
     #[test]
-    fn a_name_says_the_format() {
+    fn the_extension_gives_the_format() {
         assert_eq!(ImageFormat::from_path(Path::new("a/x.PNG")), Some(ImageFormat::Png));
         assert_eq!(ImageFormat::from_path(Path::new("x.npy")), Some(ImageFormat::Npy));
         assert_eq!(ImageFormat::from_path(Path::new("x.jpg")), None);

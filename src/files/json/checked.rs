@@ -1,4 +1,4 @@
-//! The bytes of a JSON file, checked before the parser sees them.
+//! Checks of the bytes of a JSON file before the parser sees them.
 
 use std::io::{Error as IoError, ErrorKind, Read, Result as IoResult};
 use std::path::{Path, PathBuf};
@@ -6,38 +6,38 @@ use std::path::{Path, PathBuf};
 use crate::error::Error;
 use crate::files::text::{not_utf_8, without_mark};
 
-/// Bytes that are read and checked together.
+/// Number of bytes that are read and checked together.
 const BUFFER: usize = 1 << 16;
-/// Maximum number of bytes of a text, quotes excluded.
+/// Maximum length of a string in bytes, without quotes.
 const MAX_TEXT: u32 = 1 << 20;
-/// Maximum number of bytes of a number.
+/// Maximum length of a number in bytes.
 const MAX_NUMBER: u32 = 1 << 10;
 /// Maximum nesting depth of lists and objects.
 const MAX_DEPTH: u32 = 64;
 
-/// What the byte before belongs to.
+/// Token that the previous byte belongs to.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Token {
     None,
     Text,
-    /// The byte after a backslash.
+    /// Backslash in a string; the next byte is escaped.
     Escape,
-    /// A number or a word.
+    /// Number or keyword.
     Word,
 }
 
-/// A reader of UTF-8 text that is refused where it is not, and where a text, a number or the nesting is beyond the limits.
+/// Reader that passes on UTF-8 text and fails for other bytes and for strings, numbers or nesting beyond the limits.
 #[derive(Debug)]
-pub(super) struct Checked<R> {
+pub(super) struct CheckedReader<R> {
     file: R,
     path: PathBuf,
     buffer: Vec<u8>,
-    /// Part of the buffer that the parser has taken, and part that has been checked.
+    /// Number of buffer bytes that the parser has taken, and number that have been checked.
     taken: usize,
     checked: usize,
-    /// Part of the buffer that holds bytes: behind what is checked up to 3 bytes of a character that goes on.
+    /// Number of buffer bytes that were read. Up to 3 bytes of an incomplete character may follow the checked ones.
     filled: usize,
-    /// Place in the file of the first byte of the buffer.
+    /// Offset in the file of the first byte of the buffer.
     start: u64,
     is_begun: bool,
     is_blank: bool,
@@ -47,9 +47,10 @@ pub(super) struct Checked<R> {
     refusal: Option<Error>,
 }
 
-impl<R: Read> Checked<R> {
-    pub(super) fn new(file: R, path: &Path) -> Checked<R> {
-        Checked {
+impl<R: Read> CheckedReader<R> {
+    /// Starts a checked reader of `file`; `path` names it in messages.
+    pub(super) fn new(file: R, path: &Path) -> CheckedReader<R> {
+        CheckedReader {
             file,
             path: path.to_owned(),
             buffer: vec![0; BUFFER],
@@ -66,17 +67,18 @@ impl<R: Read> Checked<R> {
         }
     }
 
-    /// Returns the error by which the text was refused, if it was.
+    /// Returns the error that ended the reading, if there was one.
     pub(super) fn refusal(&mut self) -> Option<Error> {
         self.refusal.take()
     }
 
-    /// Whether there was nothing but white space.
+    /// Returns whether the text so far is only white space.
     pub(super) fn is_blank(&self) -> bool {
         self.is_blank
     }
 
-    /// Bytes from the last two on that the parser has taken.
+    /// Returns bytes around the parser's position: the last two it has taken and at least 14 following ones, if there
+    /// are any.
     pub(super) fn around(&mut self) -> Vec<u8> {
         let mut around = self.buffer[self.taken.saturating_sub(2)..self.checked].to_vec();
         if around.len() < 16 && self.fill().is_ok() {
@@ -85,7 +87,7 @@ impl<R: Read> Checked<R> {
         around
     }
 
-    /// Replaces the bytes that were taken by the next ones.
+    /// Replaces the checked bytes of the buffer by the next ones of the file.
     fn fill(&mut self) -> IoResult<()> {
         if self.refusal.is_some() {
             return Err(ErrorKind::InvalidData.into());
@@ -94,7 +96,7 @@ impl<R: Read> Checked<R> {
         self.start += self.checked as u64;
         self.filled -= self.checked;
         (self.taken, self.checked) = (0, 0);
-        // More than once where few bytes come at a time: a mark at the beginning has three, a character up to four.
+        // Read more than once if few bytes come at a time: a byte order mark has three bytes, a character up to four.
         loop {
             let count = match self.file.read(&mut self.buffer[self.filled..]) {
                 Err(error) if error.kind() == ErrorKind::Interrupted => continue,
@@ -124,17 +126,18 @@ impl<R: Read> Checked<R> {
         }
     }
 
-    /// Keeps the error for the byte at `at` of the buffer.
+    /// Stores the error for the byte at index `at` of the buffer. Fails at once if the parser has taken all bytes
+    /// before it.
     fn refuse(&mut self, at: usize, error: Error) -> IoResult<()> {
         self.refusal = Some(error);
-        // What comes before is still the parser's: it may be wrong earlier.
+        // Pass on the bytes before it first: they may hold an earlier error for the parser to report.
         match at > self.taken {
             true => Ok(()),
             false => Err(ErrorKind::InvalidData.into()),
         }
     }
 
-    /// Checks the bytes that came in; `is_end`: there are no more.
+    /// Checks the bytes that were read; `is_end` says that no more will follow.
     fn check(&mut self, is_end: bool) -> IoResult<()> {
         let from = self.checked;
         let bad = match str::from_utf8(&self.buffer[from..self.filled]) {
@@ -160,7 +163,7 @@ impl<R: Read> Checked<R> {
         }
     }
 
-    /// Goes one byte on; returns what was expected where that is beyond a limit.
+    /// Advances the state by one byte. Returns a description of the limit if the byte exceeds one.
     fn step(&mut self, byte: u8) -> Option<String> {
         if self.is_blank && !byte.is_ascii_whitespace() {
             self.is_blank = false;
@@ -204,7 +207,7 @@ impl<R: Read> Checked<R> {
     }
 }
 
-impl<R: Read> Read for Checked<R> {
+impl<R: Read> Read for CheckedReader<R> {
     #[inline]
     fn read(&mut self, out: &mut [u8]) -> IoResult<usize> {
         if self.taken == self.checked {

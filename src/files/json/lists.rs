@@ -1,4 +1,4 @@
-//! The elements of lists in a JSON document, one at a time.
+//! Streaming reader of the elements of lists in a JSON document.
 
 use std::fmt;
 use std::io::Read;
@@ -11,41 +11,41 @@ use super::{Stopped, read, read_from};
 use crate::error::Result;
 use crate::files::open::open_file;
 
-/// Place of a value in a document.
+/// Position of a value in a document.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct JsonPlace {
-    /// Index of the key among those asked for; 0 for a document that is a list itself.
+    /// Index of its key in [`Ask::keys`]; 0 if the document itself is the list.
     pub(crate) key: usize,
-    /// Index in the list. Index 0 comes again where a key is repeated: the last list counts.
+    /// Index in the list. Restarts at 0 if a key is repeated; the last list counts.
     pub(crate) index: usize,
-    /// Index in the list within the list. `None`: that list is over, and the value is an empty one; or it is no list, and
-    /// the value is what is there instead.
+    /// Index in the inner list. `None` in two cases: at the end of an inner list, with an empty list as value; or if
+    /// the element is not a list, with the element as value.
     pub(crate) inner: Option<usize>,
 }
 
-/// What is read of a document.
+/// Selection of values to read from a document.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Ask<'a> {
-    /// Keys of an object under which the lists are; none: the document is the list.
+    /// Keys of the object under which the lists are; empty if the document itself is the list.
     pub(crate) keys: &'a [&'a str],
-    /// Whether the elements of the lists are lists themselves, whose elements are meant.
+    /// Whether the elements of the lists are lists whose elements are wanted.
     pub(crate) nested: bool,
     /// Keys of the elements that are kept.
     pub(crate) wanted: &'a [&'a str],
 }
 
-/// Hands the elements of the lists that `ask` names in the file at `path` to `each`.
+/// Calls `each` with the elements of the lists selected by `ask` in the file at `path`.
 ///
 /// # Errors
-/// Those of `each` and of [`read`].
+/// Fails if `each` fails, and like [`read`].
 pub(crate) fn each_element(path: &Path, ask: Ask<'_>, each: impl FnMut(JsonPlace, Small) -> Result<()>) -> Result<()> {
     each_in(open_file(path)?, path, ask, each)
 }
 
-/// Hands the elements of the lists that `ask` names in the document that `file` holds to `each`.
+/// Calls `each` with the elements of the lists selected by `ask` in the document in `file`.
 ///
 /// # Errors
-/// Those of `each` and of [`read`].
+/// Fails if `each` fails, and like [`read`].
 pub(crate) fn each_in(
     file: impl Read,
     path: &Path,
@@ -57,23 +57,24 @@ pub(crate) fn each_in(
     read_from(file, path, &stopped, Document(&mut lists))
 }
 
-/// Hands the entries of the object in the file at `path` to `each`, in order; nothing of another document. `wanted`: keys
-/// of the values that are kept.
+/// Calls `each` with the entries of the object in the file at `path`, in order; does not call it if the document is not
+/// an object. `wanted`: keys of the values that are kept.
 ///
 /// # Errors
-/// Those of `each` and of [`read`].
+/// Fails if `each` fails, and like [`read`].
 pub(crate) fn each_entry(path: &Path, wanted: &[&str], mut each: impl FnMut(&str, Small) -> Result<()>) -> Result<()> {
     let stopped = Stopped::default();
     read(path, &stopped, Entries { wanted, each: &mut each, stopped: &stopped })
 }
 
+/// State of a reading: the selection, the callback and the slot for its error.
 struct Lists<'a> {
     ask: Ask<'a>,
     each: &'a mut dyn FnMut(JsonPlace, Small) -> Result<()>,
     stopped: &'a Stopped,
 }
 
-/// Visits of values that are not asked for.
+/// Visitor methods that ignore values that were not selected.
 macro_rules! ignore_scalars {
     () => {
         fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -106,7 +107,8 @@ macro_rules! ignore_scalars {
     };
 }
 
-macro_rules! any {
+/// Implements [`DeserializeSeed`] for a visitor that accepts any value.
+macro_rules! seed_from_visitor {
     ($type:ty) => {
         impl<'de> DeserializeSeed<'de> for $type {
             type Value = ();
@@ -118,9 +120,9 @@ macro_rules! any {
     };
 }
 
-/// A document that holds lists.
+/// Visitor of a document that holds lists.
 struct Document<'a, 'b>(&'a mut Lists<'b>);
-any!(Document<'_, '_>);
+seed_from_visitor!(Document<'_, '_>);
 
 impl<'de> Visitor<'de> for Document<'_, '_> {
     type Value = ();
@@ -144,12 +146,12 @@ impl<'de> Visitor<'de> for Document<'_, '_> {
     }
 }
 
-/// A list that is asked for.
+/// Visitor of a selected list.
 struct List<'a, 'b> {
     lists: &'a mut Lists<'b>,
     key: usize,
 }
-any!(List<'_, '_>);
+seed_from_visitor!(List<'_, '_>);
 
 impl<'de> Visitor<'de> for List<'_, '_> {
     type Value = ();
@@ -160,7 +162,7 @@ impl<'de> Visitor<'de> for List<'_, '_> {
         for index in 0.. {
             let at = JsonPlace { key: self.key, index, inner: None };
             let value = match ask.nested {
-                true => list.next_element_seed(Within { lists: self.lists, at })?,
+                true => list.next_element_seed(InnerList { lists: self.lists, at })?,
                 false => list.next_element_seed(Keep { wanted: ask.wanted, elements: MAX_ELEMENTS })?,
             };
             let Some(value) = value else { break };
@@ -174,13 +176,13 @@ impl<'de> Visitor<'de> for List<'_, '_> {
     }
 }
 
-/// An element of a list that should be a list itself. Its value is what it is, without its elements.
-struct Within<'a, 'b> {
+/// Visitor of an element that should be a list itself. Its own value is a description without its elements.
+struct InnerList<'a, 'b> {
     lists: &'a mut Lists<'b>,
     at: JsonPlace,
 }
 
-impl<'de> DeserializeSeed<'de> for Within<'_, '_> {
+impl<'de> DeserializeSeed<'de> for InnerList<'_, '_> {
     type Value = Small;
 
     fn deserialize<D: Deserializer<'de>>(self, from: D) -> std::result::Result<Small, D::Error> {
@@ -188,7 +190,7 @@ impl<'de> DeserializeSeed<'de> for Within<'_, '_> {
     }
 }
 
-impl<'de> Visitor<'de> for Within<'_, '_> {
+impl<'de> Visitor<'de> for InnerList<'_, '_> {
     type Value = Small;
 
     fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -235,13 +237,13 @@ impl<'de> Visitor<'de> for Within<'_, '_> {
     }
 }
 
-/// An object whose entries are asked for.
+/// Visitor of an object whose entries are selected.
 struct Entries<'a> {
     wanted: &'a [&'a str],
     each: &'a mut dyn FnMut(&str, Small) -> Result<()>,
     stopped: &'a Stopped,
 }
-any!(Entries<'_>);
+seed_from_visitor!(Entries<'_>);
 
 impl<'de> Visitor<'de> for Entries<'_> {
     type Value = ();
@@ -303,7 +305,7 @@ mod tests {
     }
 
     #[test]
-    fn an_error_of_the_receiver_ends_the_reading_and_comes_back() {
+    fn error_of_the_callback_ends_reading() {
         let file = file("[1, 2, 3");
         let ask = Ask { keys: &[], nested: false, wanted: &[] };
         let error = each_element(file.path(), ask, |at, _| match at.index {

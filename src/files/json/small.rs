@@ -1,4 +1,4 @@
-//! JSON values of which no more is kept than a camera file can need.
+//! JSON values of limited size: only the parts that a camera file can need are kept.
 
 use std::fmt;
 
@@ -6,32 +6,32 @@ use serde::Deserialize;
 use serde::de::{DeserializeSeed, Deserializer, IgnoredAny, MapAccess, SeqAccess, Visitor};
 use serde_json::{Map, Number, Value};
 
-/// Bytes of the longest text that is kept: no system has longer paths.
+/// Maximum length in bytes of a string that is kept: no system has longer paths.
 const MAX_TEXT: usize = 4096;
-/// Bytes of the longest key that is kept.
+/// Maximum length in bytes of a key that is kept.
 const MAX_KEY: usize = 64;
-/// Maximum number of keys kept of an object, beside those that are wanted.
+/// Maximum number of keys kept of an object, in addition to the wanted ones.
 const MAX_KEYS: usize = 8;
 /// Maximum number of elements kept of a list, unless fewer are asked for.
 pub(crate) const MAX_ELEMENTS: usize = 16;
-/// Maximum number of values kept of one entry: a 4 × 4 matrix has 21.
+/// Maximum number of values kept of one entry; a 4 × 4 matrix has 21.
 const MAX_VALUES: usize = 64;
 
-/// A JSON value, or the part of it that is kept.
+/// JSON value, or the part of it that is kept.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum Small {
     Null,
     Bool(bool),
     Number(Number),
     Text(Box<str>),
-    /// The first elements of a list, and how many it has.
+    /// The first elements of a list, and its length.
     List(Vec<Small>, usize),
     Object(Object),
-    /// A value that no camera file has: what it is, for messages.
+    /// Value too large for a camera file, replaced by a description for messages.
     Large(Box<str>),
 }
 
-/// Entries of a JSON object: those that are wanted, and a few others by which a person knows it again.
+/// Entries of a JSON object: the wanted ones, and a few others so that messages can describe the object.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub(crate) struct Object {
     entries: Vec<(Box<str>, Small)>,
@@ -39,11 +39,12 @@ pub(crate) struct Object {
 }
 
 impl Object {
-    /// Value under `key`; of repeated keys the last one.
+    /// Returns the value under `key`; the last one if the key is repeated.
     pub(crate) fn get(&self, key: &str) -> Option<&Small> {
         self.entries.iter().find(|(name, _)| **name == *key).map(|(_, value)| value)
     }
 
+    /// Sets the value under `key`.
     fn set(&mut self, key: &str, value: Small) {
         match self.entries.iter_mut().find(|(name, _)| **name == *key) {
             Some(entry) => entry.1 = value,
@@ -53,12 +54,12 @@ impl Object {
 }
 
 impl Small {
-    /// An object with one entry.
+    /// Builds an object with one entry.
     pub(crate) fn of_entry(key: &str, value: Small) -> Small {
         Small::Object(Object { entries: vec![(key.into(), value)], others: 0 })
     }
 
-    /// Elements of a list of which all were kept.
+    /// Returns the elements of a list if all were kept.
     pub(crate) fn elements(&self) -> Option<&[Small]> {
         match self {
             Small::List(kept, total) if kept.len() == *total => Some(kept),
@@ -66,7 +67,7 @@ impl Small {
         }
     }
 
-    /// The number, as the nearest f64.
+    /// Returns the number as the nearest f64; `None` for other values.
     pub(crate) fn as_f64(&self) -> Option<f64> {
         match self {
             Small::Number(number) => number.as_f64(),
@@ -74,7 +75,7 @@ impl Small {
         }
     }
 
-    /// The whole number, if it is not negative.
+    /// Returns a non-negative integer; `None` for other values.
     pub(crate) fn as_u64(&self) -> Option<u64> {
         match self {
             Small::Number(number) => number.as_u64(),
@@ -82,7 +83,7 @@ impl Small {
         }
     }
 
-    /// Value under `key` of an object.
+    /// Returns the value under `key` of an object.
     pub(crate) fn get(&self, key: &str) -> Option<&Small> {
         match self {
             Small::Object(object) => object.get(key),
@@ -113,6 +114,7 @@ impl Small {
         }
     }
 
+    /// Converts the kept part to a JSON value.
     fn value(&self) -> Value {
         match self {
             Small::Null => Value::Null,
@@ -129,10 +131,10 @@ impl Small {
     }
 }
 
-/// Reads any value as [`Small`].
+/// Seed that reads any value as [`Small`].
 #[derive(Debug)]
 pub(crate) struct Keep<'a> {
-    /// Keys of objects that are kept however many there are.
+    /// Keys of objects that are always kept.
     pub(crate) wanted: &'a [&'a str],
     /// Maximum number of elements kept of a list.
     pub(crate) elements: usize,
@@ -142,31 +144,32 @@ impl<'de> DeserializeSeed<'de> for Keep<'_> {
     type Value = Small;
 
     fn deserialize<D: Deserializer<'de>>(self, from: D) -> Result<Small, D::Error> {
-        from.deserialize_any(Inner { keep: &self, left: &mut MAX_VALUES.clone(), depth: 0 })
+        from.deserialize_any(NestedValue { keep: &self, remaining: &mut MAX_VALUES.clone(), depth: 0 })
     }
 }
 
-/// Reads a value within another one.
-struct Inner<'a> {
+/// Seed and visitor of a value within another one.
+struct NestedValue<'a> {
     keep: &'a Keep<'a>,
     /// Number of values that may still be kept of the entry.
-    left: &'a mut usize,
+    remaining: &'a mut usize,
     depth: usize,
 }
 
-impl<'a> Inner<'a> {
-    fn inner(&mut self) -> Inner<'_> {
-        Inner { keep: self.keep, left: self.left, depth: self.depth + 1 }
+impl<'a> NestedValue<'a> {
+    /// Returns the seed of the next value one level deeper.
+    fn next_level(&mut self) -> NestedValue<'_> {
+        NestedValue { keep: self.keep, remaining: self.remaining, depth: self.depth + 1 }
     }
 }
 
-impl<'de> DeserializeSeed<'de> for Inner<'_> {
+impl<'de> DeserializeSeed<'de> for NestedValue<'_> {
     type Value = Small;
 
     fn deserialize<D: Deserializer<'de>>(self, from: D) -> Result<Small, D::Error> {
-        match self.left.checked_sub(1) {
-            Some(left) => {
-                *self.left = left;
+        match self.remaining.checked_sub(1) {
+            Some(remaining) => {
+                *self.remaining = remaining;
                 from.deserialize_any(self)
             }
             None => IgnoredAny::deserialize(from).map(|IgnoredAny| Small::Large("a value of many parts".into())),
@@ -174,7 +177,7 @@ impl<'de> DeserializeSeed<'de> for Inner<'_> {
     }
 }
 
-impl<'de> Visitor<'de> for Inner<'_> {
+impl<'de> Visitor<'de> for NestedValue<'_> {
     type Value = Small;
 
     fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -212,7 +215,7 @@ impl<'de> Visitor<'de> for Inner<'_> {
         let (mut kept, mut total) = (Vec::new(), 0);
         let most = self.keep.elements;
         while kept.len() < most {
-            let Some(element) = list.next_element_seed(self.inner())? else { break };
+            let Some(element) = list.next_element_seed(self.next_level())? else { break };
             kept.push(element);
             total += 1;
         }
@@ -236,10 +239,12 @@ impl<'de> Visitor<'de> for Inner<'_> {
                 }
                 object.others += 1;
             }
-            // Each entry of the document itself has room of its own, so that none takes that of a wanted one.
+            // Each entry of the document has a limit of its own, so that a large one cannot crowd out a wanted one.
             let value = match self.depth {
-                0 => map.next_value_seed(Inner { keep: self.keep, left: &mut MAX_VALUES.clone(), depth: 1 })?,
-                _ => map.next_value_seed(self.inner())?,
+                0 => {
+                    map.next_value_seed(NestedValue { keep: self.keep, remaining: &mut MAX_VALUES.clone(), depth: 1 })?
+                }
+                _ => map.next_value_seed(self.next_level())?,
             };
             object.set(&key, value);
         }
@@ -247,7 +252,7 @@ impl<'de> Visitor<'de> for Inner<'_> {
     }
 }
 
-/// Reads a key, of which the first bytes are kept.
+/// Seed that reads a key and keeps its first bytes.
 #[derive(Debug)]
 pub(crate) struct ShortKey;
 
@@ -268,7 +273,7 @@ impl Visitor<'_> for ShortKey {
 
     fn visit_str<E>(self, key: &str) -> Result<String, E> {
         let end = (0..=key.len().min(MAX_KEY)).rev().find(|&end| key.is_char_boundary(end)).unwrap_or(0);
-        // A key that is cut must not be taken for a wanted one.
+        // Mark a cut key, so that it does not equal a wanted one.
         Ok(if end < key.len() { format!("{}…", &key[..end]) } else { key.to_owned() })
     }
 }

@@ -1,8 +1,8 @@
-//! A numpy `.npz` archive with fewer rows.
+//! Writes a copy of a NumPy `.npz` archive with fewer rows.
 //!
-//! In: an open archive, and for each of its arrays which rows stay. Out: an archive with the same arrays in the same order
-//! and types, compressed as they were. Memory: one frame of rows. Bytes depend on the content alone: entries are dated
-//! 1980-01-01.
+//! In: an open archive, the axis of Gaussians of each of its arrays, and the rows to keep. Out: an archive with the
+//! same arrays in the same order and types, compressed as before. Memory: the rows of one frame. The output bytes
+//! depend only on the content: entries of the archive are dated 1980-01-01.
 
 use std::fs::File;
 use std::io::{BufWriter, Write};
@@ -15,26 +15,26 @@ use crate::error::{Error, Result};
 use crate::files::npz::{Npz, NpzArray};
 use crate::files::zip_output::ZipOutput;
 
-/// Bytes from which an entry of an archive needs wide lengths.
-const LARGE: usize = 1 << 32;
+/// Size in bytes from which an entry of a zip archive needs 64-bit lengths.
+const ZIP64_BYTES: usize = 1 << 32;
 
-/// What becomes of an array.
+/// Axis of an array that counts Gaussians.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum ArrayRows {
-    /// It stays as it is.
+    /// No axis: the array is copied unchanged.
     None,
-    /// Its axis 0 counts Gaussians.
+    /// Axis 0.
     First,
-    /// Its axis 1 counts Gaussians, axis 0 frames.
+    /// Axis 1; axis 0 counts frames.
     Second,
 }
 
-/// Writes `template` with the rows `kept` of its arrays along `axis` to `path`. `change` may change the values of a row: it
-/// gets the array's name, the frame, and the values of all rows that stay, and says of which rows it changed any; all
-/// others keep their bytes.
+/// Writes `template` to `path`, keeping only the rows `kept` of its arrays along `axis`. `change` may change the values
+/// of rows: it receives the name of the array, the frame and the values of all kept rows, and returns the indices of
+/// the rows it changed. All other rows keep their bytes.
 ///
 /// # Errors
-/// An array that does not decode; those of `change`; a failed write.
+/// An array cannot be decoded; `change` fails; the file cannot be written.
 pub(crate) fn write_like(
     template: &Npz,
     kept: &[u32],
@@ -57,7 +57,7 @@ pub(crate) fn write_like(
         let options = FileOptions::default()
             .compression_method(method)
             .last_modified_time(DateTime::default())
-            .large_file(entry.len().saturating_mul(8) >= LARGE);
+            .large_file(entry.len().saturating_mul(8) >= ZIP64_BYTES);
         archive.start_file(format!("{}.npy", entry.name), options).map_err(|error| failed(error.into()))?;
         template.read(entry, |values| {
             if axis == ArrayRows::None {
@@ -75,24 +75,26 @@ pub(crate) fn write_like(
             };
             let width: usize = rows[1..].iter().product();
             let row_bytes = width * float.bytes;
-            let (mut frame_bytes, mut left) = (vec![0; rows[0] * row_bytes], Vec::new());
+            let (mut frame_bytes, mut kept_bytes) = (vec![0; rows[0] * row_bytes], Vec::new());
             let mut as_f32 = Vec::new();
             for frame in 0..frames {
                 values.read_exact(&mut frame_bytes).map_err(|error| template.damaged(entry, &error))?;
-                left.clear();
-                kept.iter()
-                    .for_each(|&row| left.extend_from_slice(&frame_bytes[row as usize * row_bytes..][..row_bytes]));
+                kept_bytes.clear();
+                kept.iter().for_each(|&row| {
+                    kept_bytes.extend_from_slice(&frame_bytes[row as usize * row_bytes..][..row_bytes])
+                });
                 as_f32.clear();
-                as_f32.extend(left.chunks_exact(float.bytes).map(|stored| float.decode(stored)));
+                as_f32.extend(kept_bytes.chunks_exact(float.bytes).map(|stored| float.decode(stored)));
                 for row in change(&entry.name, frame, &mut as_f32)? {
                     let row = row as usize;
-                    let (stored, values) = (&mut left[row * row_bytes..][..row_bytes], &as_f32[row * width..][..width]);
+                    let (stored, values) =
+                        (&mut kept_bytes[row * row_bytes..][..row_bytes], &as_f32[row * width..][..width]);
                     stored
                         .chunks_exact_mut(float.bytes)
                         .zip(values)
                         .for_each(|(stored, &value)| float.encode(value, stored));
                 }
-                archive.write_all(&left).map_err(failed)?;
+                archive.write_all(&kept_bytes).map_err(failed)?;
             }
             Ok(())
         })?;
@@ -100,7 +102,7 @@ pub(crate) fn write_like(
     archive.finish().map_err(Into::into).and_then(ZipOutput::close).map_err(failed)
 }
 
-/// The header of an array, version 1.0 of numpy's format: a dictionary padded to a multiple of 64 bytes.
+/// Returns the header of an array in version 1.0 of NumPy's format: a dictionary padded to a multiple of 64 bytes.
 fn header(descr: &str, is_fortran: bool, shape: &[usize]) -> Vec<u8> {
     let order = if is_fortran { "True" } else { "False" };
     let lengths: String = shape.iter().map(|length| format!("{length}, ")).collect();

@@ -1,4 +1,4 @@
-//! Runs the instructions of a pickle within limits of their number, of nesting and of memory.
+//! Executes the instructions of a pickle, with limits on their number, on nesting and on memory.
 
 use std::ops::Range;
 
@@ -8,20 +8,20 @@ use super::{MAX_DEPTH, Node, NodeId, Pickle, Wrong};
 
 /// Maximum number of instructions. One tensor takes about 35, so this is enough for 50,000 tensors.
 const MAX_INSTRUCTIONS: u32 = 1 << 21;
-/// Bytes that the allocator adds to an allocation, rounded up.
-const ALLOCATION: usize = 32;
-/// Bytes of one entry of the memo, counted while the table grows.
-const MEMO_ENTRY: usize = 32;
+/// Overhead of one heap allocation in bytes, rounded up.
+const ALLOCATION_BYTES: usize = 32;
+/// Memory of one entry of the memo in bytes, including the growth of the table.
+const MEMO_ENTRY_BYTES: usize = 32;
 
-/// Counts the bytes that are allocated, and refuses those beyond the limit before they are.
+/// Counter of allocated bytes that refuses allocations beyond the limit before they are made.
 #[derive(Debug)]
-struct Meter {
+struct AllocationCounter {
     limit: u64,
     taken: u64,
 }
 
-impl Meter {
-    /// Counts `bytes` that are about to be allocated; `at` is the byte of the pickle that asks for them.
+impl AllocationCounter {
+    /// Counts `bytes` that are about to be allocated; `at` is the position in the pickle that requires them.
     fn take(&mut self, bytes: usize, at: usize) -> Result<(), Wrong> {
         let taken = self.taken.saturating_add(bytes as u64);
         if taken > self.limit {
@@ -31,30 +31,31 @@ impl Meter {
         Ok(())
     }
 
-    /// Makes room for `more` elements in `list`. Old and new buffer are counted while one is copied to the other.
+    /// Reserves memory for `more` elements of `list`. Counts the old and the new buffer while one is copied to the
+    /// other.
     fn reserve<T>(&mut self, list: &mut Vec<T>, more: usize, at: usize) -> Result<(), Wrong> {
         let (needed, old) = (list.len() + more, list.capacity());
         if needed > old {
             let capacity = needed.max(2 * old).max(4);
-            self.take(ALLOCATION + capacity * size_of::<T>(), at)?;
+            self.take(ALLOCATION_BYTES + capacity * size_of::<T>(), at)?;
             list.reserve_exact(capacity - list.len());
             if old > 0 {
-                self.taken -= (ALLOCATION + old * size_of::<T>()) as u64;
+                self.taken -= (ALLOCATION_BYTES + old * size_of::<T>()) as u64;
             }
         }
         Ok(())
     }
 }
 
-/// The machine that builds nodes by the instructions of a pickle.
+/// Virtual machine that executes a pickle and builds its nodes.
 pub(super) struct PickleMachine<'a> {
     bytes: &'a [u8],
     at: usize,
     instructions: u32,
-    meter: Meter,
+    allocations: AllocationCounter,
     nodes: Vec<Node>,
-    /// Nesting depth of each node when it was last changed; 0 for a scalar. A container that grows later does not deepen
-    /// the nodes around it: the limit is for those who would follow the nodes, and these count again.
+    /// Nesting depth of each node when it was last changed; 0 for a scalar. If a container grows later, the depths of
+    /// the nodes around it are not updated: code that follows the nodes counts depth itself.
     depths: Vec<u8>,
     frames: Vec<Range<usize>>,
     stack: Vec<NodeId>,
@@ -63,12 +64,13 @@ pub(super) struct PickleMachine<'a> {
 }
 
 impl<'a> PickleMachine<'a> {
+    /// Returns a machine at the start of `bytes` that may allocate `memory` bytes.
     pub(super) fn new(bytes: &'a [u8], memory: u64) -> PickleMachine<'a> {
         PickleMachine {
             bytes,
             at: 0,
             instructions: 0,
-            meter: Meter { limit: memory, taken: 0 },
+            allocations: AllocationCounter { limit: memory, taken: 0 },
             nodes: Vec::new(),
             depths: Vec::new(),
             frames: Vec::new(),
@@ -78,7 +80,10 @@ impl<'a> PickleMachine<'a> {
         }
     }
 
-    /// Runs all instructions.
+    /// Executes all instructions.
+    ///
+    /// # Errors
+    /// The first instruction that is malformed or exceeds a limit.
     pub(super) fn read(mut self) -> Result<Pickle, Wrong> {
         loop {
             if let Some(root) = self.step()? {
@@ -87,20 +92,17 @@ impl<'a> PickleMachine<'a> {
         }
     }
 
-    /// Runs one instruction; returns the root after the last one.
+    /// Executes one instruction. Returns the root node after the last one.
     fn step(&mut self) -> Result<Option<NodeId>, Wrong> {
         let start = self.at;
-        self.instructions += 1;
-        if self.instructions > MAX_INSTRUCTIONS {
-            return Err(Wrong::TooMuch(start, format!("at most {MAX_INSTRUCTIONS} instructions"), "more".into()));
-        }
-        let [instruction] = self.take()?;
+        self.count_instruction(start)?;
+        let [instruction] = self.take_bytes()?;
         match instruction {
-            // PROTO, FRAME: nothing to do.
-            0x80 => drop(self.take::<1>()?),
+            // PROTO and FRAME build nothing.
+            0x80 => drop(self.take_bytes::<1>()?),
             0x95 => {
-                self.take::<8>()?;
-                self.meter.reserve(&mut self.frames, 1, start)?;
+                self.take_bytes::<8>()?;
+                self.allocations.reserve(&mut self.frames, 1, start)?;
                 self.frames.push(start..self.at);
             }
             b'.' => return self.pop().map(Some),
@@ -110,33 +112,6 @@ impl<'a> PickleMachine<'a> {
                 let first = self.unmark()?;
                 self.stack.truncate(first);
             }
-            b'N' => self.push(Node::None, 0)?,
-            0x88 => self.push(Node::Bool(true), 0)?,
-            0x89 => self.push(Node::Bool(false), 0)?,
-            b'K' => {
-                let [value] = self.take()?;
-                self.push_int(value.into(), start)?;
-            }
-            b'M' => {
-                let value = u16::from_le_bytes(self.take()?);
-                self.push_int(value.into(), start)?;
-            }
-            b'J' => {
-                let value = i32::from_le_bytes(self.take()?);
-                self.push_int(value.into(), start)?;
-            }
-            0x8a => self.long(1, start)?,
-            0x8b => self.long(4, start)?,
-            b'G' => {
-                let value = f64::from_be_bytes(self.take()?);
-                self.push(Node::Float(value), 0)?;
-            }
-            b'X' => self.text(4)?,
-            0x8c => self.text(1)?,
-            0x8d => self.text(8)?,
-            b'B' | b'T' => self.blob(4)?,
-            b'C' | b'U' => self.blob(1)?,
-            0x8e | 0x96 => self.blob(8)?,
             b'c' => self.global(start)?,
             0x93 => self.stack_global(start)?,
             b')' => self.push(Node::Tuple(Vec::new()), 1)?,
@@ -149,7 +124,7 @@ impl<'a> PickleMachine<'a> {
             0x85..=0x87 => {
                 let first = self.stack.len().checked_sub(usize::from(instruction - 0x84));
                 let first = first.filter(|&first| first >= self.floor());
-                self.collect(first.ok_or(Wrong::at(start, "a tuple of more than there is"))?, Node::Tuple)?;
+                self.collect(first.ok_or(Wrong::at(start, "a tuple of more values than there are"))?, Node::Tuple)?;
             }
             b'l' | 0x91 => {
                 let first = self.unmark()?;
@@ -178,43 +153,87 @@ impl<'a> PickleMachine<'a> {
             }
             b'R' | 0x81 => {
                 let (arguments, callee) = (self.pop()?, self.pop()?);
-                let depth = self.deeper([arguments, callee])?;
+                let depth = self.container_depth([arguments, callee])?;
                 self.push(Node::Called { callee, arguments, items: Vec::new() }, depth)?;
             }
-            // BUILD: attributes of an object beside its items are not needed.
+            // BUILD: attributes of an object are not needed, only its items.
             b'b' => drop(self.pop()?),
             b'Q' => {
                 let what = self.pop()?;
-                let depth = self.deeper([what])?;
+                let depth = self.container_depth([what])?;
                 self.push(Node::Outside(what), depth)?;
             }
             b'q' => {
-                let [key] = self.take()?;
-                self.remember(key.into())?;
+                let [key] = self.take_bytes()?;
+                self.store_in_memo(key.into())?;
             }
             b'r' => {
-                let key = u32::from_le_bytes(self.take()?);
-                self.remember(key)?;
+                let key = u32::from_le_bytes(self.take_bytes()?);
+                self.store_in_memo(key)?;
             }
-            0x94 => self.remember(self.memo.len() as u32)?,
+            0x94 => self.store_in_memo(self.memo.len() as u32)?,
             b'h' => {
-                let [key] = self.take()?;
-                self.recall(start, key.into())?;
+                let [key] = self.take_bytes()?;
+                self.push_from_memo(start, key.into())?;
             }
             b'j' => {
-                let key = u32::from_le_bytes(self.take()?);
-                self.recall(start, key)?;
+                let key = u32::from_le_bytes(self.take_bytes()?);
+                self.push_from_memo(start, key)?;
             }
-            other => return Err(Wrong::at(start, format!("instruction {other:#04x}"))),
+            other => self.step_scalar(other, start)?,
         }
         Ok(None)
     }
 
-    /// Adds a node and puts it on the stack.
+    /// Counts one instruction, at byte `start`.
+    fn count_instruction(&mut self, start: usize) -> Result<(), Wrong> {
+        self.instructions += 1;
+        if self.instructions > MAX_INSTRUCTIONS {
+            return Err(Wrong::TooMuch(start, format!("at most {MAX_INSTRUCTIONS} instructions"), "more".into()));
+        }
+        Ok(())
+    }
+
+    /// Executes an instruction that pushes a scalar, a text or opaque bytes. Refuses unknown instructions.
+    fn step_scalar(&mut self, instruction: u8, start: usize) -> Result<(), Wrong> {
+        match instruction {
+            b'N' => self.push(Node::None, 0)?,
+            0x88 => self.push(Node::Bool(true), 0)?,
+            0x89 => self.push(Node::Bool(false), 0)?,
+            b'K' => {
+                let [value] = self.take_bytes()?;
+                self.push_int(value.into(), start)?;
+            }
+            b'M' => {
+                let value = u16::from_le_bytes(self.take_bytes()?);
+                self.push_int(value.into(), start)?;
+            }
+            b'J' => {
+                let value = i32::from_le_bytes(self.take_bytes()?);
+                self.push_int(value.into(), start)?;
+            }
+            0x8a => self.long(1, start)?,
+            0x8b => self.long(4, start)?,
+            b'G' => {
+                let value = f64::from_be_bytes(self.take_bytes()?);
+                self.push(Node::Float(value), 0)?;
+            }
+            b'X' => self.text(4)?,
+            0x8c => self.text(1)?,
+            0x8d => self.text(8)?,
+            b'B' | b'T' => self.blob(4)?,
+            b'C' | b'U' => self.blob(1)?,
+            0x8e | 0x96 => self.blob(8)?,
+            other => return Err(Wrong::at(start, format!("instruction {other:#04x}"))),
+        }
+        Ok(())
+    }
+
+    /// Adds a node and pushes it onto the stack.
     fn push(&mut self, node: Node, depth: u8) -> Result<(), Wrong> {
-        self.meter.reserve(&mut self.nodes, 1, self.at)?;
-        self.meter.reserve(&mut self.depths, 1, self.at)?;
-        self.meter.reserve(&mut self.stack, 1, self.at)?;
+        self.allocations.reserve(&mut self.nodes, 1, self.at)?;
+        self.allocations.reserve(&mut self.depths, 1, self.at)?;
+        self.allocations.reserve(&mut self.stack, 1, self.at)?;
         self.stack.push(self.nodes.len() as NodeId);
         self.nodes.push(node);
         self.depths.push(depth);
@@ -228,12 +247,13 @@ impl<'a> PickleMachine<'a> {
         Ok(())
     }
 
+    /// Pushes a number, with the position of its instruction that began at `start`.
     fn push_int(&mut self, value: i64, start: usize) -> Result<(), Wrong> {
         self.push(Node::Int(value, start as u32..self.at as u32), 0)
     }
 
-    /// Depth of a container of these nodes.
-    fn deeper(&self, nodes: impl IntoIterator<Item = NodeId>) -> Result<u8, Wrong> {
+    /// Returns the depth of a container that holds `nodes`.
+    fn container_depth(&self, nodes: impl IntoIterator<Item = NodeId>) -> Result<u8, Wrong> {
         let deepest = nodes.into_iter().map(|id| self.depths[id as usize]).max().unwrap_or(0);
         match deepest < MAX_DEPTH {
             true => Ok(deepest + 1),
@@ -241,28 +261,32 @@ impl<'a> PickleMachine<'a> {
         }
     }
 
+    /// Returns the error for too many nested containers.
     fn too_deep(&self) -> Wrong {
         Wrong::TooMuch(self.at, format!("containers nested at most {MAX_DEPTH} deep"), "deeper ones".into())
     }
 
+    /// Begins a container: marks the top of the stack.
     fn mark(&mut self, start: usize) -> Result<(), Wrong> {
         if self.marks.len() >= usize::from(MAX_DEPTH) {
             return Err(self.too_deep());
         }
-        self.meter.reserve(&mut self.marks, 1, start)?;
+        self.allocations.reserve(&mut self.marks, 1, start)?;
         self.marks.push(self.stack.len());
         Ok(())
     }
 
-    /// Start of the part of the stack that the innermost open container may use.
+    /// Returns the start of the part of the stack that belongs to the innermost open container.
     fn floor(&self) -> usize {
         self.marks.last().copied().unwrap_or(0)
     }
 
+    /// Returns the error for an instruction that needs more values than the stack has.
     fn missing(&self) -> Wrong {
         Wrong::at(self.at, "a value that was never given")
     }
 
+    /// Removes and returns the top of the stack.
     fn pop(&mut self) -> Result<NodeId, Wrong> {
         match self.stack.len() > self.floor() {
             true => Ok(self.stack.pop().expect("there is one")),
@@ -270,35 +294,36 @@ impl<'a> PickleMachine<'a> {
         }
     }
 
-    /// Place on the stack of the last `count` values, below which there is another one.
+    /// Returns the place on the stack of the last `count` values, which must have another value below them.
     fn beyond_top(&self, count: usize) -> Result<usize, Wrong> {
         self.stack.len().checked_sub(count).filter(|&first| first > self.floor()).ok_or_else(|| self.missing())
     }
 
-    /// Closes the innermost open container; returns the place on the stack where its elements begin.
+    /// Ends the innermost open container and returns the place on the stack of its first element.
     fn unmark(&mut self) -> Result<usize, Wrong> {
-        let mark = self.marks.pop().ok_or(Wrong::at(self.at, "the end of what was never begun"))?;
+        let mark = self.marks.pop().ok_or(Wrong::at(self.at, "the end of a container that was never begun"))?;
         Ok(mark.min(self.stack.len()))
     }
 
-    /// Replaces the values from `first` on by one container of them.
+    /// Replaces the values from `first` on by one container that holds them.
     fn collect(&mut self, first: usize, make: fn(Vec<NodeId>) -> Node) -> Result<(), Wrong> {
-        let depth = self.deeper(self.stack[first..].iter().copied())?;
+        let depth = self.container_depth(self.stack[first..].iter().copied())?;
         let mut elements = Vec::new();
         if first < self.stack.len() {
             let count = self.stack.len() - first;
-            self.meter.take(ALLOCATION + count * size_of::<NodeId>(), self.at)?;
+            self.allocations.take(ALLOCATION_BYTES + count * size_of::<NodeId>(), self.at)?;
             elements.reserve_exact(count);
             elements.extend(self.stack.drain(first..));
         }
         self.push(make(elements), depth)
     }
 
-    /// The container below `first` on the stack, with a depth beyond that of the values from there on.
+    /// Returns the container below `first` on the stack, after raising its depth above that of the values from `first`
+    /// on.
     fn container(&mut self, first: usize) -> Result<usize, Wrong> {
         let below = first.checked_sub(1).filter(|&below| below >= self.floor());
         let top = self.stack[below.ok_or_else(|| self.missing())?] as usize;
-        let depth = self.deeper(self.stack[first..].iter().copied())?;
+        let depth = self.container_depth(self.stack[first..].iter().copied())?;
         self.depths[top] = self.depths[top].max(depth);
         Ok(top)
     }
@@ -308,12 +333,12 @@ impl<'a> PickleMachine<'a> {
         let top = self.container(first)?;
         match &mut self.nodes[top] {
             Node::List(list) => {
-                self.meter.reserve(list, self.stack.len() - first, start)?;
+                self.allocations.reserve(list, self.stack.len() - first, start)?;
                 list.extend(self.stack.drain(first..));
             }
-            // An object that is filled like a list.
+            // The elements of an object that behaves like a list are not needed.
             Node::Called { .. } => self.stack.truncate(first),
-            _ => return Err(Wrong::at(start, "an element of what is no list")),
+            _ => return Err(Wrong::at(start, "an element added to a value that is not a list")),
         }
         Ok(())
     }
@@ -327,37 +352,41 @@ impl<'a> PickleMachine<'a> {
         }
         match &mut self.nodes[top] {
             Node::Dict(items) | Node::Called { items, .. } => {
-                self.meter.reserve(items, pairs.len(), start)?;
+                self.allocations.reserve(items, pairs.len(), start)?;
                 items.extend(pairs.iter().map(|&[key, value]| (key, value)));
             }
-            _ => return Err(Wrong::at(start, "an item of what is no dict")),
+            _ => return Err(Wrong::at(start, "an item added to a value that is not a dict")),
         }
         self.stack.truncate(first);
         Ok(())
     }
 
-    fn remember(&mut self, key: u32) -> Result<(), Wrong> {
+    /// Stores the top of the stack in the memo under `key`.
+    fn store_in_memo(&mut self, key: u32) -> Result<(), Wrong> {
         let top = self.stack.last().copied().filter(|_| self.stack.len() > self.floor());
         let top = top.ok_or_else(|| self.missing())?;
-        self.meter.take(MEMO_ENTRY, self.at)?;
+        self.allocations.take(MEMO_ENTRY_BYTES, self.at)?;
         self.memo.insert(key, top);
         Ok(())
     }
 
-    fn recall(&mut self, start: usize, key: u32) -> Result<(), Wrong> {
+    /// Pushes the node stored in the memo under `key`.
+    fn push_from_memo(&mut self, start: usize, key: u32) -> Result<(), Wrong> {
         let known = self.memo.get(&key).copied();
-        let known = known.ok_or_else(|| Wrong::at(start, format!("what was never remembered, {key}")))?;
-        self.meter.reserve(&mut self.stack, 1, start)?;
+        let known = known.ok_or_else(|| Wrong::at(start, format!("memo entry {key}, which was never stored")))?;
+        self.allocations.reserve(&mut self.stack, 1, start)?;
         self.stack.push(known);
         Ok(())
     }
 
-    fn take<const N: usize>(&mut self) -> Result<[u8; N], Wrong> {
-        let taken = self.some(N as u64)?;
+    /// Reads `N` bytes.
+    fn take_bytes<const N: usize>(&mut self) -> Result<[u8; N], Wrong> {
+        let taken = self.take_slice(N as u64)?;
         Ok(taken.try_into().expect("as many"))
     }
 
-    fn some(&mut self, count: u64) -> Result<&[u8], Wrong> {
+    /// Reads `count` bytes.
+    fn take_slice(&mut self, count: u64) -> Result<&[u8], Wrong> {
         let left = self.bytes.len() - self.at;
         let count = usize::try_from(count).ok().filter(|&count| count <= left);
         let count = count.ok_or(Wrong::at(self.at, "the end of the pickle"))?;
@@ -365,11 +394,12 @@ impl<'a> PickleMachine<'a> {
         Ok(&self.bytes[self.at - count..self.at])
     }
 
-    /// A whole number of as many bytes as those before it say.
+    /// Reads a whole number whose length in bytes precedes it in `length_bytes` bytes. Numbers that do not fit into
+    /// `i64` become opaque nodes.
     fn long(&mut self, length_bytes: usize, start: usize) -> Result<(), Wrong> {
         let length = self.length(length_bytes)?;
-        let digits = self.some(length)?;
-        // Nine where the highest bit of eight would be taken for a sign.
+        let digits = self.take_slice(length)?;
+        // A ninth byte of 0 only keeps the highest bit of the eighth from being taken for a sign.
         let digits = match digits {
             [eight @ .., 0] if eight.len() == 8 && eight[7] < 0x80 => eight,
             digits => digits,
@@ -383,33 +413,35 @@ impl<'a> PickleMachine<'a> {
         self.push_int(i64::from_le_bytes(wide), start)
     }
 
-    /// A length of so many bytes.
+    /// Reads a length stored in `bytes` bytes.
     fn length(&mut self, bytes: usize) -> Result<u64, Wrong> {
         let mut wide = [0; 8];
-        wide[..bytes].copy_from_slice(self.some(bytes as u64)?);
+        wide[..bytes].copy_from_slice(self.take_slice(bytes as u64)?);
         Ok(u64::from_le_bytes(wide))
     }
 
+    /// Reads a text whose length precedes it.
     fn text(&mut self, length_bytes: usize) -> Result<(), Wrong> {
         let length = self.length(length_bytes)?;
         let start = self.at;
-        self.some(length)?;
-        self.meter.take(ALLOCATION + (self.at - start), start)?;
+        self.take_slice(length)?;
+        self.allocations.take(ALLOCATION_BYTES + (self.at - start), start)?;
         let text = std::str::from_utf8(&self.bytes[start..self.at]);
         let text = text.map_err(|_| Wrong::at(start, "a text that is not UTF-8"))?;
         self.push(Node::Text(text.into()), 0)
     }
 
+    /// Skips bytes whose length precedes them; they become an opaque node.
     fn blob(&mut self, length_bytes: usize) -> Result<(), Wrong> {
         let length = self.length(length_bytes)?;
-        self.some(length)?;
+        self.take_slice(length)?;
         self.push(Node::Opaque, 0)
     }
 
-    /// GLOBAL: module and name as two lines.
+    /// GLOBAL: reads module and name as two lines.
     fn global(&mut self, start: usize) -> Result<(), Wrong> {
         let (module, name) = (self.line()?, self.line()?);
-        self.meter.take(ALLOCATION + module.len() + 1 + name.len(), start)?;
+        self.allocations.take(ALLOCATION_BYTES + module.len() + 1 + name.len(), start)?;
         let text = |line: Range<usize>| {
             std::str::from_utf8(&self.bytes[line.clone()])
                 .map_err(|_| Wrong::at(line.start, "a name that is not UTF-8"))
@@ -418,22 +450,23 @@ impl<'a> PickleMachine<'a> {
         self.push(Node::Global(global.into()), 0)
     }
 
-    /// STACK_GLOBAL: module and name as two texts on the stack. They may be shared, so that a long one is copied often.
+    /// STACK_GLOBAL: takes module and name as two texts from the stack. The texts may be shared, so a long text may be
+    /// copied many times; each copy is counted.
     fn stack_global(&mut self, start: usize) -> Result<(), Wrong> {
         let (name, module) = (self.pop()?, self.pop()?);
         let (Node::Text(module), Node::Text(name)) = (&self.nodes[module as usize], &self.nodes[name as usize]) else {
-            return Err(Wrong::at(start, "something of a module without its name"));
+            return Err(Wrong::at(start, "a global without the texts of its module and name"));
         };
-        self.meter.take(ALLOCATION + module.len() + 1 + name.len(), start)?;
+        self.allocations.take(ALLOCATION_BYTES + module.len() + 1 + name.len(), start)?;
         let global = [module, ".", name].concat();
         self.push(Node::Global(global.into()), 0)
     }
 
-    /// Place of a line without its end.
+    /// Reads a line and returns its position without the line end.
     fn line(&mut self) -> Result<Range<usize>, Wrong> {
         let start = self.at;
         let end = self.bytes[start..].iter().position(|&byte| byte == b'\n');
-        self.some(end.map_or(u64::MAX, |end| end as u64 + 1))?;
+        self.take_slice(end.map_or(u64::MAX, |end| end as u64 + 1))?;
         Ok(start..self.at - 1)
     }
 }

@@ -7,7 +7,7 @@ fn read(bytes: &[u8]) -> Pickle {
 }
 
 #[test]
-fn values_are_those_that_python_pickled() {
+fn values_pickled_by_python_are_read() {
     // pickle.dumps(({"a": [1, -2, 300, 70000, 2**40], "b": (None, True, 0.5)}, "é"), 2)
     let bytes = b"\x80\x02}q\x00(X\x01\x00\x00\x00aq\x01]q\x02(K\x01J\xfe\xff\xff\xffM,\x01Jp\x11\x01\x00\x8a\x06\x00\x00\x00\x00\x00\x01eX\x01\x00\x00\x00bq\x03N\x88G?\xe0\x00\x00\x00\x00\x00\x00\x87q\x04uX\x02\x00\x00\x00\xc3\xa9q\x05\x86q\x06.";
     let pickle = read(bytes);
@@ -23,8 +23,8 @@ fn values_are_those_that_python_pickled() {
 }
 
 #[test]
-fn numbers_written_anew_stand_where_the_old_ones_did() {
-    // pickle.dumps((7, "x", 7), 4): in a frame, with a memo.
+fn replaced_numbers_keep_their_positions() {
+    // pickle.dumps((7, "x", 7), 4): with a frame and a memo.
     let bytes = b"\x80\x04\x95\x0b\x00\x00\x00\x00\x00\x00\x00K\x07\x8c\x01x\x94K\x07\x87\x94.";
     let pickle = read(bytes);
     let elements = pickle.elements(pickle.root()).unwrap().to_vec();
@@ -39,24 +39,24 @@ fn numbers_written_anew_stand_where_the_old_ones_did() {
 }
 
 #[test]
-fn what_would_be_called_is_a_name_and_what_is_shared_is_there_once() {
+fn calls_are_not_executed_and_shared_nodes_exist_once() {
     let bytes = b"\x80\x02cposix\nsystem\nX\x04\x00\x00\x00exit\x85R.";
     let pickle = read(bytes);
     assert_eq!(pickle.call(pickle.root()).unwrap().0, "posix.system");
-    // A list of two of a list of two of …: 2^60 paths, a node for each list.
+    // A list of two references to a list of two references …: 2^60 paths, but one node for each list.
     let mut bytes = b"\x80\x02]q\x00".to_vec();
     for level in 0..60u8 {
         bytes.extend([b']', b'q', level + 1, b'(', b'h', level, b'h', level, b'e']);
     }
     bytes.push(b'.');
     assert_eq!(read(&bytes).ids().len(), 61);
-    // One that is inside itself.
+    // A list that contains itself.
     let circle = read(b"\x80\x02]q\x00h\x00a.");
     assert_eq!(circle.elements(circle.root()), Some(&[circle.root()][..]));
 }
 
 #[test]
-fn nesting_is_limited_whatever_makes_it() {
+fn nesting_is_limited_for_every_instruction() {
     let deepest = usize::from(MAX_DEPTH);
     let tuples = |depth: usize| [b")".to_vec(), b"\x85".repeat(depth - 1), b".".to_vec()].concat();
     assert_eq!(read(&tuples(deepest)).ids().len(), deepest);
@@ -72,7 +72,7 @@ fn nesting_is_limited_whatever_makes_it() {
     }
 }
 
-/// Pickles that take far more memory than they have bytes, each of about `size` bytes.
+/// Returns pickles of about `size` bytes that would take far more memory than that.
 fn bombs(size: usize) -> Vec<(&'static str, Vec<u8>)> {
     let long = [&[b'X'][..], &(size as u32 / 2).to_le_bytes(), &b"x".repeat(size / 2)].concat();
     let flood = |piece: &[u8]| piece.repeat(size / piece.len());
@@ -94,11 +94,11 @@ fn bombs(size: usize) -> Vec<(&'static str, Vec<u8>)> {
 }
 
 #[test]
-fn memory_is_limited_before_it_is_taken() {
+fn memory_is_limited_before_it_is_allocated() {
     for (name, bytes) in bombs(300_000) {
         let memory = 1 << 20;
         match Pickle::read(&bytes, memory) {
-            // A flood that is not ended.
+            // The bytes do not end with STOP.
             Err(Wrong::Malformed(at, found)) => {
                 assert!(at == bytes.len() && found.contains("end"), "{name}: {found}");
             }
@@ -139,14 +139,14 @@ fn memo_numbers_and_lengths_may_be_the_largest() {
 }
 
 #[test]
-fn what_is_broken_is_told_with_its_place() {
+fn malformed_pickles_are_refused_with_their_position() {
     for (bytes, at, found) in [
         (&b""[..], 0, "end"),
         (b"\x80\x02K", 3, "end"),
         (b"\x80\x02X\xff\xff\xff\xffab", 7, "end"),
         (b"\x80\x02(K\x010", 6, "end"),
         (b"\x80\x02\x85.", 2, "tuple"),
-        (b"\x80\x02h\x00.", 2, "remembered"),
+        (b"\x80\x02h\x00.", 2, "never stored"),
         (b"\x80\x02}K\x01K\x02.", 8, ""),
         (b"\x80\x02}(K\x01u.", 6, "key without"),
         (b"\x80\x02\xff.", 2, "0xff"),

@@ -1,4 +1,4 @@
-//! Text bodies turned into the binary body they stand for, so that one reader serves both.
+//! Converts text bodies to the equivalent binary bodies, so that one reader serves both.
 //!
 //! In: header and text. Out: little-endian rows of every element, appended to a scratch file. Memory: one line of text.
 
@@ -11,12 +11,12 @@ use std::sync::{Arc, Mutex, PoisonError};
 use super::header::{Element, PlyHeader, Property, Scalar};
 use crate::error::{Error, Result, quoted};
 
-/// Bytes of a line of text, beside [`LINE_BYTES_PER_NUMBER`] for each number of its row.
+/// Maximum length of a line of text in bytes, not counting [`LINE_BYTES_PER_NUMBER`] for each number of its row.
 const LINE_BYTES: u64 = 1 << 20;
-/// An f64 in its longest usual form has 24 characters.
+/// Maximum number of bytes per number: the longest usual form of an f64 has 24 characters.
 const LINE_BYTES_PER_NUMBER: u64 = 64;
 
-/// Scratch file without a name for the binary rows of any number of text files; created when the first one is read.
+/// Anonymous scratch file for the binary rows of any number of text files; created when the first text file is read.
 #[derive(Debug)]
 pub(crate) struct TextStore {
     folder: PathBuf,
@@ -27,28 +27,28 @@ pub(crate) struct TextStore {
 #[derive(Debug, Clone)]
 pub(crate) struct TextRows {
     pub(super) file: Arc<File>,
-    /// Where they lie in the scratch file.
+    /// Range of the rows in the scratch file.
     pub(super) range: Range<u64>,
 }
 
 impl TextStore {
-    /// Store whose scratch file lies in `folder`.
+    /// Returns a store whose scratch file will be in `folder`.
     pub(crate) fn new(folder: &Path) -> TextStore {
         TextStore { folder: folder.to_owned(), file: Mutex::new(None) }
     }
 
-    /// Converts the body of the text file `text`, read from `path`, whose header is `header`. One row per line; blank
-    /// lines are skipped; what follows the last row is ignored.
+    /// Converts the body of the text file `text`, read from `path`, whose header is `header`. There is one row per
+    /// line. Blank lines are skipped; text after the last row is ignored.
     ///
     /// # Errors
     /// Too few rows, a row with too few or too many numbers, a word that is not a number of its type, a line far longer
-    /// than its numbers take; each names the line. A scratch file that cannot be written.
+    /// than its numbers require; each error names the line. The scratch file cannot be written.
     pub(super) fn convert(&self, path: &Path, header: &PlyHeader, mut text: File) -> Result<TextRows> {
         let failed = |action| Error::io(action, path);
         let whole = text.metadata().map_err(failed("read the size of"))?.len();
         check_counts(path, header, whole.saturating_sub(header.text.len() as u64))?;
         text.seek(SeekFrom::Start(header.text.len() as u64)).map_err(failed("read"))?;
-        // Held until the rows are written: they lie together.
+        // Locked until all rows are written, so that they are contiguous.
         let mut slot = self.file.lock().unwrap_or_else(PoisonError::into_inner);
         let scratch = |action| Error::io(action, &self.folder);
         let file = match &*slot {
@@ -74,7 +74,7 @@ impl TextStore {
     }
 }
 
-/// Confirms that `available` bytes of text can hold the announced rows: a number takes a digit and a separator.
+/// Checks that `available` bytes of text can hold the declared rows: a number takes at least a digit and a separator.
 fn check_counts(path: &Path, header: &PlyHeader, available: u64) -> Result<()> {
     for element in &header.elements {
         let least = element.count.checked_mul(2 * element.properties.len() as u64);
@@ -87,11 +87,11 @@ fn check_counts(path: &Path, header: &PlyHeader, available: u64) -> Result<()> {
     Ok(())
 }
 
-/// Lines of a text body.
+/// Reader of the lines of a text body.
 struct AsciiLines<'a> {
     path: &'a Path,
     text: BufReader<File>,
-    /// Number of the line read last, counted from 1.
+    /// Number of the last line read, counted from 1.
     number: usize,
     line: Vec<u8>,
 }
@@ -119,7 +119,7 @@ impl AsciiLines<'_> {
         Ok(())
     }
 
-    /// Reads the next line that is not blank; false at the end of the file.
+    /// Reads the next line that is not blank. Returns false at the end of the file.
     fn read_line(&mut self, numbers: usize) -> Result<bool> {
         let most = LINE_BYTES + LINE_BYTES_PER_NUMBER * numbers as u64;
         loop {
@@ -142,17 +142,19 @@ impl AsciiLines<'_> {
     }
 }
 
+/// Returns the name of an element as a place in messages.
 fn place(element: &Element) -> String {
     format!("element {}", element.name)
 }
 
+/// Returns the error for a word that is not a number of the type of its property.
 fn unreadable(path: &Path, line: usize, property: &Property, word: &[u8]) -> Error {
     let expected = format!("a number of type {} for property {}", property.scalar.name(), quoted(&property.name));
     let word = String::from_utf8_lossy(&word[..word.len().min(60)]);
     Error::input(path, format!("line {line}"), expected, quoted(&word))
 }
 
-/// Appends the number `word` stands for; `None` when it stands for none of that type.
+/// Appends the number written as `word` in binary; returns `None` if it is not a number of that type.
 fn push_number(out: &mut Vec<u8>, word: &[u8], scalar: Scalar) -> Option<()> {
     let word = std::str::from_utf8(word).ok()?;
     match scalar {

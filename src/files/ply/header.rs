@@ -1,4 +1,4 @@
-//! The header of a PLY file: encoding, elements, properties, comments.
+//! Parses the header of a PLY file: encoding, elements, properties, comments.
 //!
 //! In: the bytes of a file. Out: [`PlyHeader`]. Source: G. Turk, "The PLY Polygon File Format", 1994.
 
@@ -8,10 +8,10 @@ use hashbrown::HashSet;
 
 use crate::error::{Error, Result, quoted};
 
-/// Most bytes of a header: some 50,000 properties, where models of Gaussians have 60 to a few hundred.
-const MOST_BYTES: usize = 1 << 20;
+/// Maximum length of a header in bytes: enough for about 50,000 properties. Gaussian models have 60 to a few hundred.
+const MAX_HEADER_BYTES: usize = 1 << 20;
 
-/// How the body stores numbers.
+/// Encoding of the numbers in the body.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum PlyEncoding {
     /// Text, one row per line.
@@ -22,7 +22,19 @@ pub enum PlyEncoding {
     BigEndian,
 }
 
-/// Type of a property.
+impl PlyEncoding {
+    /// Returns the encoding that a `format` line calls `name`.
+    fn parse(name: &str) -> Option<PlyEncoding> {
+        match name {
+            "ascii" => Some(PlyEncoding::Ascii),
+            "binary_little_endian" => Some(PlyEncoding::LittleEndian),
+            "binary_big_endian" => Some(PlyEncoding::BigEndian),
+            _ => None,
+        }
+    }
+}
+
+/// Number type of a property.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[expect(missing_docs, reason = "the names say it")]
 pub enum Scalar {
@@ -37,7 +49,7 @@ pub enum Scalar {
 }
 
 impl Scalar {
-    /// The type a header spells `name`, in the old or the sized spelling.
+    /// Returns the type that a header calls `name`, in the old or the sized spelling.
     fn parse(name: &str) -> Option<Scalar> {
         Some(match name {
             "char" | "int8" => Scalar::I8,
@@ -52,7 +64,7 @@ impl Scalar {
         })
     }
 
-    /// The old spelling.
+    /// Returns the name in the old spelling.
     pub fn name(self) -> &'static str {
         match self {
             Scalar::I8 => "char",
@@ -66,7 +78,7 @@ impl Scalar {
         }
     }
 
-    /// Bytes of one value in a binary body.
+    /// Returns the number of bytes of one value in a binary body.
     pub fn bytes(self) -> usize {
         match self {
             Scalar::I8 | Scalar::U8 => 1,
@@ -77,37 +89,37 @@ impl Scalar {
     }
 }
 
-/// One column of an element.
+/// Property of an element: one column of its table.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Property {
-    /// Its name.
+    /// Name in the header.
     pub name: String,
-    /// Its type.
+    /// Number type.
     pub scalar: Scalar,
-    /// Its place in a binary row, bytes.
+    /// Offset in a binary row, in bytes.
     pub offset: usize,
 }
 
-/// A table of the file.
+/// Element of the file: a table of `count` rows.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Element {
     pub(crate) name: String,
     pub(crate) count: u64,
     pub(crate) properties: Vec<Property>,
-    /// Bytes of a binary row.
+    /// Length of a binary row in bytes.
     pub(crate) stride: usize,
 }
 
-/// A parsed header. All elements have rows of fixed size.
+/// Parsed header. All elements have rows of fixed size.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct PlyHeader {
     pub(crate) encoding: PlyEncoding,
     pub(crate) elements: Vec<Element>,
     /// Texts of the `comment` lines, in order.
     pub(crate) comments: Vec<String>,
-    /// The header itself, through the line end of `end_header`.
+    /// Bytes of the header, through the line end of `end_header`.
     pub(crate) text: Vec<u8>,
-    /// Its number of lines.
+    /// Number of lines of the header.
     pub(crate) lines: usize,
 }
 
@@ -115,10 +127,10 @@ impl PlyHeader {
     /// Parses the header at the start of `bytes`, the content of `path`. Lines may end in LF or CRLF.
     ///
     /// # Errors
-    /// Not a PLY; a header without `end_header`, or of more than 1 MiB; a line, type or count that is none; a list property
-    /// (its rows have no fixed size); a name used twice. Each names the line.
+    /// Not a PLY; a header without `end_header` or of more than 1 MiB; an invalid line, type or count; a list property
+    /// (its rows have no fixed size); a name used twice. Each error names the line.
     pub(crate) fn parse(path: &Path, bytes: &[u8]) -> Result<PlyHeader> {
-        let (length, bytes) = (bytes.len(), &bytes[..bytes.len().min(MOST_BYTES)]);
+        let (length, bytes) = (bytes.len(), &bytes[..bytes.len().min(MAX_HEADER_BYTES)]);
         let first = bytes.split(|&b| b == b'\n').next().unwrap_or_default();
         if first.trim_ascii_end() != b"ply" {
             return Err(Error::input(path, "first line", "\"ply\"", found(first)).hint("this is not a PLY file"));
@@ -148,15 +160,11 @@ impl PlyHeader {
                     comments.push(String::from_utf8_lossy(comment).into_owned());
                 }
                 ["format", name, "1.0"] => {
-                    encoding = Some(match name {
-                        "ascii" => PlyEncoding::Ascii,
-                        "binary_little_endian" => PlyEncoding::LittleEndian,
-                        "binary_big_endian" => PlyEncoding::BigEndian,
-                        _ => {
-                            let expected = "ascii, binary_little_endian or binary_big_endian";
-                            return Err(Error::input(path, place(), expected, quoted(name)));
-                        }
-                    });
+                    let Some(found) = PlyEncoding::parse(name) else {
+                        let expected = "ascii, binary_little_endian or binary_big_endian";
+                        return Err(Error::input(path, place(), expected, quoted(name)));
+                    };
+                    encoding = Some(found);
                 }
                 ["element", name, count] => {
                     if !element_names.insert(word(raw, 1)) {
@@ -209,20 +217,14 @@ impl PlyHeader {
                 }
             }
         }
-        if length > MOST_BYTES {
-            let expected = format!("an end_header line within {MOST_BYTES} bytes");
-            return Err(Error::input(path, "header", expected, format!("none, in a file of {length} bytes"))
-                .hint("a header of Gaussians has a few kilobytes: the file is damaged or not a model"));
-        }
-        let what = format!("the file ends after {length} bytes without one");
-        Err(Error::input(path, "header", "an end_header line", what).hint("the file is cut short; copy it again"))
+        Err(missing_end(path, length))
     }
 
-    /// The header text for `count` vertices, whose properties get other names or go: the same lines, but for these, the
-    /// count and, where the body was text, the format, which becomes little-endian binary.
+    /// Returns the header text for `count` vertices. `name` returns the new name of a property, or `None` to remove it.
+    /// Everything else stays the same, except that a text format becomes little-endian binary.
     pub(crate) fn text_for(&self, count: usize, name: impl Fn(&str) -> Option<String>) -> Vec<u8> {
         let mut out = Vec::with_capacity(self.text.len() + 16);
-        let mut of_vertex = false;
+        let mut in_vertex = false;
         for line in self.text.split_inclusive(|&b| b == b'\n') {
             let text = String::from_utf8_lossy(line);
             let words: Vec<&str> = text.split_ascii_whitespace().collect();
@@ -232,11 +234,11 @@ impl PlyHeader {
                     Some("format binary_little_endian 1.0".to_owned())
                 }
                 ["element", element, ..] => {
-                    of_vertex = element == "vertex";
+                    in_vertex = element == "vertex";
                     let differs = self.vertex().is_some_and(|vertex| vertex.count != count as u64);
-                    (of_vertex && differs).then(|| format!("element vertex {count}"))
+                    (in_vertex && differs).then(|| format!("element vertex {count}"))
                 }
-                ["property", kind, old] if of_vertex => match name(old) {
+                ["property", kind, old] if in_vertex => match name(old) {
                     None => continue,
                     Some(new) => (new != old).then(|| format!("property {kind} {new}")),
                 },
@@ -250,23 +252,34 @@ impl PlyHeader {
         out
     }
 
-    /// The element that holds the Gaussians.
+    /// Returns the element that holds the Gaussians.
     pub(crate) fn vertex(&self) -> Option<&Element> {
         self.elements.iter().find(|element| element.name == "vertex")
     }
 }
 
-/// Returns word `at` of a header line that has so many words.
+/// Returns the error for a file of `length` bytes without an `end_header` line.
+fn missing_end(path: &Path, length: usize) -> Error {
+    if length > MAX_HEADER_BYTES {
+        let expected = format!("an end_header line within {MAX_HEADER_BYTES} bytes");
+        return Error::input(path, "header", expected, format!("none, in a file of {length} bytes"))
+            .hint("a header of Gaussians has a few kilobytes: the file is damaged or not a model");
+    }
+    let what = format!("the file ends after {length} bytes without one");
+    Error::input(path, "header", "an end_header line", what).hint("the file is cut short; copy it again")
+}
+
+/// Returns word `at` of a header line; empty if there are fewer words.
 fn word(line: &[u8], at: usize) -> &[u8] {
     excerpt(line).split(u8::is_ascii_whitespace).filter(|word| !word.is_empty()).nth(at).unwrap_or_default()
 }
 
-/// Enough of a line to hold any keyword with its arguments: binary data may lack line ends.
+/// Returns the first bytes of a line, enough for any keyword with its arguments. Binary data may have no line ends.
 fn excerpt(line: &[u8]) -> &[u8] {
     &line[..line.len().min(1024)]
 }
 
-/// A line as messages quote it.
+/// Returns a line as quoted in messages.
 fn found(line: &[u8]) -> String {
     let line = line.trim_ascii();
     match line.len() {

@@ -1,4 +1,4 @@
-//! Where a PLY row holds each plane of a Gaussian.
+//! Location of each plane of a Gaussian in a PLY row.
 //!
 //! In: the properties of element `vertex`. Out: [`PlyLayout`].
 
@@ -8,21 +8,21 @@ use super::header::{Element, Property};
 use crate::error::{Error, Result};
 use crate::model::{Columns, HIGHEST_DEGREE, sh_coefficients};
 
-/// Natural log of the thickness given to a surfel (2DGS, no `scale_2`), relative to its smaller
-/// axis: a thousandth. Relative, so that results do not depend on the scene's unit; thin enough to
-/// vanish under the rasteriser's 0.3 px² dilation, thick enough to stay an f32 covariance.
+/// Natural log of the thickness given to a surfel (2DGS, no `scale_2`), relative to its smaller axis: a thousandth.
+/// Relative, so that results do not depend on the unit of the scene; thin enough to vanish under the rasterizer's 0.3
+/// px² dilation, thick enough to give a valid f32 covariance.
 pub const THIN_LOG_SCALE: f32 = -6.907_755_4;
 
-/// The source of one plane.
+/// Source of one plane.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum PlaneSource {
-    /// A property of the row.
+    /// Property of the row.
     Property(Property),
-    /// The missing third scale of a surfel: min(scale_0, scale_1) + [`THIN_LOG_SCALE`].
+    /// Missing third scale of a surfel: min(scale_0, scale_1) + [`THIN_LOG_SCALE`].
     Thin,
 }
 
-/// The planes of every column, in the order of [`Gaussians`](crate::model::Gaussians).
+/// Sources of the planes of every attribute, in the order of [`Gaussians`](crate::model::Gaussians).
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct PlyLayout {
     pub(crate) sh_degree: usize,
@@ -33,7 +33,7 @@ impl PlyLayout {
     /// Finds the planes among the properties of `vertex`; any others are ignored.
     ///
     /// # Errors
-    /// A missing property, or a number of `f_rest` that belongs to no degree.
+    /// A missing property, or a number of `f_rest_*` properties that belongs to no SH degree.
     pub(crate) fn from_element(path: &Path, vertex: &Element) -> Result<PlyLayout> {
         let find = |name: &str| vertex.properties.iter().find(|property| property.name == name);
         let need = |name: &str| match find(name) {
@@ -54,7 +54,7 @@ impl PlyLayout {
             let expected = "0, 9, 24 or 45 properties f_rest_* (degree 0 to 3)";
             return Err(Error::input(path, "element vertex", expected, rest.to_string()));
         };
-        // The file holds all of red, then green, then blue; a plane is 3 · coefficient + channel.
+        // The file stores all of red, then green, then blue; a plane has index 3 · coefficient + channel.
         let per_channel = rest / 3;
         for coefficient in 0..per_channel {
             for channel in 0..3 {
@@ -64,25 +64,26 @@ impl PlyLayout {
         Ok(PlyLayout { sh_degree, planes: [position, rotation, log_scale, opacity, sh] })
     }
 
-    /// The planes of a single column.
+    /// Returns the planes of a single attribute.
     pub(crate) fn planes(&self, column: Columns) -> &[PlaneSource] {
         let index = Columns::all().iter().take_while(|&one| one != column).count();
         &self.planes[index]
     }
 }
 
-/// The name of a property of rows with harmonics of degree `from` once those above `to` are gone; none where it goes with
-/// them.
+/// Returns the name of a property after the SH degree has been reduced from `from` to `to`; `None` if the property is
+/// removed.
 pub(crate) fn name_without_bands(name: &str, from: usize, to: usize) -> Option<String> {
-    let [had, left] = [from, to.min(from)].map(|degree| sh_coefficients(degree) - 1);
+    let [old_count, new_count] = [from, to.min(from)].map(|degree| sh_coefficients(degree) - 1);
     let Some(number) = name.strip_prefix("f_rest_").and_then(|number| number.parse::<usize>().ok()) else {
         return Some(name.to_owned());
     };
-    // Only a header with some of them has such a name.
-    let (channel, coefficient) = (number / had.max(1), number % had.max(1));
-    (coefficient < left).then(|| format!("f_rest_{}", channel * left + coefficient))
+    // `max(1)`: only a header with SH coefficients above degree 0 has such a name.
+    let (channel, coefficient) = (number / old_count.max(1), number % old_count.max(1));
+    (coefficient < new_count).then(|| format!("f_rest_{}", channel * new_count + coefficient))
 }
 
+/// Returns the error for a missing property, with a hint about the kind of file.
 fn missing(path: &Path, vertex: &Element, name: &str) -> Error {
     let has = |name: &str| vertex.properties.iter().any(|property| property.name == name);
     let names: Vec<&str> = vertex.properties.iter().map(|property| property.name.as_str()).take(80).collect();

@@ -1,12 +1,12 @@
-//! Gaussians from a PLY file in the INRIA layout and its dialects.
+//! Reads Gaussians from a PLY file in the INRIA layout and its variants.
 //!
-//! In: a path. Out: planes of f32 for any list of Gaussians, and the rows as they lie in the file for
-//! writers that keep them. Memory: 2 MiB of a map of the file, or of a scratch file with the binary rows of a text file.
-//! Source: 3D Gaussian Splatting (Kerbl et al., 2023), `save_ply` of its public code.
+//! In: a path. Out: planes of f32 for any list of Gaussians, and the stored rows for writers that copy them. Memory: 2
+//! MiB of a memory map of the file, or of a scratch file with the binary rows of a text file. Source: 3D Gaussian
+//! Splatting (Kerbl et al., 2023), `save_ply` of its public code.
 //!
-//! Accepted: binary of either byte order and text; any number type per property; properties in any
-//! order, further ones, no normals; comments; LF or CRLF; further elements before or after `vertex`;
-//! no `scale_2` (2DGS, see [`THIN_LOG_SCALE`]); bytes after the last element. NaN is no error here.
+//! Accepted: binary of either byte order and text; any number type per property; properties in any order, extra
+//! properties, no normals; comments; LF or CRLF; extra elements before or after `vertex`; no `scale_2` (2DGS, see
+//! [`THIN_LOG_SCALE`]); bytes after the last element. NaN values are accepted here.
 
 mod ascii;
 mod header;
@@ -34,19 +34,19 @@ use crate::model::{Column, Columns, Gaussians};
 use crate::progress::Events;
 use crate::source::Ids;
 
-/// Rows handled together, so that all planes of them are taken from cache: 32 KiB at degree 3.
+/// Maximum number of rows read together, so that all their planes are read from the cache: 32 KiB at degree 3.
 const BLOCK_ROWS: usize = 128;
-/// Bytes of rows handled together.
+/// Maximum number of bytes of rows read together.
 const BLOCK_BYTES: usize = 1 << 20;
 
-/// How PLY files may be read.
+/// Options for reading PLY files.
 #[derive(Debug, Clone)]
 pub struct PlyOptions {
     /// Folder for the scratch file that holds the rows of text files while they are open.
     pub scratch: PathBuf,
-    /// Memory that reading a whole file may take.
+    /// Maximum memory for reading a whole file.
     pub memory: ReadLimit,
-    /// Where the progress of linking frames goes.
+    /// Receiver of the progress of linking frames.
     pub events: Events,
 }
 
@@ -56,14 +56,14 @@ impl Default for PlyOptions {
     }
 }
 
-/// Parses the header at the start of `bytes`, the content of `path`, and returns the number of Gaussians that it
-/// announces. Says nothing about the rows behind it.
+/// Parses the header at the start of `bytes`, the content of `path`, and returns the number of Gaussians it declares.
+/// Does not check the rows after it.
 ///
 /// # Errors
-/// Those of [`Ply::open_with`] that the header alone shows.
+/// The errors of [`Ply::open_with`] that depend only on the header.
 pub fn check_header(bytes: &[u8], path: &Path) -> Result<u64> {
     let header = PlyHeader::parse(path, bytes)?;
-    let vertex = vertex_of(&header, path)?;
+    let vertex = vertex_element(&header, path)?;
     PlyLayout::from_element(path, vertex)?;
     Ok(vertex.count)
 }
@@ -77,40 +77,41 @@ pub struct Ply {
     stride: usize,
     properties: Vec<Property>,
     body: PlyBody,
-    /// Where the rows of `vertex` lie in the body.
+    /// Range of the rows of `vertex` in the body.
     rows: Range<usize>,
     count: usize,
     memory: ReadLimit,
 }
 
-/// The tables of a file after its header.
+/// Tables of a file, after its header.
 #[derive(Debug)]
 struct PlyBody {
-    /// The whole file, or the converted rows of a text file.
+    /// Memory map of the whole file, or of the converted rows of a text file.
     map: FileMap,
-    /// Where the tables start in the map.
+    /// Offset of the tables in the map.
     start: usize,
-    /// Of a text file: its length in bytes, and where its converted rows are.
+    /// Length of a text file in bytes, and its converted rows; `None` for a binary file.
     text: Option<(u64, TextRows)>,
 }
 
 impl PlyBody {
+    /// Returns the bytes of the body.
     fn bytes(&self) -> &[u8] {
         &self.map[self.start..]
     }
 
-    /// Returns `range` of the body in the map.
+    /// Converts a range of the body to a range of the map.
     fn range(&self, range: Range<usize>) -> Range<usize> {
         self.start + range.start..self.start + range.end
     }
 }
 
 impl Ply {
-    /// Opens the file at `path` and checks its header against its size. Rows of a text file lie in the system's folder
-    /// for temporary files.
+    /// Opens the file at `path` and checks its header against its size. Converted rows of a text file are kept in the
+    /// system's folder for temporary files.
     ///
     /// # Errors
-    /// Those of [`Ply::open_with`].
+    /// The errors of [`Ply::open_with`].
     pub fn open(path: &Path) -> Result<Ply> {
         Self::open_with(path, &PlyOptions::default())
     }
@@ -118,23 +119,24 @@ impl Ply {
     /// Opens the file at `path` and checks its header against its size.
     ///
     /// # Errors
-    /// Not a PLY; a malformed header; a missing property; a list property; a number of `f_rest_*` that
-    /// belongs to no SH degree; more than `u32::MAX` Gaussians; fewer bytes than the header declares; in
-    /// a text file, a row that cannot be read.
+    /// Not a PLY; a malformed header; a missing property; a list property; a number of `f_rest_*` that belongs to no SH
+    /// degree; more than `u32::MAX` Gaussians; fewer bytes than the header declares; in a text file, a row that cannot
+    /// be read.
     pub fn open_with(path: &Path, options: &PlyOptions) -> Result<Ply> {
         Self::open_into(path, options.memory, &TextStore::new(&options.scratch))
     }
 
-    /// Opens the file at `path`; rows of a text file go to `texts`.
+    /// Opens the file at `path`; converted rows of a text file are written to `texts`.
     pub(crate) fn open_into(path: &Path, memory: ReadLimit, texts: &TextStore) -> Result<Ply> {
         Self::with_text_rows(path, memory, |header| texts.convert(path, header, open_file(path)?))
     }
 
-    /// Opens the file at `path` again. `text` are its rows if it is a text file.
+    /// Opens the file at `path` again. `text` holds its converted rows if it is a text file.
     pub(crate) fn open_again(path: &Path, memory: ReadLimit, text: Option<&TextRows>) -> Result<Ply> {
-        Self::with_text_rows(path, memory, |_| text.cloned().ok_or_else(|| changed(path)))
+        Self::with_text_rows(path, memory, |_| text.cloned().ok_or_else(|| encoding_changed(path)))
     }
 
+    /// Opens the file at `path`; `convert` provides the converted rows if it is a text file.
     fn with_text_rows(
         path: &Path,
         memory: ReadLimit,
@@ -142,7 +144,7 @@ impl Ply {
     ) -> Result<Ply> {
         let map = FileMap::open(path)?;
         let header = PlyHeader::parse(path, &map)?;
-        let vertex = vertex_of(&header, path)?;
+        let vertex = vertex_element(&header, path)?;
         let (stride, properties) = (vertex.stride, vertex.properties.clone());
         let layout = PlyLayout::from_element(path, vertex)?;
         let count = u32::try_from(vertex.count)
@@ -160,15 +162,15 @@ impl Ply {
         Ok(Ply { path: path.to_owned(), header, layout, stride, properties, body, rows, count, memory })
     }
 
-    /// The converted rows of a text file, for [`Ply::open_again`].
+    /// Returns the converted rows of a text file, for [`Ply::open_again`]; `None` for a binary file.
     pub(crate) fn text_rows(&self) -> Option<&TextRows> {
         self.body.text.as_ref().map(|(_, rows)| rows)
     }
 
-    /// Reads all columns of all Gaussians.
+    /// Reads all attributes of all Gaussians.
     ///
     /// # Errors
-    /// More than the memory that reading may take; a file cut short since it was opened.
+    /// The memory limit is exceeded; the file was truncated since it was opened.
     pub(crate) fn whole(&self) -> Result<Gaussians> {
         let bytes = 4 * Columns::all().width(self.sh_degree()) as u64 * self.count as u64;
         self.memory.check(&self.path, "element vertex", "the Gaussians of the file", bytes)?;
@@ -177,41 +179,41 @@ impl Ply {
         Ok(out)
     }
 
-    /// The file.
+    /// Returns the path of the file.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// N, the number of Gaussians.
+    /// Returns N, the number of Gaussians.
     pub fn count(&self) -> usize {
         self.count
     }
 
-    /// Degree of the spherical harmonics, 0 to 3.
+    /// Returns the SH degree, 0 to 3.
     pub fn sh_degree(&self) -> usize {
         self.layout.sh_degree
     }
 
-    /// Texts of the `comment` lines, in order.
+    /// Returns the texts of the `comment` lines, in order.
     pub fn comments(&self) -> &[String] {
         &self.header.comments
     }
 
-    /// The properties of a Gaussian's row, in file order.
+    /// Returns the properties of the row of a Gaussian, in file order.
     pub fn properties(&self) -> &[Property] {
         &self.properties
     }
 
-    /// Writes the columns `want` of the Gaussians `range` into `out`, as [`Ply::gather`] does.
+    /// Writes the attributes `want` of the Gaussians `range` into `out`, as [`Ply::gather`] does.
     pub fn gaussians(&self, range: Range<usize>, want: Columns, out: &mut Gaussians) -> Result<()> {
         self.gather(&Ids::Range(range), want, out)
     }
 
-    /// Writes the columns `want` of the Gaussians `ids`, in that order, into `out`, which is resized to
-    /// them. An f32 keeps its bits; other number types become the nearest f32.
+    /// Writes the attributes `want` of the Gaussians `ids`, in that order, into `out`, which is resized to their
+    /// number. f32 values keep their bits; values of other types are rounded to the nearest f32.
     ///
     /// # Errors
-    /// An id beyond the last Gaussian; a file cut short since it was opened.
+    /// An id beyond the last Gaussian; a file truncated since it was opened.
     pub fn gather(&self, ids: &Ids<'_>, want: Columns, out: &mut Gaussians) -> Result<()> {
         self.check_unshrunk()?;
         check_ids(&self.path, ids, self.count)?;
@@ -226,7 +228,7 @@ impl Ply {
         let big_endian = self.header.encoding == PlyEncoding::BigEndian;
         let mut starts = Vec::with_capacity(BLOCK_ROWS);
         let mut ids_left = ids.iter();
-        // Rows with thousands of properties: few of them, so that few of their pages are resident.
+        // If rows have thousands of properties, fewer are read together, so that few of their pages are resident.
         let together = (BLOCK_BYTES / self.stride.max(1)).clamp(1, BLOCK_ROWS);
         for first in (0..ids.len()).step_by(together) {
             starts.clear();
@@ -250,10 +252,10 @@ impl Ply {
         Ok(())
     }
 
-    /// The property `name` of all Gaussians, as the nearest f32; none where there is no such property.
+    /// Returns the property `name` of all Gaussians, rounded to the nearest f32; `None` if there is no such property.
     ///
     /// # Errors
-    /// A file cut short since it was opened.
+    /// The file was truncated since it was opened.
     pub(crate) fn values(&self, name: &str) -> Result<Option<Vec<f32>>> {
         self.check_unshrunk()?;
         let Some(property) = self.properties.iter().find(|property| property.name == name) else { return Ok(None) };
@@ -268,7 +270,7 @@ impl Ply {
         Ok(Some(values))
     }
 
-    /// Bytes of the file that reading `rows` Gaussians takes, whatever their columns: of a text file all.
+    /// Returns the number of bytes of the file that must be read for `rows` Gaussians: all bytes of a text file.
     pub(crate) fn bytes_of(&self, rows: usize) -> u64 {
         match &self.body.text {
             None => (rows * self.stride) as u64,
@@ -276,49 +278,49 @@ impl Ply {
         }
     }
 
-    /// The header, for writers.
+    /// Returns the header, for writers.
     pub(crate) fn header(&self) -> &PlyHeader {
         &self.header
     }
 
-    /// Where a row holds what, for writers.
+    /// Returns the layout of a row, for writers.
     pub(crate) fn layout(&self) -> &PlyLayout {
         &self.layout
     }
 
-    /// The bytes of Gaussian `i` in a binary body.
+    /// Returns the bytes of Gaussian `i` in a binary body.
     pub(crate) fn row(&self, i: usize) -> &[u8] {
         self.touch(&[i * self.stride]);
         &self.body.bytes()[self.rows.clone()][i * self.stride..(i + 1) * self.stride]
     }
 
-    /// Number of bytes that a binary body holds before the rows of `vertex`, and after them.
+    /// Returns the number of bytes in a binary body before and after the rows of `vertex`.
     pub(crate) fn bytes_around(&self) -> [usize; 2] {
         [self.rows.start, self.body.bytes().len() - self.rows.end]
     }
 
-    /// Writes what a binary body holds before the rows of `vertex`.
+    /// Writes the bytes of a binary body before the rows of `vertex`.
     pub(crate) fn write_lead(&self, out: &mut dyn Write) -> io::Result<()> {
         self.body.map.pieces(self.body.range(0..self.rows.start), |piece| out.write_all(piece))
     }
 
-    /// Writes what a binary body holds after the rows of `vertex`.
+    /// Writes the bytes of a binary body after the rows of `vertex`.
     pub(crate) fn write_tail(&self, out: &mut dyn Write) -> io::Result<()> {
         let end = self.body.bytes().len();
         self.body.map.pieces(self.body.range(self.rows.end..end), |piece| out.write_all(piece))
     }
 
-    /// Memory that reading the whole file may take.
+    /// Returns the maximum memory for reading the whole file.
     pub(crate) fn memory(&self) -> ReadLimit {
         self.memory
     }
 
-    /// Confirms that a mapped file still has its bytes.
+    /// Checks that the mapped file has not been truncated.
     pub(crate) fn check_unshrunk(&self) -> Result<()> {
         self.body.map.check()
     }
 
-    /// Records that the rows which begin at `starts` are about to be read.
+    /// Records that the rows that begin at `starts` are about to be read.
     fn touch(&self, starts: &[usize]) {
         let first = self.body.start + self.rows.start;
         for run in starts.chunk_by(|a, b| a + self.stride == *b) {
@@ -328,18 +330,18 @@ impl Ply {
     }
 }
 
-/// The element that holds the Gaussians.
-fn vertex_of<'a>(header: &'a PlyHeader, path: &Path) -> Result<&'a Element> {
+/// Returns the element that holds the Gaussians.
+fn vertex_element<'a>(header: &'a PlyHeader, path: &Path) -> Result<&'a Element> {
     header.vertex().ok_or_else(|| Error::input(path, "header", "an element \"vertex\"", "none"))
 }
 
-/// Error for a file that was binary when it was opened first.
-fn changed(path: &Path) -> Error {
+/// Returns the error for a file that was binary when it was first opened.
+fn encoding_changed(path: &Path) -> Error {
     Error::input(path, "header", "a binary body, as before", "a text body")
         .hint("the file has changed since it was opened")
 }
 
-/// Confirms that every id is below `count`.
+/// Checks that every id is below `count`.
 pub(crate) fn check_ids(path: &Path, ids: &Ids<'_>, count: usize) -> Result<()> {
     let beyond = match ids {
         Ids::Range(range) => (range.end > count && !range.is_empty()).then(|| range.end - 1),
@@ -353,7 +355,7 @@ pub(crate) fn check_ids(path: &Path, ids: &Ids<'_>, count: usize) -> Result<()> 
     }
 }
 
-/// Where the rows of `vertex` lie in a binary body of `available` bytes.
+/// Returns the range of the rows of `vertex` in a binary body of `available` bytes.
 fn vertex_rows(path: &Path, header: &PlyHeader, available: usize) -> Result<Range<usize>> {
     let mut end = 0u64;
     let mut rows = 0..0;
@@ -369,7 +371,7 @@ fn vertex_rows(path: &Path, header: &PlyHeader, available: usize) -> Result<Rang
         };
         end = next;
         if element.name == "vertex" {
-            // Both fit usize: they are at most `available`.
+            // Both fit into usize because they are at most `available`.
             rows = start as usize..next as usize;
         }
     }
@@ -397,6 +399,7 @@ pub(crate) fn read_plane(rows: &[u8], starts: &[usize], property: &Property, big
     }
 }
 
+/// Converts the `W` bytes at `offset` of each row.
 fn fill<const W: usize>(
     rows: &[u8],
     starts: &[usize],

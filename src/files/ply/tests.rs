@@ -6,7 +6,7 @@ use proptest::prelude::*;
 
 use super::*;
 
-/// The properties of a degree-1 model, no normals, a foreign one between.
+/// Returns the properties of a degree-1 model without normals, with one extra property among them.
 pub(crate) fn names() -> Vec<String> {
     let mut names: Vec<String> = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2"].map(String::from).to_vec();
     names.extend((0..9).map(|k| format!("f_rest_{k}")));
@@ -15,7 +15,7 @@ pub(crate) fn names() -> Vec<String> {
     names
 }
 
-/// The value the tests give property `p` of Gaussian `i`: exact in every number type but the 8-bit ones.
+/// Returns the value of property `p` of Gaussian `i` in these tests: exact in every number type but the 8-bit ones.
 fn value(i: usize, p: usize) -> i16 {
     (100 * i + p) as i16 - 50
 }
@@ -26,7 +26,7 @@ fn header(format: &str, kind: &str, names: &[String], count: &str, line_end: &st
     (text + "end_header\n").replace('\n', line_end)
 }
 
-/// A file of `count` Gaussians with every property of type `kind`.
+/// Returns a file of `count` Gaussians whose properties all have the type `kind`.
 pub(crate) fn file(format: &str, kind: &str, names: &[String], count: usize, line_end: &str) -> Vec<u8> {
     let mut bytes = header(format, kind, names, &count.to_string(), line_end).into_bytes();
     for i in 0..count {
@@ -79,15 +79,15 @@ fn all(ply: &Ply) -> Gaussians {
     out
 }
 
-/// What [`file`] holds, by name: independent of the layout under test.
+/// Returns the Gaussians that [`file`] writes, found by property name, independently of the layout under test.
 fn expected(count: usize, names: &[String]) -> Gaussians {
     let mut out = Gaussians::zeros(count, 1);
     for i in 0..count {
-        let of = |name: &str| f32::from(value(i, names.iter().position(|n| n == name).unwrap()));
-        out.position.set_row(i, [of("x"), of("y"), of("z")]);
-        out.rotation.set_row(i, [of("rot_0"), of("rot_1"), of("rot_2"), of("rot_3")]);
-        out.log_scale.set_row(i, [of("scale_0"), of("scale_1"), of("scale_2")]);
-        out.opacity_logit.set_row(i, [of("opacity")]);
+        let property = |name: &str| f32::from(value(i, names.iter().position(|n| n == name).unwrap()));
+        out.position.set_row(i, [property("x"), property("y"), property("z")]);
+        out.rotation.set_row(i, [property("rot_0"), property("rot_1"), property("rot_2"), property("rot_3")]);
+        out.log_scale.set_row(i, [property("scale_0"), property("scale_1"), property("scale_2")]);
+        out.opacity_logit.set_row(i, [property("opacity")]);
         // Coefficients 1, 2, 3 of red are f_rest_0..2, of green 3..5, of blue 6..8.
         out.sh.set_row(
             i,
@@ -95,7 +95,7 @@ fn expected(count: usize, names: &[String]) -> Gaussians {
                 "f_dc_0", "f_dc_1", "f_dc_2", "f_rest_0", "f_rest_3", "f_rest_6", "f_rest_1", "f_rest_4", "f_rest_7",
                 "f_rest_2", "f_rest_5", "f_rest_8",
             ]
-            .map(of),
+            .map(property),
         );
     }
     out
@@ -121,7 +121,7 @@ fn every_encoding_type_order_and_line_end_reads_the_same() {
 }
 
 #[test]
-fn any_list_in_any_order_reads_the_rows_of_the_whole() {
+fn any_list_of_ids_reads_the_same_rows() {
     let ply = open(&float_file(300)).unwrap();
     let whole = all(&ply);
     let ids: Vec<u32> = (0..290).map(|i| (i * 97 + 13) % 300).collect();
@@ -136,7 +136,7 @@ fn any_list_in_any_order_reads_the_rows_of_the_whole() {
 }
 
 #[test]
-fn columns_not_asked_for_are_left_alone() {
+fn unrequested_attributes_are_unchanged() {
     let ply = open(&float_file(3)).unwrap();
     let mut out = Gaussians::zeros(3, 1);
     out.sh.planes_mut().fill(7.0);
@@ -169,7 +169,7 @@ fn every_bit_of_an_f32_survives() {
 }
 
 #[test]
-fn a_surfel_is_a_thousandth_as_thick_as_its_smaller_axis() {
+fn surfel_thickness_is_a_thousandth_of_the_smaller_axis() {
     let names: Vec<String> = names().into_iter().filter(|name| name != "scale_2").collect();
     let out = all(&open(&file("binary_little_endian", "float", &names, 2, "\n")).unwrap());
     for i in 0..2 {
@@ -180,7 +180,7 @@ fn a_surfel_is_a_thousandth_as_thick_as_its_smaller_axis() {
 }
 
 #[test]
-fn further_elements_and_bytes_are_stepped_over() {
+fn extra_elements_and_bytes_are_skipped() {
     let names = names();
     let plain = float_file(2);
     let text = header("binary_little_endian", "float", &names, "2", "\n");
@@ -202,7 +202,7 @@ fn further_elements_and_bytes_are_stepped_over() {
 }
 
 #[test]
-fn what_is_no_ply_says_so() {
+fn other_files_are_refused_as_not_ply() {
     for bytes in [&b""[..], b"PK\x03\x04zip", b"plyx\n", &[0; 5000]] {
         assert!(refusal(bytes).contains("not a PLY"), "{:?}", String::from_utf8_lossy(bytes));
     }
@@ -213,19 +213,23 @@ fn what_is_no_ply_says_so() {
 
 #[test]
 fn a_missing_property_is_named() {
-    let of = |names: &[String]| refusal(&file("binary_little_endian", "float", names, 2, "\n"));
+    let message_for = |names: &[String]| refusal(&file("binary_little_endian", "float", names, 2, "\n"));
     for name in ["x", "f_dc_2", "opacity", "scale_1", "rot_3"] {
         let names: Vec<String> = names().into_iter().filter(|n| n != name).collect();
-        let message = of(&names);
+        let message = message_for(&names);
         assert!(message.contains(&format!("property {name},")), "{message}");
     }
     let names: Vec<String> = names().into_iter().filter(|n| n != "f_rest_3").collect();
-    assert!(of(&names).contains("0, 9, 24 or 45") && of(&names).contains("found 8"), "{}", of(&names));
-    assert!(of(&["packed_position".to_owned()]).contains("compressed PLY"));
+    assert!(
+        message_for(&names).contains("0, 9, 24 or 45") && message_for(&names).contains("found 8"),
+        "{}",
+        message_for(&names)
+    );
+    assert!(message_for(&["packed_position".to_owned()]).contains("compressed PLY"));
 }
 
 #[test]
-fn a_truncated_body_counts_its_bytes() {
+fn a_truncated_body_is_refused_with_its_length() {
     let bytes = float_file(10);
     let message = refusal(&bytes[..bytes.len() - 1]);
     let stride = 4 * names().len();
@@ -234,13 +238,13 @@ fn a_truncated_body_counts_its_bytes() {
 }
 
 #[test]
-fn absurd_counts_are_refused_before_anything_is_allocated() {
+fn absurd_counts_are_refused_before_allocation() {
     for format in ["ascii", "binary_little_endian"] {
         for count in ["4000000000", "4294967296", "18446744073709551615", "999999999999999999999", "-1", "many"] {
             let message = refusal(header(format, "float", &names(), count, "\n").as_bytes());
             assert!(message.contains("expected"), "{message}");
         }
-        // Rows of nothing take no bytes: no number of them may keep the reader busy.
+        // Rows without properties take no bytes; a huge number of them must not keep the reader busy.
         let rest = header(format, "float", &names(), "0", "\n");
         let endless = rest.replace("element vertex", "element nothing 18446744073709551615\nelement vertex");
         assert_eq!(open(endless.as_bytes()).unwrap().count(), 0);
@@ -248,9 +252,9 @@ fn absurd_counts_are_refused_before_anything_is_allocated() {
 }
 
 #[test]
-fn a_bad_word_in_text_is_shown_with_its_line() {
+fn invalid_words_in_text_are_named_with_their_line() {
     let good = String::from_utf8(file("ascii", "float", &names(), 3, "\n")).unwrap();
-    // Two lines of header come before the element, one per property, one to end it; blank lines count.
+    // The header has two lines before the element, one per property and one at its end; blank lines count.
     let row = 4 + names().len() + 1 + 1;
     let message = refusal(good.replace("\n50 ", "\n\nfifty ").as_bytes());
     assert!(message.contains(&format!("line {}", row + 2)) && message.contains("\"fifty\""), "{message}");
@@ -266,7 +270,7 @@ fn a_bad_word_in_text_is_shown_with_its_line() {
 }
 
 #[test]
-fn headers_that_contradict_themselves_are_refused_by_line() {
+fn contradictory_headers_are_refused_with_the_line() {
     let good = header("binary_little_endian", "float", &names(), "0", "\n");
     open(good.as_bytes()).unwrap();
     for (from, to, says) in [
@@ -286,8 +290,8 @@ fn headers_that_contradict_themselves_are_refused_by_line() {
     }
 }
 
-/// Opens and reads whatever `bytes` are; only a panic or a hang fails.
-fn survive(bytes: &[u8], path: &Path) -> bool {
+/// Opens and reads arbitrary `bytes` and returns whether they were accepted; only a panic or a hang fails.
+fn open_and_read(bytes: &[u8], path: &Path) -> bool {
     fs::write(path, bytes).unwrap();
     match Ply::open(path) {
         Ok(ply) => {
@@ -304,17 +308,17 @@ fn survive(bytes: &[u8], path: &Path) -> bool {
 }
 
 #[test]
-fn no_truncation_is_read_as_a_whole_file() {
+fn truncated_files_are_refused() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("a.ply");
     for format in ["ascii", "binary_little_endian", "binary_big_endian"] {
         let bytes = file(format, "float", &names(), 3, "\n");
-        // Text may lose the space and the line end after its last number, and digits of it.
+        // A text file may lose the space and line end after its last number, and some of its digits.
         let whole = if format == "ascii" { bytes.len() - 4 } else { bytes.len() };
         for len in 0..whole {
-            assert!(!survive(&bytes[..len], &path), "{format} cut to {len} of {} bytes", bytes.len());
+            assert!(!open_and_read(&bytes[..len], &path), "{format} cut to {len} of {} bytes", bytes.len());
         }
-        assert!(survive(&bytes, &path));
+        assert!(open_and_read(&bytes, &path));
     }
 }
 
@@ -322,7 +326,7 @@ proptest! {
     #![proptest_config(ProptestConfig { cases: 400, ..ProptestConfig::default() })]
 
     #[test]
-    fn no_damage_makes_the_reader_panic(
+    fn damaged_files_never_cause_a_panic(
         format in prop::sample::select(vec!["ascii", "binary_little_endian", "binary_big_endian"]),
         flips in prop::collection::vec((any::<prop::sample::Index>(), 0..8u32), 1..6),
         splice in prop::option::of((any::<prop::sample::Index>(), "[ -~\n]{0,12}")),
@@ -337,7 +341,7 @@ proptest! {
             let at = at.index(bytes.len());
             bytes.splice(at..at, text.bytes());
         }
-        survive(&bytes, &folder.path().join("a.ply"));
+        open_and_read(&bytes, &folder.path().join("a.ply"));
     }
 }
 
@@ -355,7 +359,7 @@ fn real_models_open() {
     }
 }
 
-/// The folder of trained models: `SPLATSIEVE_DATA`, else `../shared/data`, which must be there.
+/// Returns the folder of trained models: `SPLATSIEVE_DATA`, else `../shared/data`, which must exist.
 pub(crate) fn shared_data() -> PathBuf {
     let beside = || Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data");
     let data = env::var_os("SPLATSIEVE_DATA").map_or_else(beside, PathBuf::from);

@@ -1,7 +1,7 @@
-//! Gaussians to PLY files.
+//! Writes Gaussians to PLY files.
 //!
-//! In: Gaussians, or an open PLY and the rows to keep of it. Out: a file at the path given. Memory: one
-//! row. Writers that go through [`crate::files::atomic`] pass its temporary path.
+//! In: Gaussians, or an open PLY and the rows to keep of it. Out: a file at the given path. Memory: one row. Callers
+//! that use [`crate::files::atomic`] pass its temporary path.
 
 use std::fs::File;
 use std::io::{self, BufWriter, Write};
@@ -18,13 +18,13 @@ use crate::model::{Columns, Gaussians, HIGHEST_DEGREE, sh_coefficients};
 /// One row of a smaller PLY.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct OutRow {
-    /// The Gaussian of the template whose row is copied: itself, or the leader of its cluster.
+    /// Gaussian of the template whose row is copied: the Gaussian itself, or the leader of its cluster.
     pub source: u32,
-    /// The proxy whose columns replace those of the row, if any.
+    /// Index of the proxy whose attributes replace those of the row, if any.
     pub proxy: Option<u32>,
 }
 
-/// The rows of what `reduction` leaves.
+/// Returns the rows to write for the compressed model `reduction`.
 pub fn out_rows(reduction: &CompressedModel) -> Vec<OutRow> {
     let mut rows: Vec<OutRow> = reduction.kept.iter().map(|&source| OutRow { source, proxy: None }).collect();
     for (proxy, cluster) in reduction.clusters.iter().enumerate() {
@@ -33,19 +33,20 @@ pub fn out_rows(reduction: &CompressedModel) -> Vec<OutRow> {
     rows
 }
 
-/// Writes a smaller PLY with the header of `template` (properties, order, types, comments, line ends):
-/// only the count changes, and harmonics above `sh_degree` go, so that `f_rest_*` are numbered anew. What stays of a row
-/// without a proxy is the template's, byte for byte but for what `change`, by row, adds to it (zeros leave the bytes). A
-/// row with one is the template's with position, rotation, log_scale, opacity_logit and sh replaced, each in the type of
-/// its property (integers: nearest, saturated); normals and further properties stay the leader's. A template without
-/// `scale_2` has no place for a proxy's third scale: order axes largest first.
+/// Writes a smaller PLY with the header of `template` (properties, order, types, comments, line ends). Only the count
+/// changes, and SH coefficients above `sh_degree` are removed, so that `f_rest_*` are renumbered.
 ///
-/// Further elements and bytes after the last one are copied. A text template becomes little-endian
-/// binary; otherwise all rows in order without proxies give the template's own bytes.
+/// A row without a proxy keeps the bytes of the template, except that `change` is added to its values (zeros leave the
+/// bytes unchanged). A row with a proxy is the leader's row with position, rotation, log_scale, opacity_logit and sh
+/// replaced, each in the type of its property (integers: nearest, saturated); normals and extra properties stay the
+/// leader's. A template without `scale_2` cannot store the third scale of a proxy: order the axes largest first.
+///
+/// Other elements and bytes after the last one are copied. A text template becomes little-endian binary. Otherwise,
+/// writing all rows in order without proxies gives the bytes of the template.
 ///
 /// # Errors
-/// A source or proxy that does not exist; proxies of another SH degree; changes of other rows; a template cut short since
-/// it was opened; a failed write.
+/// A source or proxy does not exist; proxies have another SH degree; `change` has another number of rows; the template
+/// was truncated since it was opened; the file cannot be written.
 pub fn write_like(
     template: &Ply,
     rows: &[OutRow],
@@ -66,11 +67,12 @@ pub fn write_like(
     })
 }
 
-/// Writes the rows `sources` of `template`, each as `edit` leaves its bytes, given its place; properties get other names or
-/// go. Further elements and bytes after the last one are copied.
+/// Writes the rows `sources` of `template`. `edit` receives the index of each output row and its bytes, and may change
+/// them. `name` returns the new name of a property, or `None` to remove it. Other elements and bytes after the last one
+/// are copied.
 ///
 /// # Errors
-/// A source that does not exist; a template cut short since it was opened; a failed write.
+/// A source does not exist; the template was truncated since it was opened; the file cannot be written.
 pub(crate) fn write_rows_like(
     template: &Ply,
     sources: &[u32],
@@ -83,12 +85,12 @@ pub(crate) fn write_rows_like(
         let (path, count) = (template.path().shown(), template.count());
         return Err(Error::internal(format!("{path}: Gaussian {source} is to be kept, of {count} from 0")));
     }
-    let mut left: Vec<Range<usize>> = Vec::new();
+    let mut kept_ranges: Vec<Range<usize>> = Vec::new();
     for property in template.properties().iter().filter(|property| name(&property.name).is_some()) {
         let end = property.offset + property.scalar.bytes();
-        match left.last_mut() {
+        match kept_ranges.last_mut() {
             Some(last) if last.end == property.offset => last.end = end,
-            _ => left.push(property.offset..end),
+            _ => kept_ranges.push(property.offset..end),
         }
     }
     create(path, |out| {
@@ -99,17 +101,17 @@ pub(crate) fn write_rows_like(
             changed.clear();
             changed.extend_from_slice(template.row(source as usize));
             edit(place, &mut changed);
-            left.iter().try_for_each(|range| out.write_all(&changed[range.clone()]))?;
+            kept_ranges.iter().try_for_each(|range| out.write_all(&changed[range.clone()]))?;
         }
         template.write_tail(out)
     })
 }
 
-/// Writes `gaussians` in the INRIA layout: binary little-endian f32, zero normals, `comments` as
-/// comment lines (line breaks in them become spaces). An f32 keeps its bits.
+/// Writes `gaussians` in the INRIA layout: binary little-endian f32, zero normals, `comments` as comment lines (line
+/// breaks in them become spaces). f32 values keep their bits.
 ///
 /// # Errors
-/// A failed write; an SH width that belongs to no degree from 0 to 3.
+/// The file cannot be written; the SH width belongs to no degree from 0 to 3.
 pub fn write_inria(gaussians: &Gaussians, comments: &[String], path: &Path) -> Result<()> {
     let width = gaussians.sh.width();
     if !(0..=HIGHEST_DEGREE).any(|degree| 3 * sh_coefficients(degree) == width) {
@@ -121,7 +123,7 @@ pub fn write_inria(gaussians: &Gaussians, comments: &[String], path: &Path) -> R
     planes.extend((0..3).map(|c| gaussians.position.plane(c)));
     planes.extend([zeros.as_slice(); 3]);
     planes.extend((0..3).map(|c| gaussians.sh.plane(c)));
-    // The file holds all of red, then green, then blue; a plane is 3 · coefficient + channel.
+    // The file stores all of red, then green, then blue; a plane has index 3 · coefficient + channel.
     planes.extend((0..3).flat_map(|channel| (1..=rest / 3).map(move |k| gaussians.sh.plane(3 * k + channel))));
     planes.push(gaussians.opacity_logit.plane(0));
     planes.extend((0..3).map(|c| gaussians.log_scale.plane(c)));
@@ -137,6 +139,7 @@ pub fn write_inria(gaussians: &Gaussians, comments: &[String], path: &Path) -> R
     })
 }
 
+/// Returns the header of an INRIA file with `count` Gaussians and `rest` properties `f_rest_*`.
 fn inria_header(count: usize, rest: usize, comments: &[String]) -> String {
     let mut header = "ply\nformat binary_little_endian 1.0\n".to_owned();
     for comment in comments {
@@ -152,23 +155,23 @@ fn inria_header(count: usize, rest: usize, comments: &[String]) -> String {
     header + "end_header\n"
 }
 
-/// What of the rows of `template` is no attribute of a Gaussian, of each of `rows` one after the other.
+/// Returns the extra (non-Gaussian) properties of `rows` of `template`, one row after another, as stored.
 pub(crate) fn beside(template: &Ply, rows: impl Iterator<Item = u32>) -> Vec<u8> {
-    let ranges = ranges_beside(template.properties(), template.layout());
+    let ranges = extra_ranges(template.properties(), template.layout());
     rows.flat_map(|row| ranges.iter().flat_map(move |range| template.row(row as usize)[range.clone()].to_vec()))
         .collect()
 }
 
-/// Bytes of each row of `template` that are no attribute of a Gaussian.
+/// Returns the number of bytes of the extra (non-Gaussian) properties of each row of `template`.
 pub(crate) fn bytes_beside(template: &Ply) -> usize {
-    ranges_beside(template.properties(), template.layout()).iter().map(ExactSizeIterator::len).sum()
+    extra_ranges(template.properties(), template.layout()).iter().map(ExactSizeIterator::len).sum()
 }
 
-/// Writes a PLY with `header`, read from `from`, `cloud` as its rows with what is `beside` each, and what is before and
-/// after them.
+/// Writes a PLY with `header`, read from `from`. The rows hold `cloud` and the extra properties `beside`; `lead` and
+/// `tail` are the bytes before and after the rows.
 ///
 /// # Errors
-/// A header that is of no such rows; a failed write.
+/// The header does not match the rows; the file cannot be written.
 pub(crate) fn write_rows(
     from: &Path,
     header: &PlyHeader,
@@ -182,7 +185,7 @@ pub(crate) fn write_rows(
         return Err(mismatch(format!("{} rows", cloud.len())));
     };
     let layout = PlyLayout::from_element(from, vertex)?;
-    let ranges = ranges_beside(&vertex.properties, &layout);
+    let ranges = extra_ranges(&vertex.properties, &layout);
     let width: usize = ranges.iter().map(|range| range.len()).sum();
     if layout.planes(Columns::SH).len() != cloud.sh.width() || width * cloud.len() != beside.len() {
         return Err(mismatch("the properties of the rows".to_owned()));
@@ -206,8 +209,8 @@ pub(crate) fn write_rows(
     })
 }
 
-/// Where a row holds what is no attribute of a Gaussian.
-fn ranges_beside(properties: &[Property], layout: &PlyLayout) -> Vec<Range<usize>> {
+/// Returns the byte ranges of a row that hold extra (non-Gaussian) properties.
+fn extra_ranges(properties: &[Property], layout: &PlyLayout) -> Vec<Range<usize>> {
     let mut used: Vec<usize> = Vec::new();
     for column in Columns::all().iter() {
         used.extend(layout.planes(column).iter().filter_map(|plane| match plane {
@@ -219,12 +222,13 @@ fn ranges_beside(properties: &[Property], layout: &PlyLayout) -> Vec<Range<usize
     beside.map(|property| property.offset..property.offset + property.scalar.bytes()).collect()
 }
 
-/// Creates the file at `path` and lets `fill` write it.
+/// Creates the file at `path` and calls `fill` to write it.
 fn create(path: &Path, fill: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> Result<()> {
     let mut out = BufWriter::with_capacity(1 << 18, File::create(path).map_err(Error::io("create", path))?);
     fill(&mut out).and_then(|()| out.flush()).map_err(Error::io("write", path))
 }
 
+/// Checks that all sources and proxies exist and that the shapes of `proxies` and `change` match.
 fn check_rows(template: &Ply, rows: &[OutRow], proxies: &Gaussians, change: &ParamDelta) -> Result<()> {
     for column in change.columns().iter() {
         let changes = change.0.column(column).len();
@@ -263,7 +267,7 @@ fn replace(row: &mut [u8], layout: &PlyLayout, big_endian: bool, proxies: &Gauss
     }
 }
 
-/// Adds the change of the Gaussian at `place` of the output to the bytes of its row.
+/// Adds the parameter delta of output row `place` to the bytes of that row.
 fn add(row: &mut [u8], template: &Ply, change: &ParamDelta, place: usize) {
     let big_endian = template.header().encoding == PlyEncoding::BigEndian;
     for column in change.columns().iter() {
@@ -277,7 +281,7 @@ fn add(row: &mut [u8], template: &Ply, change: &ParamDelta, place: usize) {
     }
 }
 
-/// A value in the bytes of a row, as the nearest f32.
+/// Returns a value in the bytes of a row, rounded to the nearest f32.
 pub(crate) fn value(row: &[u8], property: &Property, big_endian: bool) -> f32 {
     let mut value = [0.0];
     read_plane(row, &[0], property, big_endian, &mut value);

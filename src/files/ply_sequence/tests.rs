@@ -5,7 +5,7 @@ use crate::files::ply::write::write_inria;
 
 const N: usize = 7;
 
-/// A frame whose every value tells frame, column and place.
+/// Returns a frame state with values that depend on the frame and the position in the plane.
 fn state(frame: usize, count: usize) -> Gaussians {
     let mut out = Gaussians::zeros(count, 1);
     for column in Columns::all().iter() {
@@ -19,7 +19,7 @@ fn write(folder: &Path, name: &str, gaussians: &Gaussians) {
     write_inria(gaussians, &[], &folder.join(name)).unwrap();
 }
 
-/// A folder of `frames` files `f_0.ply`, `f_1.ply`, … written in reverse.
+/// Returns a folder of `frames` files `f_0.ply`, `f_1.ply`, …, written in reverse order.
 fn folder(frames: usize) -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
     (0..frames).rev().for_each(|t| write(folder.path(), &format!("f_{t}.ply"), &state(t, N)));
@@ -43,7 +43,7 @@ fn frames_come_in_natural_order_at_even_times() {
 }
 
 #[test]
-fn a_block_reads_the_same_bits_as_the_whole() {
+fn any_ids_read_the_same_bits() {
     let folder = folder(3);
     let sequence = PlySequence::open(folder.path()).unwrap();
     let whole = state(2, N);
@@ -59,7 +59,7 @@ fn a_block_reads_the_same_bits_as_the_whole() {
 }
 
 #[test]
-fn a_single_file_is_one_frame_in_which_nothing_varies() {
+fn a_single_file_is_one_constant_frame() {
     let folder = folder(1);
     for sequence in
         [PlySequence::single(&folder.path().join("f_0.ply"), &PlyOptions::default()), PlySequence::open(folder.path())]
@@ -73,7 +73,7 @@ fn a_single_file_is_one_frame_in_which_nothing_varies() {
 }
 
 #[test]
-fn a_frame_with_another_count_or_property_set_is_named() {
+fn frames_with_other_counts_or_properties_are_named() {
     let folder = folder(3);
     write(folder.path(), "f_1.ply", &state(1, N - 1));
     let message = PlySequence::open(folder.path()).unwrap_err().to_string();
@@ -86,7 +86,7 @@ fn a_frame_with_another_count_or_property_set_is_named() {
 }
 
 #[test]
-fn a_frame_that_changed_since_it_was_opened_is_named() {
+fn frames_changed_since_opening_are_named() {
     let folder = folder(2);
     let sequence = PlySequence::open(folder.path()).unwrap();
     write(folder.path(), "f_1.ply", &state(1, N + 2));
@@ -96,7 +96,7 @@ fn a_frame_that_changed_since_it_was_opened_is_named() {
 }
 
 #[test]
-fn other_files_are_no_frames_and_none_is_an_error() {
+fn other_files_are_ignored_and_no_frame_is_an_error() {
     let folder = folder(2);
     for name in ["._f_0.ply", "notes.txt", "ply"] {
         fs::write(folder.path().join(name), b"not a frame").unwrap();
@@ -111,7 +111,7 @@ fn other_files_are_no_frames_and_none_is_an_error() {
 }
 
 #[test]
-fn times_that_do_not_increase_are_refused_by_frame() {
+fn times_must_increase() {
     let folder = folder(3);
     let with = |times: &[f64]| PlySequence::open(folder.path()).unwrap().with_times(times.to_vec());
     assert_eq!(with(&[-1.0, 0.0, 7.5]).unwrap().info().times, [-1.0, 0.0, 7.5]);
@@ -122,7 +122,7 @@ fn times_that_do_not_increase_are_refused_by_frame() {
 }
 
 #[test]
-fn the_digest_follows_names_and_bytes_but_not_the_folder() {
+fn the_digest_depends_on_names_and_bytes_only() {
     let (one, two) = (folder(3), folder(3));
     let digest = |folder: &Path| PlySequence::open(folder).unwrap().digest().unwrap();
     let before = digest(one.path());

@@ -1,6 +1,7 @@
-//! Gaussians on cubic paths to a `.splatv` ([`crate::files::splatv`] says what stands where).
+//! Writes Gaussians on cubic paths to a `.splatv` file ([`crate::files::splatv`] describes the layout).
 //!
-//! Memory: one row. Halves are rounded to the nearest, bytes downwards, as splaTV does.
+//! Memory: one row. Values in half precision are rounded to the nearest, values in bytes are rounded down, as in
+//! splaTV.
 
 use std::fs::File;
 use std::io::{BufWriter, Write};
@@ -16,15 +17,16 @@ use crate::files::splatv::{MAGIC, ROW_BYTES, SplatvGaussian, TEXELS, WORDS};
 use crate::model::RobustBox;
 use crate::model::{Camera, Column};
 
-/// Of the cameras around a scene one that is neither at its top nor at its bottom.
-const WELL_PLACED: usize = 4;
-/// Widths of a window in time after which an opacity of 1 has fallen to 1/255.
-const SEEN_WIDTHS: f64 = 2.36;
-/// Texels of a Gaussian.
-const TEXELS_EACH: usize = 4;
+/// Index of a camera of the virtual rig that is neither at the top nor at the bottom of the scene.
+const DEFAULT_CAMERA: usize = 4;
+/// Distance from the temporal center, in temporal widths, at which an opacity of 1 has fallen to 1/255.
+const VISIBLE_WIDTHS: f64 = 2.36;
+/// Number of texels per Gaussian.
+const TEXELS_PER_GAUSSIAN: usize = 4;
 
-/// The words that a viewer reads of `row`. What no half holds becomes the largest that it does; NaN becomes 0. A quaternion
-/// that halves would hold as 0 at every time is scaled to length 1, or is the identity: players divide by its length.
+/// Returns the words that store `row` for a viewer. Values beyond the range of half precision become the largest finite
+/// value; NaN becomes 0. If half precision would turn the quaternion and its rate to 0, they are scaled so that the
+/// quaternion has length 1, or the quaternion becomes the identity, because players divide by its length.
 pub fn words(row: &SplatvGaussian) -> [u32; WORDS] {
     let half = |value: f32| {
         let most = f16::MAX.to_f32();
@@ -65,18 +67,18 @@ pub fn words(row: &SplatvGaussian) -> [u32; WORDS] {
     ]
 }
 
-/// Measures what a viewer reads of `row` against `row` itself, as Gaussian `id`. Rounding of its path counts as far from its
-/// center as it is seen.
+/// Adds the error between `row` and its stored form, as Gaussian `id`, to `to`. The error of the path is taken as far
+/// from its center in time as the Gaussian is visible.
 pub fn measure(row: &SplatvGaussian, id: usize, to: &mut Accuracy) {
     let held = SplatvGaussian::of_words(&words(row));
-    let drawn = |of: &SplatvGaussian| Drawn {
-        position: of.position.map(f64::from),
-        scale: of.scale.map(f64::from),
-        opacity: of.opacity,
-        color: of.rgb,
+    let drawn = |row: &SplatvGaussian| Drawn {
+        position: row.position.map(f64::from),
+        scale: row.scale.map(f64::from),
+        opacity: row.opacity,
+        color: row.rgb,
     };
     let (wanted, mut found) = (drawn(row), drawn(&held));
-    let time = (SEEN_WIDTHS * f64::from(row.width)).min(1.0);
+    let time = (VISIBLE_WIDTHS * f64::from(row.width)).min(1.0);
     for axis in 0..3 {
         let off = |k: usize| f64::from(row.motion[3 * k + axis] - held.motion[3 * k + axis]) * time.powi(k as i32 + 1);
         found.position[axis] += (0..3).map(off).map(f64::abs).sum::<f64>();
@@ -84,7 +86,7 @@ pub fn measure(row: &SplatvGaussian, id: usize, to: &mut Accuracy) {
     to.add(id, &wanted, &found);
 }
 
-/// A camera as the file lists it: `rotation` has the rows of camera to world.
+/// Returns a camera as the file lists it; `rotation` has the rows of camera to world.
 pub fn camera(camera: &Camera) -> Value {
     let to_world = camera.rotation.transpose();
     let position = -(to_world * camera.translation);
@@ -95,19 +97,22 @@ pub fn camera(camera: &Camera) -> Value {
     })
 }
 
-/// The cameras of a file that none come with: one that sees most of what is at `positions`.
+/// Returns the list of cameras for a model without cameras: one that sees most of the Gaussians at `positions`.
 pub fn seen_whole(positions: &Column) -> Value {
     let found = RobustBox::from_positions(positions);
-    virtual_rig(found.middle, found.extent()).cameras.get(WELL_PLACED).map_or(json!([]), |of| json!([camera(of)]))
+    virtual_rig(found.middle, found.extent())
+        .cameras
+        .get(DEFAULT_CAMERA)
+        .map_or(json!([]), |camera| json!([self::camera(camera)]))
 }
 
-/// Writes `rows`, `count` of them, as the file at `path`, which a viewer opens at the first of `cameras`.
+/// Writes `count` rows as the file at `path`, which a viewer opens at the first of `cameras`.
 ///
 /// # Errors
-/// A failed write.
+/// The file cannot be written.
 pub fn write(path: &Path, count: usize, rows: impl Iterator<Item = [u32; WORDS]>, cameras: &Value) -> Result<()> {
-    let height = (TEXELS_EACH * count).div_ceil(TEXELS).max(1);
-    let size = TEXELS * height * ROW_BYTES / TEXELS_EACH;
+    let height = (TEXELS_PER_GAUSSIAN * count).div_ceil(TEXELS).max(1);
+    let size = TEXELS * height * ROW_BYTES / TEXELS_PER_GAUSSIAN;
     let text = json!([{
         "type": "splat", "size": size, "texwidth": TEXELS, "texheight": height, "cameras": cameras,
     }]);
@@ -134,7 +139,7 @@ mod tests {
     use super::*;
     use crate::files::splatv::Splatv;
 
-    /// A row of values that halves and bytes hold.
+    /// Returns a row of values that are exact in half precision and in bytes.
     fn row(seed: u16) -> SplatvGaussian {
         let value = |k: u16| f16::from_bits(0x3000 + (seed.wrapping_mul(31).wrapping_add(k * 977)) % 0x1000).to_f32();
         let byte = |k: u16| f64::from((seed.wrapping_mul(7).wrapping_add(k)) % 255 + 1) / 255.0 + 1e-4;
@@ -152,7 +157,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_written_is_read_and_padding_is_not() {
+    fn rows_are_read_back_without_the_padding() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("some.splatv");
         for count in [1, 1024, 1025] {
@@ -182,7 +187,7 @@ mod tests {
     }
 
     #[test]
-    fn no_row_is_written_with_a_quaternion_of_zero() {
+    fn zero_quaternions_are_never_written() {
         let rotation = |rotation| {
             SplatvGaussian::of_words(&words(&SplatvGaussian { rotation, omega: [0.0; 4], ..row(1) })).rotation
         };
@@ -192,7 +197,7 @@ mod tests {
     }
 
     #[test]
-    fn what_no_half_holds_is_the_largest_that_it_does() {
+    fn values_beyond_half_precision_are_clamped() {
         let wild = SplatvGaussian { motion: [1e9, -1e9, f32::NAN, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], width: 1e6, ..row(1) };
         let found = SplatvGaussian::of_words(&words(&wild));
         assert_eq!((&found.motion[..3], found.width), (&[65504.0, -65504.0, 0.0][..], 65504.0));
@@ -200,7 +205,7 @@ mod tests {
     }
 
     #[test]
-    fn a_camera_is_where_it_looks_from() {
+    fn a_camera_has_its_position_and_view_direction() {
         let from = glam::DVec3::new(1.0, -4.0, 2.0);
         let made = camera(&Camera::look_at(from, glam::DVec3::ZERO, 1.0, (8, 6)));
         for (c, expected) in from.to_array().into_iter().enumerate() {
@@ -212,7 +217,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_cut_anywhere_is_refused_by_what_is_missing() {
+    fn truncated_or_malformed_files_are_refused() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("some.splatv");
         write(&path, 3, (0..3).map(|k| words(&row(k))), &json!([])).unwrap();
@@ -220,7 +225,7 @@ mod tests {
         let header = 8 + u32::from_le_bytes(whole[4..8].try_into().unwrap()) as usize;
         for length in (0..200).chain((200..whole.len()).step_by(997)) {
             std::fs::write(&path, &whole[..length]).unwrap();
-            // What ends behind a whole row is not padded; what ends within one is cut.
+            // A file that ends after a whole row is not padded; one that ends within a row is truncated.
             let rows = length.checked_sub(header).filter(|bytes| *bytes > 0 && bytes % ROW_BYTES == 0);
             if let Some(bytes) = rows {
                 let file = Splatv::open(&path).unwrap();
@@ -251,7 +256,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn any_bytes_behind_the_magic_never_panic(bytes in proptest::collection::vec(any::<u8>(), 0..200)) {
+        fn any_bytes_after_the_magic_never_panic(bytes in proptest::collection::vec(any::<u8>(), 0..200)) {
             let folder = tempfile::tempdir().unwrap();
             let path = folder.path().join("some.splatv");
             std::fs::write(&path, [&MAGIC.to_le_bytes()[..], &bytes].concat()).unwrap();

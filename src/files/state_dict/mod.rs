@@ -1,4 +1,4 @@
-//! PyTorch state dicts (`.pth`): reads the tensors of a file as f32, and writes files of such tensors.
+//! Reads and writes PyTorch state dicts (`.pth`): tensors are read as f32.
 
 mod write;
 
@@ -12,22 +12,22 @@ use crate::files::checkpoint::{Checkpoint, MAX_DEPTH, Node, NodeId, TensorView};
 use crate::limits::ReadLimit;
 pub(crate) use write::{StoredTensor, TensorValues, write_state_dict};
 
-/// A view may repeat its storage (stride 0), so a small file can declare any number of values. No
-/// trained state dict stores less than a quarter of what it means.
+/// Maximum ratio of the bytes of all tensors to the size of the file. A view may repeat its storage (stride 0), so a
+/// small file can declare any number of values. No trained state dict is smaller than a quarter of its tensors.
 pub(crate) const MAX_EXPANSION: u64 = 4;
 /// Maximum number of bytes of a tensor's name.
-const MAX_NAME: usize = 1024;
-/// Bytes that one tensor takes beside its name and values.
+const MAX_NAME_BYTES: usize = 1024;
+/// Memory of one tensor without its name and values, in bytes.
 const TENSOR_BYTES: u64 = 512;
 
-/// Reads every floating-point tensor of the state dict at `path`, widened or rounded to f32. Integer and
-/// boolean tensors are left out.
+/// Reads every floating-point tensor of the state dict at `path`, widened or rounded to f32. Integer and boolean
+/// tensors are left out.
 ///
 /// Memory: the tensors, at most four times the file, and the bytes of one storage; both within `memory`.
 ///
 /// # Errors
-/// A file that is no state dict, is cut short or damaged, declares more values than it can hold, or takes more memory than
-/// allowed.
+/// The file is not a state dict, is truncated or damaged, declares more values than it can hold, or takes more memory
+/// than allowed.
 pub(crate) fn read_state_dict(path: &Path, memory: ReadLimit) -> Result<Tensors> {
     let file_bytes = fs::metadata(path).map_err(Error::io("open", path))?.len();
     let dict = StateDict::open(path, memory)?;
@@ -61,23 +61,25 @@ pub(crate) fn read_state_dict(path: &Path, memory: ReadLimit) -> Result<Tensors>
     Ok(tensors)
 }
 
-/// Returns the names of the tensors of the state dict at `path`, in order; no value is read.
+/// Returns the names of the tensors of the state dict at `path`, in order. No values are read.
 ///
 /// # Errors
-/// A file that is no state dict.
+/// The file is not a state dict.
 pub(crate) fn names(path: &Path, memory: ReadLimit) -> Result<Vec<String>> {
     Ok(StateDict::open(path, memory)?.tensors.into_keys().collect())
 }
 
-/// Whether every tensor of the state dict at `path` is one that [`read_state_dict`] reads.
+/// Returns whether [`read_state_dict`] reads every tensor of the state dict at `path`, that is, whether all are
+/// floating-point.
 ///
 /// # Errors
-/// A file that is no state dict.
+/// The file is not a state dict.
 pub(crate) fn is_floating(path: &Path, memory: ReadLimit) -> Result<bool> {
     Ok(StateDict::open(path, memory)?.tensors.values().all(|tensor| tensor.kind.is_float()))
 }
 
-/// Whether the file at `path` holds a tuple of two things instead of a state dict; false for a file that cannot be read.
+/// Returns whether the file at `path` holds a tuple of two values instead of a state dict; false for a file that cannot
+/// be read.
 pub(crate) fn is_pair(path: &Path, memory: ReadLimit) -> bool {
     Checkpoint::open(path, memory).is_ok_and(|checkpoint| {
         let pickle = checkpoint.pickle();
@@ -85,13 +87,17 @@ pub(crate) fn is_pair(path: &Path, memory: ReadLimit) -> bool {
     })
 }
 
-/// The tensors of a checkpoint, by name. Names of nested dicts, lists and tuples are joined by dots.
+/// Tensors of a checkpoint, by name. Names of nested dicts, lists and tuples are joined by dots.
 struct StateDict {
     checkpoint: Checkpoint,
     tensors: BTreeMap<String, TensorView>,
 }
 
 impl StateDict {
+    /// Opens the checkpoint at `path` and finds its tensors.
+    ///
+    /// # Errors
+    /// The checkpoint is invalid or not a dict; a value seems to be a tensor of an unknown kind.
     fn open(path: &Path, memory: ReadLimit) -> Result<StateDict> {
         let checkpoint = Checkpoint::open(path, memory)?;
         let (root, nodes) = (checkpoint.pickle().root(), checkpoint.pickle().ids().len());
@@ -100,33 +106,36 @@ impl StateDict {
                 .wrong("data.pkl", "a state dict written by torch.save", checkpoint.describe(root))
                 .hint("save the model again with torch.save(model.state_dict(), path)"));
         }
-        // What is shared is visited once for each of its names, which a pickle can make any number of.
-        let mut walk =
+        // A shared value is visited once for each of its names, and a pickle can give it any number of names.
+        let mut search =
             TensorSearch { checkpoint: &checkpoint, left: 4 * nodes + 1000, name_bytes: 0, found: BTreeMap::new() };
-        walk.visit(root, &mut String::new(), 0)?;
-        let tensors = walk.found;
+        search.visit(root, &mut String::new(), 0)?;
+        let tensors = search.found;
         Ok(StateDict { checkpoint, tensors })
     }
 }
 
-/// The search for tensors in a tree.
+/// State of the search for tensors in a tree of values.
 struct TensorSearch<'a> {
     checkpoint: &'a Checkpoint,
     /// Number of nodes that may still be visited.
     left: usize,
+    /// Memory of the tensors found so far, in bytes.
     name_bytes: u64,
     found: BTreeMap<String, TensorView>,
 }
 
 impl TensorSearch<'_> {
-    /// Adds the tensors at and below `id`, which is called `name`.
+    /// Adds the tensors at and below node `id`, whose name is `name`.
     fn visit(&mut self, id: NodeId, name: &mut String, depth: u8) -> Result<()> {
         let (checkpoint, pickle) = (self.checkpoint, self.checkpoint.pickle());
         self.left =
-            self.left.checked_sub(1).filter(|_| depth <= MAX_DEPTH && name.len() <= MAX_NAME).ok_or_else(|| {
-                let expected = format!("a tree of tensors with names of at most {MAX_NAME} bytes");
-                checkpoint.wrong("data.pkl", expected, "values that contain one another, or longer names")
-            })?;
+            self.left.checked_sub(1).filter(|_| depth <= MAX_DEPTH && name.len() <= MAX_NAME_BYTES).ok_or_else(
+                || {
+                    let expected = format!("a tree of tensors with names of at most {MAX_NAME_BYTES} bytes");
+                    checkpoint.wrong("data.pkl", expected, "values that contain one another, or longer names")
+                },
+            )?;
         if let Some(tensor) = checkpoint.tensor(id) {
             self.name_bytes += name.len() as u64 + TENSOR_BYTES;
             checkpoint.allow("data.pkl", "the list of its tensors", self.name_bytes)?;
@@ -150,7 +159,7 @@ impl TensorSearch<'_> {
                 self.visit_part(element, name, &index.to_string(), depth)?;
             }
         } else if let Some((callee, arguments)) = pickle.call(id) {
-            // A tensor of a kind that is not known must not be left out in silence.
+            // A tensor of an unknown kind must be reported, not left out.
             let is_unsigned = callee == "torch._utils._rebuild_tensor_v3";
             if !is_unsigned && arguments.iter().any(|&id| self.holds_values(id)) {
                 let place = format!("tensor {}", named(name));
@@ -160,6 +169,7 @@ impl TensorSearch<'_> {
         Ok(())
     }
 
+    /// Visits the child `part` of the node called `name`.
     fn visit_part(&mut self, id: NodeId, name: &mut String, part: &str, depth: u8) -> Result<()> {
         let before = name.len();
         if before > 0 {
@@ -171,11 +181,13 @@ impl TensorSearch<'_> {
         Ok(())
     }
 
+    /// Returns whether a node is a tensor or a storage.
     fn holds_values(&self, id: NodeId) -> bool {
         matches!(self.checkpoint.pickle().node(id), Node::Outside(_)) || self.checkpoint.tensor(id).is_some()
     }
 }
 
+/// Returns a name as quoted in messages.
 fn named(name: &str) -> String {
     if name.is_empty() { "the root".to_owned() } else { quoted(name).to_string() }
 }

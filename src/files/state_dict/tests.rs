@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use super::*;
 
-/// One tensor as a pickle describes it: storage class, storage bytes, offset, shape, strides.
+/// Tensor as a pickle describes it: storage class, storage bytes, offset, shape, strides.
 struct Entry {
     name: &'static str,
     class: &'static str,
@@ -39,7 +39,7 @@ fn tuple(items: &[i32]) -> Vec<u8> {
     [b"(".to_vec(), items.iter().flat_map(|&i| int(i)).collect(), b"t".to_vec()].concat()
 }
 
-/// The pickle torch.save writes for an OrderedDict of tensors, without memo.
+/// Returns the pickle that torch.save writes for an OrderedDict of tensors, without memo.
 fn pickle(entries: &[Entry]) -> Vec<u8> {
     let mut out = b"\x80\x02ccollections\nOrderedDict\n)R(".to_vec();
     for (key, e) in entries.iter().enumerate() {
@@ -62,7 +62,7 @@ fn crc32(bytes: &[u8]) -> u32 {
     })
 }
 
-/// A zip archive of stored files.
+/// Returns a zip archive of uncompressed files.
 fn zip(files: &[(String, Vec<u8>)]) -> Vec<u8> {
     let (mut out, mut directory) = (Vec::new(), Vec::new());
     for (name, bytes) in files {
@@ -97,11 +97,11 @@ fn state_dict(entries: &[Entry]) -> Vec<u8> {
     archive(pickle(entries), entries.iter().map(|e| e.bytes.clone()))
 }
 
-struct Scratch(tempfile::TempDir);
+struct TempStateDict(tempfile::TempDir);
 
-impl Scratch {
+impl TempStateDict {
     fn new() -> Self {
-        Scratch(tempfile::tempdir().unwrap())
+        TempStateDict(tempfile::tempdir().unwrap())
     }
 
     fn read(&self, bytes: &[u8]) -> Result<Tensors> {
@@ -119,8 +119,8 @@ fn small() -> Vec<Entry> {
 }
 
 #[test]
-fn tensors_come_out_with_their_shapes_and_values() {
-    let tensors = Scratch::new().read(&state_dict(&small())).unwrap();
+fn tensors_have_their_shapes_and_values() {
+    let tensors = TempStateDict::new().read(&state_dict(&small())).unwrap();
     let expected: Tensors = BTreeMap::from([
         ("net.weight".into(), Tensor { shape: vec![2, 3], data: vec![1.0, 2.0, 3.0, 4.0, 5.0, 6.0] }),
         ("net.bias".into(), Tensor { shape: vec![2], data: vec![-1.5, 0.25] }),
@@ -132,12 +132,12 @@ fn tensors_come_out_with_their_shapes_and_values() {
 fn strides_and_offsets_are_honored() {
     let mut transposed = f32_entry("t", &[9.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0], &[3, 2], &[1, 3]);
     transposed.offset = 1;
-    let tensors = Scratch::new().read(&state_dict(&[transposed])).unwrap();
+    let tensors = TempStateDict::new().read(&state_dict(&[transposed])).unwrap();
     assert_eq!(tensors["t"], Tensor { shape: vec![3, 2], data: vec![1.0, 4.0, 2.0, 5.0, 3.0, 6.0] });
 }
 
 #[test]
-fn every_floating_type_becomes_f32_and_others_are_left_out() {
+fn float_tensors_become_f32_and_others_are_left_out() {
     let entry = |name, class, element_bytes, bytes: Vec<u8>| Entry {
         name,
         class,
@@ -150,7 +150,7 @@ fn every_floating_type_becomes_f32_and_others_are_left_out() {
     let le16 = |values: &[u16]| values.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>();
     // 1, −2, smallest subnormal, largest, infinity; and 1, −2, 2⁻¹³³ (subnormal) in bfloat16.
     let half = le16(&[0x3C00, 0xC000, 0x0001, 0x7BFF, 0x7C00]);
-    let tensors = Scratch::new()
+    let tensors = TempStateDict::new()
         .read(&state_dict(&[
             entry("half", "HalfStorage", 2, half),
             entry("bf16", "BFloat16Storage", 2, le16(&[0x3F80, 0xC000, 0x0001])),
@@ -166,23 +166,23 @@ fn every_floating_type_becomes_f32_and_others_are_left_out() {
 }
 
 #[test]
-fn a_file_cut_anywhere_is_refused() {
-    let (scratch, whole) = (Scratch::new(), state_dict(&small()));
+fn truncated_files_are_refused() {
+    let (temp, whole) = (TempStateDict::new(), state_dict(&small()));
     for length in 0..whole.len() {
-        let error = scratch.read(&whole[..length]).expect_err("a cut file must be refused");
+        let error = temp.read(&whole[..length]).expect_err("a cut file must be refused");
         assert!(error.to_string().contains("deformation.pth"), "cut at {length}: {error}");
     }
 }
 
 #[test]
-fn a_flipped_bit_anywhere_never_changes_a_value_unnoticed() {
-    let (scratch, whole) = (Scratch::new(), state_dict(&small()));
-    let original = scratch.read(&whole).unwrap();
+fn flipped_bits_never_change_a_value_silently() {
+    let (temp, whole) = (TempStateDict::new(), state_dict(&small()));
+    let original = temp.read(&whole).unwrap();
     for at in 0..whole.len() {
         for bit in 0..8 {
             let mut bytes = whole.clone();
             bytes[at] ^= 1 << bit;
-            if let Ok(tensors) = scratch.read(&bytes) {
+            if let Ok(tensors) = temp.read(&bytes) {
                 for (name, tensor) in &tensors {
                     let same = original.get(name).is_some_and(|original| original == tensor);
                     assert!(same, "byte {at}, bit {bit}: {name} became {tensor:?}");
@@ -193,8 +193,8 @@ fn a_flipped_bit_anywhere_never_changes_a_value_unnoticed() {
 }
 
 #[test]
-fn noise_is_refused() {
-    let scratch = Scratch::new();
+fn random_bytes_are_refused() {
+    let temp = TempStateDict::new();
     let mut seed = 3u64;
     for length in [1usize, 10, 100, 5000] {
         let bytes: Vec<u8> = std::iter::repeat_with(|| {
@@ -203,23 +203,23 @@ fn noise_is_refused() {
         })
         .take(length)
         .collect();
-        scratch.read(&bytes).expect_err("noise must be refused");
+        temp.read(&bytes).expect_err("noise must be refused");
     }
 }
 
 #[test]
-fn a_small_file_cannot_ask_for_much_memory() {
-    let scratch = Scratch::new();
-    // A million values out of one, by stride 0; then a shape whose size overflows.
+fn a_small_file_cannot_declare_huge_tensors() {
+    let temp = TempStateDict::new();
+    // A million values from one by stride 0; then a shape whose size overflows.
     for shape in [vec![1000, 1000], vec![i32::MAX, i32::MAX, i32::MAX]] {
         let stride = vec![0; shape.len()];
-        scratch.read(&state_dict(&[f32_entry("t", &[1.0], &shape, &stride)])).expect_err("must be refused");
+        temp.read(&state_dict(&[f32_entry("t", &[1.0], &shape, &stride)])).expect_err("must be refused");
     }
 }
 
 #[test]
-fn storages_shorter_or_other_than_declared_are_refused() {
-    let scratch = Scratch::new();
+fn wrong_storages_are_refused() {
+    let temp = TempStateDict::new();
     for (shape, stride, offset) in [
         (vec![7], vec![1], 0),
         (vec![6], vec![1], 1),
@@ -229,35 +229,35 @@ fn storages_shorter_or_other_than_declared_are_refused() {
     ] {
         let mut entry = f32_entry("t", &[0.0; 6], &shape, &stride);
         entry.offset = offset;
-        let error = scratch.read(&state_dict(&[entry]));
+        let error = temp.read(&state_dict(&[entry]));
         assert!(error.is_err(), "shape {shape:?}, stride {stride:?}, offset {offset}: {error:?}");
     }
     let missing = archive(pickle(&small()), std::iter::empty());
-    scratch.read(&missing).expect_err("absent storages must be refused");
+    temp.read(&missing).expect_err("absent storages must be refused");
 }
 
 #[test]
-fn a_pickle_that_calls_something_is_refused_and_nothing_is_called() {
-    let scratch = Scratch::new();
-    let target = scratch.0.path().join("called");
+fn a_pickle_with_a_call_is_refused_and_not_executed() {
+    let temp = TempStateDict::new();
+    let target = temp.0.path().join("called");
     let command = string(&format!("touch {}", target.display()));
     let pickle = [b"\x80\x02cposix\nsystem\n(".to_vec(), command, b"tR.".to_vec()].concat();
-    let read = scratch.read(&archive(pickle, std::iter::empty()));
+    let read = temp.read(&archive(pickle, std::iter::empty()));
     assert!(read.is_err() || read.is_ok_and(|tensors| tensors.is_empty()));
     assert!(!target.exists());
 }
 
 #[test]
-fn deep_nesting_is_refused_without_exhausting_the_stack() {
-    let scratch = Scratch::new();
+fn deep_nesting_is_refused_without_stack_overflow() {
+    let temp = TempStateDict::new();
     let nested = [b"\x80\x02".to_vec(), b"]".repeat(200_000), b"a".repeat(199_999), b".".to_vec()].concat();
-    scratch.read(&archive(nested, std::iter::empty())).expect_err("must be refused");
+    temp.read(&archive(nested, std::iter::empty())).expect_err("must be refused");
     let tuples = [b"\x80\x02)".to_vec(), b"\x85".repeat(200_000), b".".to_vec()].concat();
-    scratch.read(&archive(tuples, std::iter::empty())).expect_err("must be refused");
+    temp.read(&archive(tuples, std::iter::empty())).expect_err("must be refused");
 }
 
 #[test]
-fn a_missing_file_is_an_error_of_the_system() {
+fn a_missing_file_is_an_io_error() {
     let error = read_state_dict(Path::new("nowhere/deformation.pth"), ReadLimit::NONE).expect_err("must fail");
     assert!(matches!(error, Error::Io { .. }), "{error}");
 }

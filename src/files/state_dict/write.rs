@@ -1,9 +1,8 @@
-//! Writing what `torch.save` would: a zip archive of stored entries, a pickle that names every tensor, and the values
-//! of each in an entry of its own.
+//! Writes state dicts in the format of `torch.save`: a zip archive of uncompressed entries, a pickle that names every
+//! tensor, and one entry with the values of each tensor.
 //!
-//! Data in: tensors in the layout that they are to have. Data out: a file of zip version 3 of PyTorch's format, which
-//! `torch.load` opens, with `weights_only` or without. Memory: the pickle.
-//! Source: the files that PyTorch 1.6 and later writes.
+//! In: tensors in the layout to be stored. Out: a file of version 3 of PyTorch's zip format, which `torch.load` opens,
+//! with `weights_only` or without. Memory: the pickle. Source: the files that PyTorch 1.6 and later writes.
 
 use std::fs::File;
 use std::io::{self, BufWriter, Write};
@@ -17,26 +16,26 @@ use zip::{CompressionMethod, DateTime, ZipWriter};
 use crate::error::{Error, Result};
 use crate::files::zip_output::ZipOutput;
 
-/// Where the values of a tensor begin in the file is a multiple of so many bytes, as PyTorch has it.
+/// Alignment of the values of each tensor in the file, in bytes, as in PyTorch.
 const ALIGNMENT: u16 = 64;
 
-/// A tensor as a file stores it: element `i` of its `shape` is value `offset + Σ i·stride` of its storage. Strides may
+/// Tensor in its stored layout: element `i` of its `shape` is value `offset + Σ i·stride` of its storage. Strides may
 /// be 0 and elements may share values.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct StoredTensor {
-    /// Its dotted name.
+    /// Dotted name.
     pub(crate) name: String,
-    /// Its values.
+    /// Values of the storage.
     pub(crate) values: TensorValues,
-    /// Place of its first element.
+    /// Index of the first element in the storage.
     pub(crate) offset: usize,
     /// Extents, outermost first; empty for a scalar.
     pub(crate) shape: Vec<usize>,
-    /// Values from an element to the next, along each extent.
+    /// Distance in values from an element to the next, along each extent.
     pub(crate) stride: Vec<usize>,
 }
 
-/// The values of a tensor.
+/// Values of a tensor.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum TensorValues {
     /// IEEE 754 binary32.
@@ -46,7 +45,7 @@ pub(crate) enum TensorValues {
 }
 
 impl TensorValues {
-    /// How many there are.
+    /// Returns the number of values.
     pub(crate) fn len(&self) -> usize {
         match self {
             TensorValues::F32(values) => values.len(),
@@ -54,7 +53,7 @@ impl TensorValues {
         }
     }
 
-    /// Bytes of each.
+    /// Returns the number of bytes of each value.
     pub(crate) fn width(&self) -> usize {
         match self {
             TensorValues::F32(_) => size_of::<f32>(),
@@ -62,7 +61,7 @@ impl TensorValues {
         }
     }
 
-    /// Name of the storage in the pickle.
+    /// Returns the name of the storage class in the pickle.
     fn class(&self) -> &'static str {
         match self {
             TensorValues::F32(_) => "FloatStorage",
@@ -70,7 +69,7 @@ impl TensorValues {
         }
     }
 
-    /// In this machine's order of bytes.
+    /// Returns the values in the byte order of this machine.
     fn bytes(&self) -> &[u8] {
         match self {
             TensorValues::F32(values) => bytemuck::cast_slice(values),
@@ -80,7 +79,7 @@ impl TensorValues {
 }
 
 impl StoredTensor {
-    /// `values` one after the other, the last extent fastest.
+    /// Returns a tensor whose `values` are contiguous, with the last extent fastest.
     pub(crate) fn dense(name: String, shape: Vec<usize>, values: TensorValues) -> StoredTensor {
         let mut stride = vec![1; shape.len()];
         for axis in (1..shape.len()).rev() {
@@ -90,14 +89,15 @@ impl StoredTensor {
     }
 }
 
-/// Writes a state dict of `tensors`, in their order.
+/// Writes a state dict of `tensors`, in the given order.
 ///
 /// # Errors
-/// A failed write.
+/// The file cannot be written.
 pub(crate) fn write_state_dict(path: &Path, tensors: &[StoredTensor]) -> Result<()> {
     let write = || {
         let mut archive = ZipWriter::new(ZipOutput::new(BufWriter::new(File::create(path)?)));
-        // The pickle first, and all in one folder: by its name readers know the others.
+        // The pickle comes first and all entries are in one folder: readers find the other entries by the pickle's
+        // folder.
         add(&mut archive, "data.pkl", &pickle(tensors))?;
         add(&mut archive, "byteorder", if cfg!(target_endian = "big") { b"big" } else { b"little" })?;
         for (key, tensor) in tensors.iter().enumerate() {
@@ -109,6 +109,7 @@ pub(crate) fn write_state_dict(path: &Path, tensors: &[StoredTensor]) -> Result<
     write().map_err(Error::io("write", path))
 }
 
+/// Adds an uncompressed, aligned entry to the archive.
 fn add(archive: &mut ZipWriter<ZipOutput<BufWriter<File>>>, name: &str, bytes: &[u8]) -> io::Result<()> {
     let options = FileOptions::default()
         .compression_method(CompressionMethod::Stored)
@@ -118,14 +119,15 @@ fn add(archive: &mut ZipWriter<ZipOutput<BufWriter<File>>>, name: &str, bytes: &
     archive.write_all(bytes)
 }
 
-/// The pickle, of protocol 2, of an ordered dictionary of the tensors by name. Value storages are called by number.
+/// Returns the pickle, of protocol 2, of an ordered dictionary of the tensors by name. Storages are referred to by
+/// number.
 fn pickle(tensors: &[StoredTensor]) -> Vec<u8> {
     const DICTIONARY: &[u8] = b"ccollections\nOrderedDict\n)R";
     let mut out = [b"\x80\x02", DICTIONARY, b"("].concat();
     for (key, tensor) in tensors.iter().enumerate() {
         text(&mut out, &tensor.name);
         out.extend(b"ctorch._utils\n_rebuild_tensor_v2\n(");
-        // Its storage: kind, class, key, device, how many values.
+        // Storage: kind, class, key, device, number of values.
         out.extend(b"(");
         text(&mut out, "storage");
         out.extend(format!("ctorch\n{}\n", tensor.values.class()).bytes());
@@ -139,20 +141,21 @@ fn pickle(tensors: &[StoredTensor]) -> Vec<u8> {
             extents.iter().for_each(|&extent| number(&mut out, extent));
             out.extend(b"t");
         }
-        // No gradient is wanted of it, and no hook is called.
+        // `requires_grad` is false and there are no hooks.
         out.extend([b"\x89", DICTIONARY, b"tR"].concat());
     }
     out.extend(b"u.");
     out
 }
 
+/// Appends a text to the pickle.
 fn text(out: &mut Vec<u8>, text: &str) {
     out.push(b'X');
     out.extend((text.len() as u32).to_le_bytes());
     out.extend(text.bytes());
 }
 
-/// The shortest of the ways in which a pickle has whole numbers.
+/// Appends a whole number to the pickle in the shortest form.
 fn number(out: &mut Vec<u8>, number: usize) {
     match number {
         0..=0xFF => out.extend([b'K', number as u8]),
@@ -161,7 +164,7 @@ fn number(out: &mut Vec<u8>, number: usize) {
             out.push(b'J');
             out.extend((number as i32).to_le_bytes());
         }
-        // Nine bytes, the last of which is 0: never negative.
+        // Nine bytes, of which the last is 0, so that the number is not negative.
         _ => {
             out.extend([0x8A, 9]);
             out.extend((number as u64).to_le_bytes());
@@ -179,7 +182,7 @@ mod tests {
     use super::super::read_state_dict;
     use super::*;
 
-    /// The element at `index`, by the definition.
+    /// Returns the element at `index`, by the definition.
     fn element(tensor: &StoredTensor, index: &[usize]) -> f32 {
         let at = tensor.offset + index.iter().zip(&tensor.stride).map(|(i, stride)| i * stride).sum::<usize>();
         match &tensor.values {
@@ -188,7 +191,7 @@ mod tests {
         }
     }
 
-    /// Every element, the last index fastest.
+    /// Returns all elements, with the last index fastest.
     fn elements(tensor: &StoredTensor) -> Vec<f32> {
         let mut indices = vec![Vec::new()];
         for &extent in &tensor.shape {
@@ -197,7 +200,7 @@ mod tests {
         indices.iter().map(|index| element(tensor, index)).collect()
     }
 
-    /// Of any shape and strides over a storage with some values before and behind.
+    /// Generates tensors of any shape and strides, with a few unused values before and after in the storage.
     fn tensor() -> impl Strategy<Value = StoredTensor> {
         let extents = proptest::collection::vec((1..5usize, 0..7usize), 0..4);
         (extents, 0..4usize, 0..3usize, any::<bool>(), any::<u64>()).prop_map(
@@ -217,7 +220,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn any_tensors_read_back_as_themselves(mut tensors in proptest::collection::vec(tensor(), 0..6)) {
+        fn any_tensors_are_read_back_unchanged(mut tensors in proptest::collection::vec(tensor(), 0..6)) {
             tensors.iter_mut().enumerate().for_each(|(k, tensor)| tensor.name = format!("net.{k}.weight ✓"));
             let folder = tempfile::tempdir().unwrap();
             let path = folder.path().join("a.pth");
@@ -226,7 +229,7 @@ mod tests {
             prop_assert_eq!(read.len(), tensors.len());
             for tensor in &tensors {
                 let bits = |values: &[f32]| values.iter().map(|value| value.to_bits()).collect::<Vec<_>>();
-                // Any NaN is a NaN: widening may change which.
+                // All NaNs count as equal, because widening may change their bits.
                 let plain = |values: Vec<f32>| {
                     bits(&values.into_iter().map(|x| if x.is_nan() { f32::NAN } else { x }).collect::<Vec<_>>())
                 };
@@ -237,7 +240,7 @@ mod tests {
         }
     }
 
-    /// Of an archive the name, the place and the bytes of every entry, read by the format's own description.
+    /// Returns the name, offset and bytes of every entry of an archive, read by the definition of the zip format.
     fn entries(bytes: &[u8]) -> Vec<(String, usize, Vec<u8>)> {
         let word = |at: usize| u16::from_le_bytes([bytes[at], bytes[at + 1]]) as usize;
         let long = |at: usize| word(at) | word(at + 2) << 16;
@@ -259,13 +262,16 @@ mod tests {
     }
 
     #[test]
-    fn entries_are_named_ordered_and_aligned_as_pytorch_has_them() {
+    fn entries_have_the_names_order_and_alignment_of_pytorch() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.pth");
-        let of = |name: &str, values| StoredTensor::dense(name.to_owned(), vec![3], values);
+        let tensor = |name: &str, values| StoredTensor::dense(name.to_owned(), vec![3], values);
         let half = [1.0, -2.0, 0.25].map(f16::from_f32).to_vec();
-        write_state_dict(&path, &[of("a", TensorValues::F32(vec![1.0, 2.0, 3.0])), of("b", TensorValues::F16(half))])
-            .unwrap();
+        write_state_dict(
+            &path,
+            &[tensor("a", TensorValues::F32(vec![1.0, 2.0, 3.0])), tensor("b", TensorValues::F16(half))],
+        )
+        .unwrap();
         let found = entries(&fs::read(&path).unwrap());
         let names: Vec<&str> = found.iter().map(|entry| entry.0.as_str()).collect();
         let expected = ["data.pkl", "byteorder", "data/0", "data/1", "version"].map(|name| format!("archive/{name}"));
@@ -276,7 +282,7 @@ mod tests {
     }
 
     #[test]
-    fn a_pickle_is_these_bytes() {
+    fn the_pickle_has_the_expected_bytes() {
         let values = TensorValues::F16(vec![f16::ZERO; 300]);
         let tensor =
             StoredTensor { name: "w".to_owned(), values, offset: 7, shape: vec![2, 70_000], stride: vec![0, 0] };
@@ -294,7 +300,7 @@ mod tests {
     }
 
     #[test]
-    fn a_write_that_fails_names_the_file() {
+    fn write_errors_name_the_file() {
         let error = write_state_dict(Path::new("nowhere/a.pth"), &[]).unwrap_err().to_string();
         assert!(error.contains("nowhere/a.pth"), "{error}");
     }

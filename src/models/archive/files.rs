@@ -1,4 +1,4 @@
-//! The parts of an archive beside symbols, by name, and the PLY among them.
+//! Named parts of an archive other than entropy-coded values, among them those of a PLY.
 
 use std::io::{self, Write};
 use std::path::Path;
@@ -8,25 +8,28 @@ use crate::error::{Error, Result};
 use crate::files::ply::write::{beside, bytes_beside, write_rows};
 use crate::files::ply::{Ply, PlyHeader, name_without_bands};
 
-/// Names of what an archive holds of a PLY beside its rows.
+/// Name of the part with the header of the PLY.
 pub(crate) const HEADER: &str = "ply.header";
+/// Name of the part with the bytes between the header and the rows.
 const LEAD: &str = "ply.lead";
+/// Name of the part with the bytes after the rows.
 const TAIL: &str = "ply.tail";
-/// Name of a model folder's configuration in an archive; without one it is a single PLY.
+/// Name of the part with the configuration of a model folder. An archive without this part holds a single PLY.
 pub(crate) const CFG_ARGS: &str = "cfg_args";
-/// Name of the number of a model folder's training iteration, as text.
+/// Name of the part with the training iteration of a model folder, as text.
 pub(crate) const ITERATION: &str = "iteration";
 
-/// Adds what is left of `template` beside the attributes: of `rows` what else they have, and what is around them.
+/// Adds to `content` everything of the PLY `template` that is not an attribute: the extra properties of `rows`, and the
+/// bytes before and after the rows.
 ///
 /// # Errors
-/// A template cut short since it was opened.
+/// Fails if the template was cut short since it was opened, or needs more memory than allowed.
 pub(crate) fn add_cloud(content: &mut Content, template: &Ply, rows: impl Iterator<Item = u32>) -> Result<()> {
     template.check_unshrunk()?;
     let [lead, tail] = template.bytes_around();
-    let what = "what the archive keeps beside the attributes of Gaussians";
+    let what = "the data that the archive keeps beside the attributes of Gaussians";
     let bytes = lead + tail + bytes_beside(template) * content.cloud.len();
-    // The content, and the archive that it is encoded to.
+    // Counted twice: the content and the archive encoded from it.
     template.memory().check(template.path(), "element vertex", what, 2 * bytes as u64)?;
     content.beside = beside(template, rows);
     let around = |write: &dyn Fn(&mut dyn Write) -> io::Result<()>| {

@@ -1,6 +1,8 @@
-//! Archives (`.gsz`) as a family: what one holds, decoded into a scratch folder, is an input of its own kind.
+//! Archives (`.gsz`) as a model format. The content is decoded into a scratch folder and opened as a model of its own
+//! format.
 //!
-//! Specified in `format/ARCHIVE.md`. No name in an archive is ever a path: which files come of it is decided here.
+//! Specified in `format/ARCHIVE.md`. Names in an archive are never used as paths: this module decides which files are
+//! written.
 
 pub(super) mod files;
 
@@ -27,39 +29,39 @@ use crate::progress::Events;
 use crate::recipe::MergeParams;
 use crate::source::FrameSource;
 
-/// An archive.
+/// Archive (`.gsz`).
 pub(super) const ENTRY: ModelFormat = ModelFormat {
     recognizes: |found| found.is_file_of(&archive::MAGIC, "gsz"),
     open: |path, options| Ok(Box::new(OpenArchive::open(path, options)?)),
 };
 
-/// Reads an archive; gives also how many of its bytes are for what.
+/// Reads an archive and returns its content and its bytes by part.
 ///
 /// # Errors
-/// Whatever is wrong with it; more than `memory` takes.
+/// Fails if the archive is damaged or needs more than `memory`.
 pub fn read_archive(path: &Path, memory: ReadLimit) -> Result<(Content, ArchiveSize)> {
     archive::decode(&load(path, memory)?, path, memory)
 }
 
-/// Reads the bytes of the archive at `path`. Its head is checked before the rest is read.
+/// Reads the bytes of the archive at `path`. Checks the head before reading the rest.
 fn load(path: &Path, memory: ReadLimit) -> Result<Vec<u8>> {
     let failed = |error| Error::io("read", path)(error);
     let mut file = open_file(path)?;
-    let whole = file.metadata().map_err(failed)?.len();
+    let length = file.metadata().map_err(failed)?.len();
     let mut bytes = Vec::new();
     file.by_ref().take(archive::HEAD as u64).read_to_end(&mut bytes).map_err(failed)?;
-    archive::check_head(&bytes, whole, path, memory)?;
-    // The head is part of the checked length.
-    bytes.reserve_exact((whole - bytes.len() as u64) as usize);
-    file.take(whole - bytes.len() as u64).read_to_end(&mut bytes).map_err(failed)?;
+    archive::check_head(&bytes, length, path, memory)?;
+    // `check_head` compared the length of the file with the head, so the length is safe to allocate.
+    bytes.reserve_exact((length - bytes.len() as u64) as usize);
+    file.take(length - bytes.len() as u64).read_to_end(&mut bytes).map_err(failed)?;
     Ok(bytes)
 }
 
-/// Writes what an archive, read from `path`, holds, as it was: into the folder `to` the files of a model, or a single
-/// PLY to the new file `to`.
+/// Writes the content of an archive read from `path` as the original files: a model folder into `to`, or a single PLY
+/// to the new file `to`.
 ///
 /// # Errors
-/// Contents that make up no model; a failed write.
+/// Fails if the content is not a complete model or a write fails.
 pub fn unpack(content: &Content, path: &Path, to: &Path) -> Result<()> {
     let Some(cfg_args) = content.files.get(CFG_ARGS) else { return write_cloud(content, path, to) };
     let number = content.files.get(ITERATION).and_then(|text| std::str::from_utf8(text).ok()?.parse::<u32>().ok());
@@ -74,14 +76,14 @@ pub fn unpack(content: &Content, path: &Path, to: &Path) -> Result<()> {
     write_cloud(content, path, &folder.join("point_cloud.ply"))
 }
 
-/// Whether what an archive holds is a folder.
+/// Returns whether the archive holds a model folder rather than a single PLY.
 pub fn is_folder(content: &Content) -> bool {
     content.files.contains_key(CFG_ARGS)
 }
 
-/// An open archive.
+/// Open archive.
 struct OpenArchive {
-    /// What it holds, as files in `scratch`.
+    /// Model decoded into `scratch`.
     inner: Box<dyn InputModel>,
     scratch: ScratchFolder,
     digest: String,
@@ -89,6 +91,7 @@ struct OpenArchive {
 }
 
 impl OpenArchive {
+    /// Reads the archive at `path`, writes its files to a scratch folder and opens them.
     fn open(path: &Path, options: &OpenOptions) -> Result<OpenArchive> {
         options.refuse_for(path)?;
         let bytes = load(path, options.memory)?;

@@ -1,12 +1,12 @@
-//! `cfg_args`: what training was told.
+//! Training arguments in `cfg_args`.
 
 use std::path::{Path, PathBuf};
 
 use crate::error::Result;
 use crate::files::python_literal::{Argument, Literal, parse_call};
-use crate::models::four_d_gaussians::cfg_args::{ConfigKey, NAME, read};
+use crate::models::four_d_gaussians::cfg_args::{CALL_NAME, ConfigKey, read};
 
-/// The keys of a `cfg_args`.
+/// Keys of a `cfg_args` file and their values.
 #[derive(Debug)]
 pub(in crate::models) struct Arguments {
     keys: Vec<Argument>,
@@ -17,19 +17,19 @@ impl Arguments {
     /// Reads the file at `path`.
     ///
     /// # Errors
-    /// A file that cannot be read; text that is no `Namespace(…)`.
+    /// Fails if the file cannot be read or its text is not a `Namespace(…)`.
     pub(in crate::models) fn read(path: &Path) -> Result<Arguments> {
         let text = read(path)?;
-        let keys = parse_call(&text, NAME).map_err(|error| error.in_file(path, &text))?;
+        let keys = parse_call(&text, CALL_NAME).map_err(|error| error.in_file(path, &text))?;
         Ok(Arguments { keys, path: path.to_owned() })
     }
 
-    /// The file.
+    /// Returns the path of the file.
     pub(in crate::models) fn path(&self) -> &Path {
         &self.path
     }
 
-    /// The last value of `name`; none stands for a missing key too.
+    /// Returns the last value of `name`; `None` if the key is missing.
     pub(in crate::models) fn get(&self, name: &'static str) -> ConfigKey<'_> {
         let found = self.keys.iter().rev().find(|key| key.name == name);
         ConfigKey { name, value: found.map_or(&Literal::None, |key| &key.value), path: &self.path }

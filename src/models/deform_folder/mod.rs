@@ -1,9 +1,9 @@
-//! Model folders with a `deform` folder in them: a canonical cloud, and a network that deforms it.
+//! Model folders with a subfolder `deform`: canonical Gaussians and a network that deforms them.
 //!
-//! `cfg_args`, `cameras.json`, `point_cloud/iteration_K/point_cloud.ply`, `deform/iteration_K/deform.pth`. A family of
-//! such folders gives the law by which the network's outputs become states ([`Deforming`]); files, proxies and writing are
-//! the same. The result is a folder of the same layout with a smaller cloud: the network stays byte for byte as it was, and
-//! so does the configuration, but for the SH degree where that is lower.
+//! Files: `cfg_args`, `cameras.json`, `point_cloud/iteration_K/point_cloud.ply`, `deform/iteration_K/deform.pth`. A
+//! model format provides the computation of states from the network's outputs ([`NetworkMotionModel`]); reading files, proxies
+//! and writing are shared. The output is a folder of the same layout with a smaller point cloud file. The network is
+//! copied byte for byte, and so is the configuration, except for the SH degree if that is lowered.
 
 mod arguments;
 mod paths;
@@ -16,7 +16,7 @@ use std::path::Path;
 
 pub(super) use arguments::Arguments;
 use paths::Paths;
-pub(super) use paths::{has_network, names_of_network};
+pub(super) use paths::{has_network, network_tensor_names};
 
 use super::files::copy;
 use super::four_d_gaussians::cfg_args::read_for_degree;
@@ -38,42 +38,44 @@ use crate::progress::Events;
 use crate::recipe::MergeParams;
 use crate::source::FrameSource;
 
-/// Smallest scale that has a logarithm here.
-pub(super) const LEAST_SCALE: f64 = 1e-7;
+/// Minimum scale, so that its logarithm is finite.
+pub(super) const MIN_SCALE: f64 = 1e-7;
 
-/// A law by which what a network says becomes states.
-pub(super) trait Deforming: MotionModel {
-    /// What the family is called.
+/// Motion model that computes states from the outputs of a network.
+pub(super) trait NetworkMotionModel: MotionModel {
+    /// Name of the model format, shown to users.
     const KIND: &'static str;
-    /// Whether a rotation is made unit before what the network says is added to it.
-    const NORMALISES: bool;
+    /// Whether a quaternion is normalized before the network's output is added to it.
+    const NORMALIZES_ROTATION: bool;
 
-    /// Bytes that one Gaussian takes once it is prepared.
+    /// Returns the bytes per Gaussian of the values prepared by [`MotionModel::prepare`].
     fn bytes_per_gaussian(&self) -> usize;
 
-    /// Bytes that it holds however many Gaussians there are, beside the network.
+    /// Returns the bytes that do not depend on the number of Gaussians, in addition to the network.
     fn bytes(&self) -> usize {
         0
     }
 
-    /// Seconds of one processor that a state takes, about.
+    /// Returns the approximate CPU seconds on one core to compute one state.
     fn seconds_per_state(&self) -> f64;
 }
 
-/// What a family is made from.
-pub(super) struct Parts<'a> {
+/// Parts from which a model format creates its motion model.
+pub(super) struct ModelParts<'a> {
+    /// Training arguments of `cfg_args`.
     pub(super) arguments: &'a Arguments,
+    /// Tensors of the network.
     pub(super) tensors: &'a Tensors,
-    /// The file that `tensors` are of.
+    /// Path of the file of `tensors`.
     pub(super) file: &'a Path,
-    /// Planes `fea_*` of the cloud.
+    /// Number of properties `fea_*` in the point cloud file.
     pub(super) features: usize,
-    /// The cloud.
+    /// Path of the point cloud file.
     pub(super) cloud: &'a Path,
 }
 
-/// An open model folder.
-pub(super) struct Folder<L> {
+/// Open model folder.
+pub(super) struct DeformFolder<L> {
     paths: Paths,
     model: MotionModelFrames<L>,
     source_path: Option<String>,
@@ -82,15 +84,15 @@ pub(super) struct Folder<L> {
     notes: Vec<String>,
 }
 
-impl<L: Deforming + 'static> Folder<L> {
-    /// Opens the model at `root`; `make` gives its law, and what a person should know of it.
+impl<L: NetworkMotionModel + 'static> DeformFolder<L> {
+    /// Opens the model at `root`. `make` returns its motion model and notes for the user.
     ///
     /// # Errors
-    /// Files that are missing; what is wrong with one of them.
+    /// Fails if files are missing or damaged, or if `make` refuses the model.
     pub(super) fn open(
         root: &Path,
         options: &OpenOptions,
-        make: impl FnOnce(&Parts<'_>) -> Result<(L, Vec<String>)>,
+        make: impl FnOnce(&ModelParts<'_>) -> Result<(L, Vec<String>)>,
     ) -> Result<Box<dyn InputModel>> {
         let paths = Paths::locate(root, options.iteration)?;
         let arguments = Arguments::read(&paths.cfg_args)?;
@@ -98,21 +100,28 @@ impl<L: Deforming + 'static> Folder<L> {
         let ply = Ply::open_with(&paths.point_cloud, &options.ply())?;
         let raw = raw(&ply)?;
         let (features, file, cloud) = (raw.own.width(), &*paths.network, &*paths.point_cloud);
-        let parts = Parts { arguments: &arguments, tensors: &tensors, file, features, cloud };
-        let (law, notes) = make(&parts)?;
+        let parts = ModelParts { arguments: &arguments, tensors: &tensors, file, features, cloud };
+        let (motion_model, notes) = make(&parts)?;
         let values = tensors.values().map(|tensor| tensor.data.len()).sum::<usize>();
         let source_path = arguments.get("source_path").string()?;
         let white_background = arguments.get("white_background").bool(false)?;
-        let model = MotionModelFrames::new(law, raw, ply.sh_degree());
-        Ok(Box::new(Folder { paths, model, source_path, white_background, tensor_bytes: 4 * values as u64, notes }))
+        let model = MotionModelFrames::new(motion_model, raw, ply.sh_degree());
+        Ok(Box::new(DeformFolder {
+            paths,
+            model,
+            source_path,
+            white_background,
+            tensor_bytes: 4 * values as u64,
+            notes,
+        }))
     }
 
-    /// Returns the text of `cfg_args` with the SH degree up to `sh_degree`.
+    /// Returns the text of `cfg_args` with the SH degree limited to `sh_degree`.
     fn cfg_args(&self, sh_degree: usize) -> Result<String> {
         read_for_degree(&self.paths.cfg_args, self.model.info().sh_degree, sh_degree)
     }
 
-    /// Writes what is left as a folder at `path`.
+    /// Writes the compressed model as a folder at `path`.
     fn write_folder(&self, reduction: &CompressedModel, path: &Path) -> Result<()> {
         let to = Paths::new(path, self.paths.iteration);
         for file in [&to.point_cloud, &to.network] {
@@ -129,7 +138,7 @@ impl<L: Deforming + 'static> Folder<L> {
         let proxies = reduction.proxies.raw.as_ref().map_or(&none, |raw| &raw.gaussians);
         let mut rows = out_rows(reduction);
         for cluster in &reduction.clusters {
-            // A proxy has the features of its heaviest member.
+            // A proxy gets the features of its heaviest member.
             rows[cluster.output as usize].source = heaviest(cluster);
         }
         let template = Ply::open(&self.paths.point_cloud)?;
@@ -137,13 +146,14 @@ impl<L: Deforming + 'static> Folder<L> {
     }
 }
 
-/// The member of most weight, the first of several.
+/// Returns the member with the largest weight, the first of several.
 fn heaviest(cluster: &Cluster) -> u32 {
     let first = (cluster.leader, f64::NEG_INFINITY);
     cluster.members.iter().fold(first, |most, &member| if member.1 > most.1 { member } else { most }).0
 }
 
-/// The parameters of a cloud, with its planes `fea_0`, `fea_1`, ….
+/// Reads the parameters of all Gaussians, with the properties `fea_0`, `fea_1`, … as format-specific planes. Fails if
+/// values that the network reads or that are decomposed are not finite.
 fn raw(ply: &Ply) -> Result<Raw> {
     let count = ply.count();
     let gaussians = ply.whole()?;
@@ -157,7 +167,7 @@ fn raw(ply: &Ply) -> Result<Raw> {
             read_plane(ply.row(row), &[0], property, big_endian, std::slice::from_mut(value));
         }
     }
-    // What a network reads, or what is decomposed.
+    // Check the columns that the network reads or that are decomposed.
     let read = [&gaussians.position, &gaussians.rotation, &gaussians.log_scale, &own];
     for (column, name) in read.into_iter().zip(["x y z", "rot", "scale", "fea"]) {
         if let Some(at) = column.planes().iter().position(|value| !value.is_finite()) {
@@ -168,19 +178,19 @@ fn raw(ply: &Ply) -> Result<Raw> {
                 "a finite number",
                 value.to_string(),
             )
-            .hint("drop this Gaussian, or save the model anew"));
+            .hint("remove this Gaussian from the model, or train and save it again"));
         }
     }
     Ok(Raw { gaussians, own })
 }
 
-/// Of a model's files that a renderer opens.
+/// Returns the sizes of the files that a renderer opens.
 fn size_of(paths: &Paths) -> Result<Size> {
     let (cloud, field) = (bytes_of([&*paths.point_cloud])?, bytes_of([&*paths.network])?);
     Ok(Size { cloud, field, rest: bytes_of([&*paths.cfg_args])?, ..Size::default() })
 }
 
-impl<L: Deforming + 'static> InputModel for Folder<L> {
+impl<L: NetworkMotionModel + 'static> InputModel for DeformFolder<L> {
     fn kind(&self) -> &'static str {
         L::KIND
     }
@@ -209,24 +219,24 @@ impl<L: Deforming + 'static> InputModel for Folder<L> {
     }
 
     fn residence(&self) -> MemoryProfile {
-        let law = self.model.law();
+        let motion_model = self.model.motion_model();
         let features = 4 * self.model.raw().own.width() as u64;
         let whole = state_bytes(self.model.info().sh_degree, Columns::all()) + features;
         MemoryProfile {
             per_gaussian: whole,
-            // Normals and the like stand beside the values.
+            // Normals and other extra properties are stored beside the attributes.
             opening: whole + 24,
-            // A copy of the parameters, what is prepared of them, and what a block adds to them.
-            reader: 2 * whole + law.bytes_per_gaussian() as u64 + 128,
+            // A copy of the parameters, values prepared from them, and the deltas of a block.
+            reader: 2 * whole + motion_model.bytes_per_gaussian() as u64 + 128,
             reduced: 2 * whole,
             jacobian: Jacobian::BYTES_PER_GAUSSIAN as u64 + 36,
             file: whole + 24,
-            // Tensors as they are read and as they are used.
-            fixed: 2 * self.tensor_bytes + law.bytes() as u64,
+            // Tensors as read and as used.
+            fixed: 2 * self.tensor_bytes + motion_model.bytes() as u64,
             frame_block: 0,
             gaussian_block: GAUSSIAN_BLOCK as u64,
             columns: 0,
-            seconds_per_state: law.seconds_per_state(),
+            seconds_per_state: motion_model.seconds_per_state(),
             decoded: 0,
         }
     }
@@ -235,7 +245,7 @@ impl<L: Deforming + 'static> InputModel for Folder<L> {
         Timing::Continuous
     }
 
-    /// The network was trained with times as cameras give them.
+    /// Uses camera times unchanged, since the network was trained with them.
     fn clock(&self) -> Clock {
         Clock::Given
     }
@@ -292,10 +302,11 @@ impl<L: Deforming + 'static> InputModel for Folder<L> {
             OutputKind::Model => self.write_folder(reduction, path).map(|()| Vec::new())?,
             _ => write_sequence(&*self.reduced(reduction)?, kind, path, limits.frames_held, events)?,
         };
-        let left = Columns::all().difference(self.model.law().movable());
+        let left = Columns::all().difference(self.model.motion_model().movable());
         if !reduction.change.is_empty() && !left.is_empty() {
             notes.push(
-                "sizes and rotations were not refined: this model's covariances are not those of its quaternions"
+                "scales and rotations were not refined: the covariances of this model do not follow from its \
+                 quaternions alone"
                     .to_owned(),
             );
         }

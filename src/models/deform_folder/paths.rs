@@ -1,4 +1,4 @@
-//! The files of a model folder with a `deform` folder in it.
+//! Files of a model folder with a subfolder `deform`.
 
 use std::path::{Path, PathBuf};
 
@@ -9,13 +9,16 @@ use crate::error::{Error, Result};
 use crate::files::digest::hash_file;
 use crate::files::state_dict::{is_pair, names, read_state_dict};
 use crate::limits::ReadLimit;
-use crate::models::iterations::numbers;
+use crate::models::iterations::iteration_numbers;
 
-const CLOUDS: &str = "point_cloud";
-const NETWORKS: &str = "deform";
-const NETWORK: &str = "deform.pth";
+/// Name of the folder of point cloud files.
+const POINT_CLOUD_FOLDER: &str = "point_cloud";
+/// Name of the folder of networks.
+const NETWORK_FOLDER: &str = "deform";
+/// Name of the network file in an iteration folder.
+const NETWORK_FILE: &str = "deform.pth";
 
-/// The files.
+/// Paths of the files of a model folder.
 #[derive(Debug, Clone)]
 pub(in crate::models) struct Paths {
     pub(super) root: PathBuf,
@@ -23,36 +26,38 @@ pub(in crate::models) struct Paths {
     pub(super) iteration: u32,
     pub(super) cfg_args: PathBuf,
     pub(super) point_cloud: PathBuf,
-    /// The network's state dict.
+    /// State dict of the network.
     pub(super) network: PathBuf,
 }
 
-/// Whether a folder has a network of this kind.
+/// Returns whether a folder contains a network `deform/iteration_K/deform.pth`.
 pub(in crate::models) fn has_network(root: &Path) -> bool {
-    iterations(&root.join(NETWORKS), NETWORK).is_ok_and(|found| !found.is_empty())
+    iterations(&root.join(NETWORK_FOLDER), NETWORK_FILE).is_ok_and(|found| !found.is_empty())
 }
 
-/// Names of the tensors of the last network of a folder; none of what cannot be read, which is for its reader to say.
-pub(in crate::models) fn names_of_network(root: &Path, memory: ReadLimit) -> Vec<String> {
-    let last = iterations(&root.join(NETWORKS), NETWORK).ok().and_then(|found| found.last().copied());
+/// Returns the tensor names of the last network of a folder; empty if the file cannot be read. Opening the model then
+/// reports the error.
+pub(in crate::models) fn network_tensor_names(root: &Path, memory: ReadLimit) -> Vec<String> {
+    let last = iterations(&root.join(NETWORK_FOLDER), NETWORK_FILE).ok().and_then(|found| found.last().copied());
     last.and_then(|k| names(&Paths::new(root, k).network, memory).ok()).unwrap_or_default()
 }
 
-/// K of the folders `iteration_K` in `within` that hold `file`, increasing.
+/// Returns the number K of each folder `iteration_K` in `within` that contains `file`, in increasing order.
 fn iterations(within: &Path, file: &str) -> Result<Vec<u32>> {
-    let mut found = numbers(within)?;
+    let mut found = iteration_numbers(within)?;
     found.retain(|k| within.join(format!("iteration_{k}")).join(file).is_file());
     Ok(found)
 }
 
 impl Paths {
-    /// Finds the files at `root`: of `iteration`, or of the largest that both folders have, as they were saved together.
+    /// Finds the files of the model at `root`: of `iteration`, or of the largest iteration that has both a point cloud
+    /// and a network.
     ///
     /// # Errors
-    /// A folder or file that is missing.
+    /// Fails if a folder or file is missing.
     pub(super) fn locate(root: &Path, iteration: Option<u32>) -> Result<Paths> {
-        let (clouds, networks) = (root.join(CLOUDS), root.join(NETWORKS));
-        let (of_cloud, of_network) = (iterations(&clouds, "point_cloud.ply")?, iterations(&networks, NETWORK)?);
+        let (clouds, networks) = (root.join(POINT_CLOUD_FOLDER), root.join(NETWORK_FOLDER));
+        let (of_cloud, of_network) = (iterations(&clouds, "point_cloud.ply")?, iterations(&networks, NETWORK_FILE)?);
         let both: Vec<u32> = of_cloud.iter().copied().filter(|k| of_network.contains(k)).collect();
         let chosen = iteration.map_or(both.last().copied(), |k| both.contains(&k).then_some(k));
         let Some(k) = chosen else {
@@ -60,46 +65,64 @@ impl Paths {
                 [] => "none".to_owned(),
                 found => found.iter().map(u32::to_string).collect::<Vec<_>>().join(", "),
             };
-            let wanted = iteration.map_or("iteration_<number>".to_owned(), |k| format!("iteration_{k}"));
-            let found = format!("clouds of {}, networks of {}", names(&of_cloud), names(&of_network));
-            return Err(Error::input(root, "", format!("{CLOUDS} and {NETWORKS} of the same {wanted}"), found));
+            let expected = iteration.map_or("iteration_<number>".to_owned(), |k| format!("iteration_{k}"));
+            let found = format!(
+                "point clouds of iterations {}, networks of iterations {}",
+                names(&of_cloud),
+                names(&of_network)
+            );
+            return Err(Error::input(
+                root,
+                "",
+                format!(
+                    "folders {POINT_CLOUD_FOLDER} and {NETWORK_FOLDER} with the \
+                                                       same {expected}"
+                ),
+                found,
+            ));
         };
         let paths = Paths::new(root, k);
         match paths.cfg_args.is_file() {
             true => Ok(paths),
-            false => Err(Error::input(&paths.cfg_args, "", "a file of the model folder", "none")
+            false => Err(Error::input(&paths.cfg_args, "", "this file of the model folder", "no such file")
                 .hint("training writes it: copy it from where the model was trained")),
         }
     }
 
-    /// Those of training iteration `k` in `root`.
+    /// Returns the paths of training iteration `k` in `root`.
     pub(super) fn new(root: &Path, k: u32) -> Paths {
         let within = |folder: &str| root.join(folder).join(format!("iteration_{k}"));
         Paths {
             root: root.to_owned(),
             iteration: k,
             cfg_args: root.join("cfg_args"),
-            point_cloud: within(CLOUDS).join("point_cloud.ply"),
-            network: within(NETWORKS).join(NETWORK),
+            point_cloud: within(POINT_CLOUD_FOLDER).join("point_cloud.ply"),
+            network: within(NETWORK_FOLDER).join(NETWORK_FILE),
         }
     }
 
-    /// The network's tensors.
+    /// Reads the tensors of the network.
     ///
     /// # Errors
-    /// A file that is no state dict; one of Grid4D.
+    /// Fails if the file is not a state dict, or belongs to Grid4D.
     pub(super) fn tensors(&self, memory: ReadLimit) -> Result<Tensors> {
-        let pair = "its hash grids are not read here; write what it renders from as a PLY for each time, and give the folder of \
-                    them";
+        let grid4d_hint = "hash grids are not supported: export the Gaussians of each frame as a PLY with the model's \
+                           own code, and give the folder of these files";
         read_state_dict(&self.network, memory).map_err(|error| match is_pair(&self.network, memory) {
-            true => {
-                Error::input(&self.network, "", "the state dict of one network", "two, as Grid4D saves them").hint(pair)
-            }
+            true => Error::input(
+                &self.network,
+                "",
+                "the state dict of one network",
+                "two state dicts, as Grid4D saves \
+                                                                                  them",
+            )
+            .hint(grid4d_hint),
             false => error,
         })
     }
 
-    /// xxh3-128 over the bytes of cloud, network and `cfg_args`, as 32 hex digits.
+    /// Returns the xxh3-128 hash of the bytes of point cloud, network and `cfg_args`, as 32 hex digits. Fails if a file
+    /// cannot be read.
     pub(super) fn digest(&self) -> Result<String> {
         let mut hash = Xxh3::new();
         [&self.point_cloud, &self.network, &self.cfg_args]

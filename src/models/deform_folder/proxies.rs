@@ -1,13 +1,14 @@
 //! Proxies of Gaussians that a network deforms.
 //!
-//! What the network adds depends on where a Gaussian is, so a place is chosen and not averaged: of the places of the heaviest
-//! members and their mean the one that moves most like the members' moment match, improved by Gauss-Newton steps. Size and
-//! rotation are then what is wanted less what the network makes of them there, on average.
+//! The network's output depends on the canonical position of a Gaussian, so the position of a proxy is searched for and
+//! not averaged. Candidates are the positions of the heaviest members and their mean. The candidate whose path is
+//! nearest to the moment match of the members is improved by Gauss-Newton steps. Scale and rotation are then the target
+//! values minus the network's output at that position, on average over sampled frames.
 
 use glam::{DMat3, DVec3};
 use rayon::prelude::*;
 
-use super::{Deforming, LEAST_SCALE, heaviest};
+use super::{MIN_SCALE, NetworkMotionModel, heaviest};
 use crate::compressed_model::Cluster;
 use crate::error::Result;
 use crate::merging::merged::MergedSequence;
@@ -17,26 +18,29 @@ use crate::passes::gather_all;
 use crate::recipe::MergeParams;
 use crate::source::{Deformation, FrameSource};
 
-/// Frames at which places are compared, and over which sizes and rotations are averaged.
+/// Maximum number of frames at which positions are compared, and over which scales and rotations are averaged.
 const SAMPLED_FRAMES: usize = 16;
-/// Members whose places are tried.
-const TRIED: usize = 4;
-/// Steps towards a better place.
+/// Maximum number of members whose positions are candidates.
+const MAX_CANDIDATES: usize = 4;
+/// Number of Gauss-Newton steps of the position.
 const STEPS: usize = 2;
-/// Turns towards a better size and rotation.
-const TURNS: usize = 3;
-/// What a step adds to the diagonal, of its mean: where all frames move alike the matrix is well behaved, and elsewhere a
-/// shorter step is a better one.
+/// Number of corrections of scale and rotation.
+const CORRECTIONS: usize = 3;
+/// Damping of a Gauss-Newton step: added to the diagonal, relative to its mean. If all frames move alike the matrix is
+/// well conditioned; otherwise a shorter step is better.
 const DAMPING: f64 = 1e-3;
 
-/// Parameters that move most like the members of each of `clusters`, a row for each.
-pub(super) fn propose<L: Deforming>(
+/// Returns the parameters of the proxies of `clusters`, one row each, that approximate the motion of their members.
+///
+/// # Errors
+/// Fails if frames cannot be evaluated.
+pub(super) fn propose<L: NetworkMotionModel>(
     model: &MotionModelFrames<L>,
     clusters: &[Cluster],
     rule: &MergeParams,
 ) -> Result<Raw> {
     let leaders: Vec<u32> = clusters.iter().map(|cluster| cluster.leader).collect();
-    let members = clusters.iter().zip(0..).map(|(cluster, place)| (place, &cluster.members[..]));
+    let members = clusters.iter().zip(0..).map(|(cluster, position)| (position, &cluster.members[..]));
     let wanted = MergedSequence::new(model, &leaders, members, rule);
     let count = model.info().times.len();
     let sampled = count.min(SAMPLED_FRAMES);
@@ -48,40 +52,42 @@ pub(super) fn propose<L: Deforming>(
     };
     let wanted: Vec<Gaussians> = frames.iter().enumerate().map(of_frame).collect::<Result<_>>()?;
 
-    let (mut tried, mut of_cluster) = (Vec::new(), Vec::new());
+    let (mut candidates, mut candidate_rows) = (Vec::new(), Vec::new());
     let mut features = Vec::new();
     for cluster in clusters {
-        let first = tried.len();
+        let first = candidates.len();
         let mut by_weight = cluster.members.clone();
         by_weight.sort_by(|a, b| b.1.total_cmp(&a.1).then(a.0.cmp(&b.0)));
-        by_weight.truncate(TRIED);
-        tried.extend(by_weight.into_iter().map(|(id, _)| id));
-        // The last one is moved to the mean.
-        tried.push(cluster.leader);
-        of_cluster.push(first..tried.len());
-        features.resize(tried.len(), heaviest(cluster));
+        by_weight.truncate(MAX_CANDIDATES);
+        candidates.extend(by_weight.into_iter().map(|(id, _)| id));
+        // The last candidate is moved to the mean below.
+        candidates.push(cluster.leader);
+        candidate_rows.push(first..candidates.len());
+        features.resize(candidates.len(), heaviest(cluster));
     }
-    let mut places = model.raw().pick(&tried);
-    places.own = model.raw().own.pick(&features);
-    for (cluster, rows) in clusters.iter().zip(&of_cluster) {
+    let mut candidate_params = model.raw().pick(&candidates);
+    candidate_params.own = model.raw().own.pick(&features);
+    for (cluster, rows) in clusters.iter().zip(&candidate_rows) {
         let mut mean = DVec3::ZERO;
         for &(id, weight) in &cluster.members {
-            mean += weight * place(&model.raw().gaussians, id as usize);
+            mean += weight * position(&model.raw().gaussians, id as usize);
         }
-        places.gaussians.position.set_row(rows.end - 1, mean.as_vec3().to_array());
+        candidate_params.gaussians.position.set_row(rows.end - 1, mean.as_vec3().to_array());
     }
-    let of_place: Vec<usize> = (0..clusters.len()).flat_map(|c| of_cluster[c].clone().map(move |_| c)).collect();
-    let off = off(model, &places, &frames, |k, row| place(&wanted[k], of_place[row]))?;
-    let best: Vec<u32> = of_cluster
+    let cluster_of_candidate: Vec<usize> =
+        (0..clusters.len()).flat_map(|c| candidate_rows[c].clone().map(move |_| c)).collect();
+    let off =
+        squared_distances(model, &candidate_params, &frames, |k, row| position(&wanted[k], cluster_of_candidate[row]))?;
+    let best: Vec<u32> = candidate_rows
         .iter()
         .map(|rows| rows.clone().fold(rows.start, |best, row| if off[row] < off[best] { row } else { best }) as u32)
         .collect();
-    let mut made = places.pick(&best);
+    let mut made = candidate_params.pick(&best);
     let mut least: Vec<f64> = best.iter().map(|&row| off[row as usize]).collect();
 
     for _ in 0..STEPS {
-        let better = step(model, &made, &frames, &wanted)?;
-        let found = self::off(model, &better, &frames, |k, row| place(&wanted[k], row))?;
+        let better = gauss_newton_step(model, &made, &frames, &wanted)?;
+        let found = squared_distances(model, &better, &frames, |k, row| position(&wanted[k], row))?;
         for (row, (least, found)) in least.iter_mut().zip(found).enumerate() {
             if found < *least {
                 *least = found;
@@ -93,13 +99,13 @@ pub(super) fn propose<L: Deforming>(
     Ok(made)
 }
 
-/// Where a Gaussian is.
-fn place(state: &Gaussians, row: usize) -> DVec3 {
+/// Returns the position of a Gaussian.
+fn position(state: &Gaussians, row: usize) -> DVec3 {
     DVec3::from(state.position.row::<3>(row).map(f64::from))
 }
 
-/// For every row of `raw` the sum of its squared distances from where it is wanted.
-fn off<L: Deforming>(
+/// Returns for every row of `raw` the sum over frames of its squared distance from the position that `wanted` returns.
+fn squared_distances<L: NetworkMotionModel>(
     model: &MotionModelFrames<L>,
     raw: &Raw,
     frames: &[usize],
@@ -109,14 +115,19 @@ fn off<L: Deforming>(
     for (k, &frame) in frames.iter().enumerate() {
         Deformation::state(model, frame, raw, Columns::POSITION, &mut state)?;
         for (row, off) in off.iter_mut().enumerate() {
-            *off += (place(&state, row) - wanted(k, row)).length_squared();
+            *off += (position(&state, row) - wanted(k, row)).length_squared();
         }
     }
     Ok(off)
 }
 
-/// One Gauss-Newton step of every place.
-fn step<L: Deforming>(model: &MotionModelFrames<L>, raw: &Raw, frames: &[usize], wanted: &[Gaussians]) -> Result<Raw> {
+/// Returns `raw` with every position improved by one Gauss-Newton step.
+fn gauss_newton_step<L: NetworkMotionModel>(
+    model: &MotionModelFrames<L>,
+    raw: &Raw,
+    frames: &[usize],
+    wanted: &[Gaussians],
+) -> Result<Raw> {
     let mut sums = vec![(DMat3::ZERO, DVec3::ZERO); raw.len()];
     let mut state = Gaussians::zeros(0, 0);
     for (&frame, wanted) in frames.iter().zip(wanted) {
@@ -124,10 +135,10 @@ fn step<L: Deforming>(model: &MotionModelFrames<L>, raw: &Raw, frames: &[usize],
         let slopes = Deformation::jacobian(model, frame, raw, Columns::POSITION)?;
         let slopes = slopes.column(Columns::POSITION);
         for (row, (matrix, vector)) in sums.iter_mut().enumerate() {
-            // Plane 3·i + j is component i by j: rows of the matrix, columns of its transpose.
+            // Plane 3·i + j is the derivative of component i by component j, so reading columns gives the transpose.
             let transposed = DMat3::from_cols_array(&slopes.row::<9>(row).map(f64::from));
             *matrix += transposed * transposed.transpose();
-            *vector += transposed * (place(wanted, row) - place(&state, row));
+            *vector += transposed * (position(wanted, row) - position(&state, row));
         }
     }
     let mut better = raw.clone();
@@ -135,17 +146,17 @@ fn step<L: Deforming>(model: &MotionModelFrames<L>, raw: &Raw, frames: &[usize],
         let mean = (matrix.x_axis.x + matrix.y_axis.y + matrix.z_axis.z) / 3.0;
         let by = (matrix + DMat3::from_diagonal(DVec3::splat(DAMPING * mean))).inverse() * vector;
         if by.is_finite() {
-            let moved = place(&raw.gaussians, row) + by;
+            let moved = position(&raw.gaussians, row) + by;
             better.gaussians.position.set_row(row, moved.as_vec3().to_array());
         }
     }
     Ok(better)
 }
 
-/// Sets everything but the place: from the leader's on, by what is wanted less what is there, on average. Where what the
-/// network says is added that is what is wanted less that, at once; where more comes of it, as of quaternions that are not
-/// unit, it takes some turns. The best turn stays.
-fn shape<L: Deforming>(
+/// Sets all parameters except the position. Starts from the leader and adds the mean difference between target and
+/// state, [`CORRECTIONS`] times. One correction suffices if the network's output is simply added; quaternions that are not
+/// normalized need several. Keeps the best scale and rotation.
+fn shape<L: NetworkMotionModel>(
     model: &MotionModelFrames<L>,
     made: &mut Raw,
     leaders: &[u32],
@@ -157,14 +168,14 @@ fn shape<L: Deforming>(
     (made.gaussians.opacity_logit, made.gaussians.sh) = (own.opacity_logit.pick(leaders), own.sh.pick(leaders));
     let (mut best, mut least) = (made.clone(), vec![f64::INFINITY; made.len()]);
     let share = 1.0 / frames.len().max(1) as f64;
-    for turn in 0..=TURNS {
-        let mut all = vec![Wanting::default(); made.len()];
+    for correction in 0..=CORRECTIONS {
+        let mut all = vec![StateDifference::default(); made.len()];
         let mut state = Gaussians::zeros(0, own.sh_degree());
         for (&frame, wanted) in frames.iter().zip(wanted) {
             Deformation::state(model, frame, made, Columns::all(), &mut state)?;
             all.par_iter_mut().enumerate().for_each(|(row, sum)| sum.add(wanted, &state, row));
             if wanted.sh.len() == made.len() {
-                // Harmonics are wanted at one frame: they change at all others as they do there.
+                // SH coefficients are compared at one frame: their change over time is the same at all frames.
                 for c in 0..state.sh.width() {
                     let more = wanted.sh.plane(c).iter().zip(state.sh.plane(c)).map(|(to, from)| to - from);
                     made.gaussians.sh.plane_mut(c).iter_mut().zip(more).for_each(|(of, more)| *of += more);
@@ -176,28 +187,28 @@ fn shape<L: Deforming>(
                 least[row] = sum.off;
                 best.set_row(row, made, row);
             }
-            if turn < TURNS {
-                sum.give::<L>(share, &mut made.gaussians, row);
+            if correction < CORRECTIONS {
+                sum.apply::<L>(share, &mut made.gaussians, row);
             }
         }
     }
-    // Opacities and harmonics are right from the first turn on.
+    // Opacities and SH coefficients are right after the first correction.
     (made.gaussians.rotation, made.gaussians.log_scale) = (best.gaussians.rotation, best.gaussians.log_scale);
     Ok(())
 }
 
-/// What one row lacks, summed over frames.
+/// Difference between target and state of one row, summed over frames.
 #[derive(Clone, Copy, Default)]
-struct Wanting {
+struct StateDifference {
     scale: [f64; 3],
     rotation: [f64; 4],
     opacity: f64,
-    /// Squares of what is lacking, of logarithms of scales and of unit quaternions.
+    /// Sum of squared differences of log scales and of unit quaternions.
     off: f64,
 }
 
-impl Wanting {
-    /// Adds what `state` lacks of `wanted`.
+impl StateDifference {
+    /// Adds the difference between `wanted` and `state` at one frame.
     fn add(&mut self, wanted: &Gaussians, state: &Gaussians, row: usize) {
         let [to, from] = [wanted, state].map(|state| state.log_scale.row::<3>(row).map(f64::from));
         for c in 0..3 {
@@ -216,20 +227,20 @@ impl Wanting {
         self.opacity += to - from;
     }
 
-    /// Gives it, on average, to parameters.
-    fn give<L: Deforming>(&self, share: f64, to: &mut Gaussians, row: usize) {
+    /// Adds the mean difference to the parameters of a row. `share` is 1 / number of frames.
+    fn apply<L: NetworkMotionModel>(&self, share: f64, to: &mut Gaussians, row: usize) {
         let scale = to.log_scale.row::<3>(row).map(|x| f64::from(x).exp());
-        let scale = [0, 1, 2].map(|c| (scale[c] + share * self.scale[c]).max(LEAST_SCALE).ln() as f32);
+        let scale = [0, 1, 2].map(|c| (scale[c] + share * self.scale[c]).max(MIN_SCALE).ln() as f32);
         to.log_scale.set_row(row, scale);
         let own = to.rotation.row::<4>(row).map(f64::from);
-        // What is added to a quaternion that is made unit first counts by its length.
-        let long = if L::NORMALISES { own.iter().map(|x| x * x).sum::<f64>().sqrt() } else { 1.0 };
+        // If quaternions are normalized first, the correction is scaled by their length.
+        let long = if L::NORMALIZES_ROTATION { own.iter().map(|x| x * x).sum::<f64>().sqrt() } else { 1.0 };
         let rotation = [0, 1, 2, 3].map(|c| (own[c] + long * share * self.rotation[c]) as f32);
         if rotation.iter().all(|x| x.is_finite()) {
             to.rotation.set_row(row, rotation);
         }
         let alpha = (opacity(to.opacity_logit.plane(0)[row]) + share * self.opacity).clamp(1e-6, 1.0 - 1e-6);
-        // An opacity that is right keeps its bits.
+        // An opacity without difference keeps its bits.
         if self.opacity != 0.0 {
             to.opacity_logit.set_row(row, [logit(alpha) as f32]);
         }

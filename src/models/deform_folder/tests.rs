@@ -1,4 +1,4 @@
-//! Models of both families, made of noise: states against the formulas in f64, results read back, and what is refused.
+//! Tests of both formats with random models: states against the formulas in f64, outputs read back, and refused inputs.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -25,20 +25,20 @@ use crate::source::FrameSource;
 const COUNT: usize = 40;
 const TIMES: [f64; 5] = [0.0, 0.25, 0.5, 0.75, 1.0];
 
-/// A folder to be, and what is written into it.
-struct Made {
+/// Content of a model folder to be written.
+struct TestModel {
     folder: TempDir,
     cfg_args: String,
     tensors: Tensors,
-    /// Names and values of the cloud's properties.
+    /// Name and values of each property of the point cloud file.
     cloud: Vec<(String, Vec<f32>)>,
 }
 
-impl Made {
-    /// Of Deformable-3D-Gaussians.
-    fn plain(kind: DeepVariant) -> Made {
+impl TestModel {
+    /// Creates a model of Deformable-3D-Gaussians.
+    fn deformable(kind: DeepVariant) -> TestModel {
         let stripped = |(name, tensor): (String, Tensor)| (name.replace("network.", ""), small(tensor));
-        Made {
+        TestModel {
             folder: tempfile::tempdir().unwrap(),
             cfg_args: format!(
                 "Namespace(is_6dof={}, is_blender={}, sh_degree=1, source_path='', white_background=True)",
@@ -50,8 +50,8 @@ impl Made {
         }
     }
 
-    /// Of SC-GS, with 12 nodes, 2 hyper dimensions and a mask.
-    fn sparse(kind: DeepVariant) -> Made {
+    /// Creates a model of SC-GS with 12 nodes, 2 hyper dimensions and a mask.
+    fn sc_gs(kind: DeepVariant) -> TestModel {
         let mut noise = Noise(23);
         let mut add = |shape: &[usize]| Tensor {
             shape: shape.to_vec(),
@@ -61,11 +61,11 @@ impl Made {
         made.insert("nodes".into(), add(&[12, 5]));
         made.insert("_node_radius".into(), add(&[12]));
         made.insert("_node_weight".into(), add(&[12, 1]));
-        Made {
+        TestModel {
             cfg_args: "Namespace(K=3, deform_type='node', gs_with_motion_mask=True, hyper_dim=2, sh_degree=1)".into(),
             tensors: made,
             cloud: cloud(3),
-            ..Made::plain(kind)
+            ..TestModel::deformable(kind)
         }
     }
 
@@ -78,7 +78,7 @@ impl Made {
         self.path().join(folder).join(format!("iteration_{k}")).join(name)
     }
 
-    /// Writes all of it as training iteration `k`.
+    /// Writes all files as training iteration `k`.
     fn write(&self, k: u32) {
         let [network, cloud] = ["deform", "point_cloud"].map(|folder| self.file(folder, k));
         for file in [&network, &cloud] {
@@ -98,7 +98,7 @@ impl Made {
         fs::write(cloud, bytes).unwrap();
     }
 
-    /// Written and open, with frames.
+    /// Writes the model, opens it and sets frame times.
     fn open(&self) -> Box<dyn InputModel> {
         self.write(7);
         open(&self.path()).unwrap()
@@ -116,9 +116,9 @@ impl Made {
     }
 }
 
-/// Weights that move Gaussians by some tenths.
+/// Scales the weights of the last layers so that Gaussians move by some tenths of a unit.
 fn small(mut tensor: Tensor) -> Tensor {
-    // Only of heads: those have few outputs.
+    // Heads are recognized by their few outputs.
     if tensor.shape[0] < 5 {
         tensor.data.iter_mut().for_each(|x| *x *= 0.1);
     }
@@ -149,7 +149,7 @@ fn states(source: &dyn FrameSource) -> Vec<Gaussians> {
     (0..TIMES.len()).map(|frame| gather_all(source, frame, Columns::all()).unwrap()).collect()
 }
 
-/// R·S²·Rᵀ by the rasteriser's formula, of any quaternion.
+/// Returns R·S²·Rᵀ by the formula of the rasterizer, which accepts any quaternion.
 fn covariance(scales: [f64; 3], [w, x, y, z]: [f64; 4]) -> DMat3 {
     let rows = [
         [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
@@ -165,17 +165,17 @@ fn unit(q: [f64; 4]) -> [f64; 4] {
     q.map(|x| x / length)
 }
 
-fn of_state(state: &Gaussians, i: usize) -> DMat3 {
+fn state_covariance(state: &Gaussians, i: usize) -> DMat3 {
     let scales = state.log_scale.row::<3>(i).map(|x| f64::from(x).exp());
     covariance(scales, unit(state.rotation.row::<4>(i).map(f64::from)))
 }
 
-fn off(a: DMat3, b: DMat3) -> f64 {
+fn relative_difference(a: DMat3, b: DMat3) -> f64 {
     let most = |m: DMat3| m.to_cols_array().iter().fold(0.0f64, |most, x| most.max(x.abs()));
     most(a - b) / most(b)
 }
 
-/// What the network says of places at a time.
+/// Returns the network's output for canonical positions at a time.
 fn motion(tensors: &Tensors, prefix: &str, places: &[[f64; 3]], time: f64) -> PredictedMotion {
     let network = Network::new(tensors, prefix, Path::new("made")).unwrap();
     let planes = (0..3).flat_map(|c| places.iter().map(move |place| place[c] as f32)).collect();
@@ -191,7 +191,7 @@ fn row<const W: usize>(column: &Column, i: usize) -> [f64; W] {
 #[test]
 fn states_of_deformable_3d_gaussians_follow_the_formulas() {
     for kind in &KINDS[..2] {
-        let made = Made::plain(*kind);
+        let made = TestModel::deformable(*kind);
         let model = made.open();
         assert_eq!(model.kind(), "Deformable-3D-Gaussians model");
         assert_eq!((model.background(), model.notes()), (Some([1.0; 3]), vec![]));
@@ -204,7 +204,7 @@ fn states_of_deformable_3d_gaussians_follow_the_formulas() {
                 let scale = made.row::<3>("scale", i).map(f64::exp);
                 let scale = [0, 1, 2].map(|c| scale[c] + row::<3>(&by.scaling, i)[c]);
                 let expected = covariance(scale, [0, 1, 2, 3].map(|c| rotation[c] + d[c]));
-                let found = off(of_state(state, i), expected);
+                let found = relative_difference(state_covariance(state, i), expected);
                 assert!(found < 1e-5, "Gaussian {i}: covariance off by {found:e}");
                 if !kind.screws {
                     let to = [0, 1, 2].map(|c| (place[c] + row::<3>(&by.warp, i)[c]) as f32);
@@ -219,7 +219,7 @@ fn states_of_deformable_3d_gaussians_follow_the_formulas() {
 #[test]
 fn states_of_sc_gs_follow_the_formulas() {
     for kind in [KINDS[0], KINDS[2]] {
-        let made = Made::sparse(kind);
+        let made = TestModel::sc_gs(kind);
         let model = made.open();
         assert_eq!((model.kind(), model.notes()), ("SC-GS model", vec![]));
         let [nodes, radius, weight] = ["nodes", "_node_radius", "_node_weight"].map(|name| &made.tensors[name].data);
@@ -243,8 +243,8 @@ fn states_of_sc_gs_follow_the_formulas() {
                 let u: Vec<(f64, usize)> = u.collect();
                 let sum: f64 = u.iter().map(|u| u.0).sum();
                 let sum = |column: &Column, c: usize| {
-                    let of: f64 = u.iter().map(|&(u, node)| u / sum * f64::from(column.plane(c)[node])).sum();
-                    of / (1.0 + (-mask).exp())
+                    let weighted: f64 = u.iter().map(|&(u, node)| u / sum * f64::from(column.plane(c)[node])).sum();
+                    weighted / (1.0 + (-mask).exp())
                 };
                 for (c, x) in x.iter().enumerate() {
                     let to = x + sum(&by.warp, c);
@@ -269,10 +269,10 @@ fn states_of_sc_gs_follow_the_formulas() {
 }
 
 #[test]
-fn the_network_may_move_gaussians_of_sc_gs_without_nodes() {
-    let made = Made {
+fn sc_gs_without_nodes_uses_the_network_directly() {
+    let made = TestModel {
         cfg_args: "Namespace(deform_type='mlp', sh_degree=1)".into(),
-        ..Made::plain(DeepVariant { screws: false, ..KINDS[0] })
+        ..TestModel::deformable(DeepVariant { screws: false, ..KINDS[0] })
     };
     let model = made.open();
     assert_eq!(model.kind(), "SC-GS model");
@@ -287,12 +287,17 @@ fn the_network_may_move_gaussians_of_sc_gs_without_nodes() {
 }
 
 #[test]
-fn derivatives_are_those_of_finite_differences() {
-    let models =
-        [Made::plain(KINDS[0]), Made::plain(KINDS[1]), Made::sparse(KINDS[0]), Made::sparse(KINDS[2])].map(|made| {
-            let model = made.open();
-            (made, model)
-        });
+fn jacobian_agrees_with_finite_differences() {
+    let models = [
+        TestModel::deformable(KINDS[0]),
+        TestModel::deformable(KINDS[1]),
+        TestModel::sc_gs(KINDS[0]),
+        TestModel::sc_gs(KINDS[2]),
+    ]
+    .map(|made| {
+        let model = made.open();
+        (made, model)
+    });
     for (_, model) in &models {
         let deformation = model.source().deformation().unwrap();
         let (stored, want) = (deformation.stored(), deformation.movable());
@@ -302,7 +307,7 @@ fn derivatives_are_those_of_finite_differences() {
             deformation.state(3, raw, want, &mut out).unwrap();
             out
         };
-        // Small beside 1/512, large beside what f32 leaves of a difference.
+        // Small compared to 1/512, large compared to the f32 error of a difference.
         let step = 3e-5f32;
         let (mut wrong, mut all) = (0, 0);
         for column in want.difference(Columns::SH).iter() {
@@ -328,13 +333,14 @@ fn derivatives_are_those_of_finite_differences() {
                 }
             }
         }
-        // In the step a ReLU may switch, or another node come near: of noise, that some sines repeat 512 times, many do.
-        // A wrong formula is wrong nearly everywhere; the network's own test is exact.
+        // Within a step a ReLU may switch or another node may become nearest. This happens often, since the network is
+        // random and some of its sines repeat 512 times. A wrong formula would be wrong nearly everywhere; the
+        // network's own test is exact.
         assert!(6 * wrong < all, "{}: {wrong} of {all} derivatives are wrong", model.kind());
     }
 }
 
-/// A reduction with two proxies and changes.
+/// Returns a compressed model with two proxies and parameter deltas.
 fn reduction(model: &dyn InputModel) -> CompressedModel {
     let rule = Recipe::preset("default").unwrap().merge;
     let mut reduction = CompressedModel::pruned(vec![1, 4, 9, 12, 30], &rule);
@@ -342,7 +348,7 @@ fn reduction(model: &dyn InputModel) -> CompressedModel {
         Cluster { output: 1, leader: 4, members: vec![(3, 0.6), (4, 0.4)] },
         Cluster { output: 3, leader: 12, members: vec![(12, 0.5), (17, 0.25), (39, 0.25)] },
     ];
-    // Noise strays from everything: what is proposed is what is written here.
+    // Random motion exceeds any drift limit, so the limit is lifted to test the writing of proposed proxies.
     let rule = crate::recipe::MergeParams { max_drift: f64::INFINITY, ..rule };
     let reference = Reference { frame: 0, extent: 1.0 };
     reduction.proxies = model.solve(&reduction.clusters, reference, &rule).unwrap();
@@ -355,8 +361,8 @@ fn reduction(model: &dyn InputModel) -> CompressedModel {
 }
 
 #[test]
-fn what_stays_keeps_its_bytes_and_the_network_all_of_them() {
-    for made in [Made::plain(KINDS[1]), Made::sparse(KINDS[0])] {
+fn kept_rows_and_network_keep_their_bytes() {
+    for made in [TestModel::deformable(KINDS[1]), TestModel::sc_gs(KINDS[0])] {
         let model = made.open();
         let rule = Recipe::preset("default").unwrap().merge;
         let path = made.folder.path().join("result");
@@ -391,8 +397,8 @@ fn what_stays_keeps_its_bytes_and_the_network_all_of_them() {
 }
 
 #[test]
-fn merged_and_changed_ones_read_back_as_they_were_shown() {
-    for made in [Made::plain(KINDS[0]), Made::plain(KINDS[1]), Made::sparse(KINDS[2])] {
+fn written_proxies_and_deltas_read_back() {
+    for made in [TestModel::deformable(KINDS[0]), TestModel::deformable(KINDS[1]), TestModel::sc_gs(KINDS[2])] {
         let model = made.open();
         let mut reduction = reduction(&*model);
         for sh_degree in [1, 0] {
@@ -409,9 +415,9 @@ fn merged_and_changed_ones_read_back_as_they_were_shown() {
 }
 
 #[test]
-fn a_proxy_of_twins_is_one_of_them() {
-    for mut made in [Made::plain(KINDS[0]), Made::plain(KINDS[1]), Made::sparse(KINDS[2])] {
-        // The second is the first, but for its normals.
+fn proxy_of_equal_members_equals_them() {
+    for mut made in [TestModel::deformable(KINDS[0]), TestModel::deformable(KINDS[1]), TestModel::sc_gs(KINDS[2])] {
+        // Gaussian 1 equals Gaussian 0 except for its normals.
         made.cloud.iter_mut().filter(|(name, _)| !name.starts_with('n')).for_each(|(_, of)| of[1] = of[0]);
         let model = made.open();
         let rule = Recipe::preset("default").unwrap().merge;
@@ -423,16 +429,16 @@ fn a_proxy_of_twins_is_one_of_them() {
         let (shown, all) = (model.reduced(&reduction).unwrap(), states(model.source()));
         for (frame, state) in states(&*shown).iter().enumerate() {
             assert!((0..3).all(|c| (state.position.plane(c)[0] - all[frame].position.plane(c)[0]).abs() < 1e-6));
-            // Sizes and rotations are right on average; noise makes quaternions of any length.
-            let found = off(of_state(state, 0), of_state(&all[frame], 0));
+            // Scales and rotations are right on average only; random quaternions have any length.
+            let found = relative_difference(state_covariance(state, 0), state_covariance(&all[frame], 0));
             assert!(found < 0.5, "{} at {frame}: covariance off by {found}", model.kind());
         }
     }
 }
 
 #[test]
-fn iterations_are_those_that_both_folders_have() {
-    let made = Made::plain(KINDS[0]);
+fn iterations_need_both_folders() {
+    let made = TestModel::deformable(KINDS[0]);
     made.write(7);
     made.write(100);
     fs::remove_file(made.file("deform", 100)).unwrap();
@@ -441,15 +447,18 @@ fn iterations_are_those_that_both_folders_have() {
     assert_eq!(opened(None).unwrap().digest().unwrap(), opened(Some(30)).unwrap().digest().unwrap());
     assert!(opened(Some(7)).is_ok());
     let message = opened(Some(100)).err().unwrap().to_string();
-    assert!(message.contains("clouds of 7, 30, 100, networks of 7, 30"), "{message}");
+    assert!(message.contains("point clouds of iterations 7, 30, 100, networks of iterations 7, 30"), "{message}");
 }
 
 #[test]
-fn what_training_was_told_is_believed_less_than_the_weights() {
-    let mut made = Made::plain(KINDS[1]);
+fn weights_take_precedence_over_cfg_args() {
+    let mut made = TestModel::deformable(KINDS[1]);
     made.cfg_args = "Namespace(is_6dof=False, is_blender=False)".into();
     let notes = made.open().notes();
-    assert!(notes.len() == 1 && notes[0].contains("is_6dof = False") && notes[0].contains("believed"), "{notes:?}");
+    assert!(
+        notes.len() == 1 && notes[0].contains("is_6dof = False") && notes[0].contains("the weights are used"),
+        "{notes:?}"
+    );
 }
 
 #[test]
@@ -457,16 +466,16 @@ fn models_that_are_not_read_are_refused_by_name() {
     for key in
         ["skinning=True", "use_hash=True", "local_frame=True", "progressive_brand_time=True", "d_rot_as_res=False"]
     {
-        let mut made = Made::sparse(KINDS[0]);
+        let mut made = TestModel::sc_gs(KINDS[0]);
         made.cfg_args = made.cfg_args.replace("K=3", &format!("K=3, {key}"));
         let message = made.message();
         assert!(message.contains(key.split('=').next().unwrap()) && message.contains("cfg_args"), "{message}");
     }
-    let mut made = Made::sparse(KINDS[0]);
+    let mut made = TestModel::sc_gs(KINDS[0]);
     made.cfg_args = made.cfg_args.replace("K=3", "max_d_scale=1.5");
     assert!(made.message().contains("max_d_scale"));
-    // Two state dicts.
-    let made = Made::plain(KINDS[0]);
+    // A file with two state dicts.
+    let made = TestModel::deformable(KINDS[0]);
     made.write(7);
     let mut archive = zip::ZipWriter::new(fs::File::create(made.file("deform", 7)).unwrap());
     let stored = zip::write::FileOptions::default().compression_method(zip::CompressionMethod::Stored);
@@ -478,34 +487,38 @@ fn models_that_are_not_read_are_refused_by_name() {
 }
 
 #[test]
-fn damaged_models_say_what_is_wrong_with_which_file() {
-    type Damage = fn(&mut Made);
-    let cases: [(Made, Damage, &[&str]); 9] = [
+fn errors_name_the_damaged_file_and_the_problem() {
+    type Damage = fn(&mut TestModel);
+    let cases: [(TestModel, Damage, &[&str]); 9] = [
         (
-            Made::plain(KINDS[0]),
+            TestModel::deformable(KINDS[0]),
             |made| drop(made.tensors.remove("linear.0.weight")),
             &["deform.pth", "linear.0.weight"],
         ),
-        (Made::plain(KINDS[0]), |made| made.cloud[0].1[5] = f32::NAN, &["point_cloud.ply", "Gaussian 5, x y z", "NaN"]),
-        (Made::plain(KINDS[0]), |made| drop(made.cloud.remove(0)), &["point_cloud.ply", "property x"]),
-        (Made::plain(KINDS[0]), |made| made.cfg_args.truncate(30), &["cfg_args"]),
-        (Made::sparse(KINDS[0]), |made| drop(made.tensors.remove("_node_radius")), &["deform.pth", "_node_radius"]),
         (
-            Made::sparse(KINDS[0]),
+            TestModel::deformable(KINDS[0]),
+            |made| made.cloud[0].1[5] = f32::NAN,
+            &["point_cloud.ply", "Gaussian 5, x y z", "NaN"],
+        ),
+        (TestModel::deformable(KINDS[0]), |made| drop(made.cloud.remove(0)), &["point_cloud.ply", "property x"]),
+        (TestModel::deformable(KINDS[0]), |made| made.cfg_args.truncate(30), &["cfg_args"]),
+        (TestModel::sc_gs(KINDS[0]), |made| drop(made.tensors.remove("_node_radius")), &["deform.pth", "_node_radius"]),
+        (
+            TestModel::sc_gs(KINDS[0]),
             |made| made.tensors.get_mut("_node_weight").unwrap().shape = vec![6, 2],
             &["_node_weight", "12 nodes", "[6, 2]"],
         ),
         (
-            Made::sparse(KINDS[0]),
+            TestModel::sc_gs(KINDS[0]),
             |made| made.tensors.get_mut("nodes").unwrap().data[7] = f32::INFINITY,
             &["nodes", "finite", "element 7"],
         ),
         (
-            Made::sparse(KINDS[0]),
+            TestModel::sc_gs(KINDS[0]),
             |made| made.cloud.retain(|(name, _)| !name.starts_with("fea_1") && !name.starts_with("fea_2")),
             &["point_cloud.ply", "2 properties fea_*", "1"],
         ),
-        (Made::sparse(KINDS[0]), |made| drop(made.tensors.remove("nodes")), &["deform.pth", "nodes", "'node'"]),
+        (TestModel::sc_gs(KINDS[0]), |made| drop(made.tensors.remove("nodes")), &["deform.pth", "nodes", "'node'"]),
     ];
     for (mut made, damage, parts) in cases {
         damage(&mut made);
@@ -517,8 +530,8 @@ fn damaged_models_say_what_is_wrong_with_which_file() {
 }
 
 #[test]
-fn a_network_cut_anywhere_is_refused() {
-    let made = Made::plain(KINDS[0]);
+fn truncated_network_is_refused() {
+    let made = TestModel::deformable(KINDS[0]);
     made.write(7);
     let path = made.file("deform", 7);
     let whole = fs::read(&path).unwrap();

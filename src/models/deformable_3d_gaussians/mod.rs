@@ -1,64 +1,66 @@
-//! Deformable-3D-Gaussians as a family: a canonical cloud, moved by a network of position and time.
+//! Deformable-3D-Gaussians as a model format: canonical Gaussians that a network of position and time deforms.
 //!
-//! State at t, with what the network says of the canonical position: x = xyz + warp, or where a screw takes it;
-//! scale = exp(scale) + d_scaling, of which only the square counts; rotation = rot/|rot| + d_rotation, which nothing makes unit again: for
-//! a quaternion of length n the rasteriser's formula gives R(q) = (1 − n²)·I + n²·R(q/n), no rotation. Here the covariance
-//! R(q)·S²·R(q)ᵀ is decomposed. Opacity and harmonics never change. Source: Yang et al., "Deformable 3D Gaussians for
-//! High-Fidelity Monocular Dynamic Scene Reconstruction", 2024, and its public code.
+//! State at time t, from the network's output at the canonical position: x = xyz + warp, or the screw motion of xyz;
+//! scale = exp(scale) + d_scaling, of which only the square matters; rotation = rot/|rot| + d_rotation, not normalized
+//! again. For a quaternion of length n the rasterizer's formula gives R(q) = (1 − n²)·I + n²·R(q/n), which is not a
+//! rotation, so the covariance R(q)·S²·R(q)ᵀ is decomposed here. Opacity and SH coefficients are constant. Source: Yang
+//! et al., "Deformable 3D Gaussians for High-Fidelity Monocular Dynamic Scene Reconstruction", 2024, and its public
+//! code.
 
 mod screw;
 
 use glam::{DMat3, DVec3};
 
-use super::deform_folder::{Deforming, Folder, Parts, has_network};
+use super::deform_folder::{DeformFolder, ModelParts, NetworkMotionModel, has_network};
 use crate::deform::{Encoded, Network, PredictedMotion};
 use crate::error::{Error, Result};
 use crate::model::{Column, Columns, Gaussians, Jacobian, Raw, scale_rotation};
 use crate::models::input_model::ModelFormat;
 use crate::models::motion_model::{MotionModel, copy_stored};
 
-/// A model folder.
+/// Deformable-3D-Gaussians model folder.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
     recognizes: |found| found.is_folder && has_network(found.path),
-    open: |path, options| Folder::open(path, options, DeformationKind::new),
+    open: |path, options| DeformFolder::open(path, options, DeformableMotion::new),
 };
 
 /// Columns that follow from the covariance.
 const SHAPE: Columns = Columns::ROTATION.union(Columns::LOG_SCALE);
 
-/// How the network deforms.
+/// Motion model of Deformable-3D-Gaussians.
 #[derive(Debug)]
-struct DeformationKind {
+struct DeformableMotion {
     network: Network,
 }
 
-impl DeformationKind {
-    fn new(parts: &Parts<'_>) -> Result<(DeformationKind, Vec<String>)> {
+impl DeformableMotion {
+    /// Reads the network, and adds a note where `cfg_args` contradicts its weights.
+    fn new(parts: &ModelParts<'_>) -> Result<(DeformableMotion, Vec<String>)> {
         if !parts.tensors.contains_key("linear.0.weight") {
             let names: Vec<&str> = parts.tensors.keys().map(String::as_str).take(6).collect();
             let found = if names.is_empty() { "none".to_owned() } else { format!("{}, …", names.join(", ")) };
             return Err(Error::input(parts.file, "", "tensors linear.0.weight and so on", found)
-                .hint("networks of Deformable-3D-Gaussians and of SC-GS are read"));
+                .hint("only networks of Deformable-3D-Gaussians and SC-GS are supported"));
         }
         let network = Network::new(parts.tensors, "", parts.file)?;
         let mut notes = Vec::new();
         let time = parts.tensors.contains_key("timenet.0.weight");
-        for (key, there) in [("is_blender", time), ("is_6dof", network.has_screws())] {
-            let said = parts.arguments.get(key).bool(there)?;
-            if said != there {
-                let [said, there] = [said, there].map(|yes| if yes { "True" } else { "False" });
+        for (key, actual) in [("is_blender", time), ("is_6dof", network.has_screws())] {
+            let configured = parts.arguments.get(key).bool(actual)?;
+            if configured != actual {
+                let [configured, actual] = [configured, actual].map(|yes| if yes { "True" } else { "False" });
                 notes.push(format!(
-                    "cfg_args says {key} = {said}, the weights in deform.pth are those of {key} = {there}: the weights are \
-                     believed"
+                    "cfg_args says {key} = {configured}, but the weights in deform.pth belong to {key} = {actual}: \
+                     the weights are used"
                 ));
             }
         }
-        Ok((DeformationKind { network }, notes))
+        Ok((DeformableMotion { network }, notes))
     }
 }
 
-impl DeformationKind {
-    /// What the network says of the columns `want` of a block.
+impl DeformableMotion {
+    /// Returns the network's output for the columns `want` of a block.
     fn motion(&self, time: f64, encoded: &Encoded, want: Columns) -> Result<PredictedMotion> {
         let mut motion = PredictedMotion::default();
         let shape = if (want & SHAPE).is_empty() { Columns::empty() } else { SHAPE };
@@ -70,7 +72,7 @@ impl DeformationKind {
     }
 }
 
-impl MotionModel for DeformationKind {
+impl MotionModel for DeformableMotion {
     type Prepared = Encoded;
 
     fn prepare(&self, raw: &Raw) -> Encoded {
@@ -95,7 +97,7 @@ impl MotionModel for DeformationKind {
                 let to = match self.network.has_screws() {
                     true => {
                         let [x, w, v] = screw(at, motion.warp.row::<6>(row));
-                        screw::moved(x, w, v).as_vec3().to_array()
+                        screw::apply_screw(x, w, v).as_vec3().to_array()
                     }
                     false => {
                         let by = motion.warp.row::<3>(row);
@@ -122,7 +124,8 @@ impl MotionModel for DeformationKind {
         Ok(())
     }
 
-    /// Of positions. A covariance changes with scales and rotations too, but its factors here are named anew at every frame.
+    /// Returns the derivative of positions only. The covariance depends on scales and rotations too, but its
+    /// decomposition is not continuous from frame to frame.
     fn jacobian(&self, time: f64, raw: &Raw, encoded: &Encoded, want: Columns) -> Result<Jacobian> {
         let mut found = Jacobian::default();
         if want.contains(Columns::POSITION) {
@@ -145,7 +148,7 @@ impl MotionModel for DeformationKind {
                         }
                         false => unit + along(0),
                     };
-                    // Where the network has no derivative, a position's state changes as it does.
+                    // If the network has no derivative, use the identity.
                     let change = if change.is_finite() { change } else { unit };
                     (0..3).for_each(|i| out.plane_mut(3 * i + axis)[row] = change[i] as f32);
                 }
@@ -156,31 +159,31 @@ impl MotionModel for DeformationKind {
     }
 }
 
-impl Deforming for DeformationKind {
+impl NetworkMotionModel for DeformableMotion {
     const KIND: &'static str = "Deformable-3D-Gaussians model";
-    const NORMALISES: bool = true;
+    const NORMALIZES_ROTATION: bool = true;
 
     fn bytes_per_gaussian(&self) -> usize {
         Network::BYTES_PER_GAUSSIAN
     }
 
-    /// `benches/families.rs`, by the size of the network.
+    /// Returns the seconds measured by `benches/families.rs`, as a function of the size of the network.
     fn seconds_per_state(&self) -> f64 {
         1e-6 + 2e-11 * self.network.multiplications() as f64
     }
 }
 
-/// Position, axis and way.
+/// Returns position, axis w and translation v of a screw motion as vectors.
 fn screw(x: [f32; 3], [a, b, c, d, e, f]: [f32; 6]) -> [DVec3; 3] {
     [x, [a, b, c], [d, e, f]].map(|row| DVec3::from(row.map(f64::from)))
 }
 
-/// R(q)·S²·R(q)ᵀ of what a renderer hands to the rasteriser: xx xy xz yy yz zz.
+/// Returns R(q)·S²·R(q)ᵀ of the values that a renderer passes to the rasterizer: xx xy xz yy yz zz.
 fn covariance(scales: [f64; 3], rotation: [f64; 4], by: ([f32; 3], [f32; 4])) -> [f64; 6] {
     let length = rotation.iter().map(|x| x * x).sum::<f64>().sqrt().max(1e-12);
     let [w, x, y, z] = [0, 1, 2, 3].map(|c| rotation[c] / length + f64::from(by.1[c]));
     let scales = DVec3::from([0, 1, 2].map(|c| scales[c] + f64::from(by.0[c])));
-    // The formula of unit quaternions, which this one need not be.
+    // The formula for unit quaternions, applied to a quaternion of any length as the rasterizer does.
     let turn = DMat3::from_cols(
         DVec3::new(1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)),
         DVec3::new(2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x)),

@@ -1,22 +1,22 @@
-//! Motion by screws, of the variant with six degrees of freedom.
+//! Screw motions, used by the variant with six degrees of freedom.
 //!
-//! A network says w and v. θ = |w|; w ← w/θ + 1e-5 and v ← v/θ + 1e-5 in every component, so that w is not quite unit; with W
-//! the matrix of w×: x′ = (I + sin θ·W + (1 − cos θ)·W²)·x + (θ·I + (1 − cos θ)·W + (θ − sin θ)·W²)·v. Source: `exp_se3` of the
-//! family's code.
+//! The network outputs w and v. θ = |w|; w ← w/θ + 1e-5 and v ← v/θ + 1e-5 in every component, so that w is not exactly
+//! unit. With W the matrix of w×: x′ = (I + sin θ·W + (1 − cos θ)·W²)·x + (θ·I + (1 − cos θ)·W + (θ − sin θ)·W²)·v.
+//! Source: `exp_se3` of the authors' code.
 
 use glam::DVec3;
 
-/// Added to axes.
+/// Value added to every component of the normalized vectors.
 const EPSILON: f64 = 1e-5;
-/// Angles below it are none: the limit is x + v, where the original divides by zero.
-const LEAST_ANGLE: f64 = 1e-30;
-/// Half the way over which a derivative is taken, of numbers of size 1: the cube root of an f64's precision.
-const SMALL: f64 = 6e-6;
+/// Minimum angle; below it the limit x + v is used, where the original divides by zero.
+const MIN_ANGLE: f64 = 1e-30;
+/// Half step of numerical derivatives for values of size 1: the cube root of the f64 precision.
+const HALF_STEP: f64 = 6e-6;
 
-/// Where a screw takes `x`.
-pub(super) fn moved(x: DVec3, w: DVec3, v: DVec3) -> DVec3 {
+/// Returns the position of `x` after the screw motion.
+pub(super) fn apply_screw(x: DVec3, w: DVec3, v: DVec3) -> DVec3 {
     let angle = w.length();
-    if angle < LEAST_ANGLE {
+    if angle < MIN_ANGLE {
         return x + v;
     }
     let (w, v) = (w / angle + EPSILON, v / angle + EPSILON);
@@ -25,12 +25,12 @@ pub(super) fn moved(x: DVec3, w: DVec3, v: DVec3) -> DVec3 {
     turned + angle * v + rest * w.cross(v) + (angle - sine) * w.cross(w.cross(v))
 }
 
-/// How the place changes along an axis of x, where w and v change with it by `slopes`: central differences along all of
-/// them together.
+/// Returns the derivative of the moved position along an axis of x, where w and v change with derivatives `of_w` and
+/// `of_v`. Uses central differences of all three together.
 pub(super) fn slope(x: DVec3, w: DVec3, v: DVec3, axis: DVec3, [of_w, of_v]: [DVec3; 2]) -> DVec3 {
-    // Screws change fast along with x: the way is short for them too.
-    let step = SMALL / (1.0 + of_w.abs().max_element() + of_v.abs().max_element());
-    let at = |by: f64| moved(x + by * axis, w + by * of_w, v + by * of_v);
+    // Screws may change fast with x, so the step is shortened accordingly.
+    let step = HALF_STEP / (1.0 + of_w.abs().max_element() + of_v.abs().max_element());
+    let at = |by: f64| apply_screw(x + by * axis, w + by * of_w, v + by * of_v);
     (at(step) - at(-step)) / (2.0 * step)
 }
 
@@ -40,7 +40,7 @@ mod tests {
 
     use super::*;
 
-    /// The formula with matrices.
+    /// Computes the motion by the matrix formula.
     fn by_matrices(x: DVec3, w: DVec3, v: DVec3) -> DVec3 {
         let angle = w.length();
         let (w, v) = (w / angle + DVec3::splat(1e-5), v / angle + DVec3::splat(1e-5));
@@ -51,25 +51,25 @@ mod tests {
     }
 
     #[test]
-    fn screws_are_those_of_the_matrices_and_none_at_no_angle() {
+    fn screw_agrees_with_the_matrix_formula() {
         let [x, w, v] = [DVec3::new(0.3, -1.2, 2.0), DVec3::new(0.02, -0.5, 0.1), DVec3::new(-0.4, 0.1, 0.7)];
         for size in [1e-9, 1e-3, 1.0, 20.0] {
-            let off = (moved(x, size * w, v) - by_matrices(x, size * w, v)).length();
+            let off = (apply_screw(x, size * w, v) - by_matrices(x, size * w, v)).length();
             assert!(off < 1e-13, "size {size}: off by {off:e}");
         }
-        assert_eq!(moved(x, DVec3::ZERO, v), x + v);
-        assert!((moved(x, 1e-20 * w, v) - x - v).length() < 1e-15);
+        assert_eq!(apply_screw(x, DVec3::ZERO, v), x + v);
+        assert!((apply_screw(x, 1e-20 * w, v) - x - v).length() < 1e-15);
     }
 
     #[test]
-    fn slopes_follow_x_and_what_the_network_changes_with_it() {
+    fn slope_follows_position_and_network() {
         let [x, w, v] = [DVec3::new(0.3, -1.2, 2.0), DVec3::new(0.02, -0.5, 0.1), DVec3::new(-0.4, 0.1, 0.7)];
-        let of = [DVec3::new(3.0, 1.0, -2.0), DVec3::new(0.5, -4.0, 1.0)];
-        let wide = |by: f64| moved(x + by * DVec3::Y, w + by * of[0], v + by * of[1]);
-        // Richardson's extrapolation of wider differences.
+        let slopes = [DVec3::new(3.0, 1.0, -2.0), DVec3::new(0.5, -4.0, 1.0)];
+        let wide = |by: f64| apply_screw(x + by * DVec3::Y, w + by * slopes[0], v + by * slopes[1]);
+        // Reference value: Richardson extrapolation of wider differences.
         let [one, two] = [1e-3, 2e-3].map(|by| (wide(by) - wide(-by)) / (2.0 * by));
         let expected = (4.0 * one - two) / 3.0;
-        let found = slope(x, w, v, DVec3::Y, of);
+        let found = slope(x, w, v, DVec3::Y, slopes);
         assert!((found - expected).length() < 1e-8, "{found} {expected}");
     }
 }

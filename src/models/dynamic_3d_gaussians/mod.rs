@@ -1,7 +1,7 @@
-//! Dynamic3DGaussians as a family: explicit trajectories in a `params.npz`.
+//! Dynamic3DGaussians as a model format: explicit trajectories in a `params.npz`.
 //!
-//! The result is a folder with a `params.npz` of the same arrays in the same order and types; what stays of them keeps its
-//! bytes.
+//! The output is a folder with a `params.npz` of the same arrays in the same order and types. Unchanged values keep
+//! their bytes.
 
 mod params;
 mod proxies;
@@ -24,13 +24,13 @@ use crate::outputs::kind::OutputKind;
 use crate::progress::Events;
 use crate::recipe::MergeParams;
 use crate::source::{FrameSource, Ids};
-use params::{COLOURS, LOG_SCALES, MEANS, OPACITIES, Params, ROTATIONS};
-use proxies::Settled;
+use params::{COLORS, LOG_SCALES, MEANS, OPACITIES, Params, ROTATIONS};
+use proxies::MergedSource;
 
-/// What a model's file is called.
+/// Name of the file in a model folder.
 const FILE: &str = "params.npz";
 
-/// A model's file, or its folder.
+/// `params.npz`, or the folder that holds it.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
     recognizes: |found| {
         let named = |path: &Path| path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("npz"));
@@ -71,7 +71,7 @@ impl InputModel for Params {
             per_gaussian: 0,
             opening: 0,
             reader: 8,
-            // Sizes and opacities of proxies, and which they are.
+            // Scales and opacities of proxies, and their indices.
             reduced: state_bytes(0, Columns::all()) + 16,
             jacobian: 0,
             file: 0,
@@ -92,7 +92,7 @@ impl InputModel for Params {
         Ok(Box::new(Params::with_times(*self, times)?))
     }
 
-    /// Pictures were taken before black.
+    /// Returns black, which the authors' training uses.
     fn background(&self) -> Option<[f32; 3]> {
         Some([0.0; 3])
     }
@@ -136,11 +136,11 @@ impl InputModel for Params {
 }
 
 impl Params {
-    /// Writes what is left as the file `path`.
+    /// Writes the compressed model as the file `path`.
     fn write_params(&self, reduction: &CompressedModel, path: PathBuf) -> Result<()> {
-        let settled = Settled::new(self, reduction);
+        let merged = MergedSource::new(self, reduction);
         let places: Vec<u32> = reduction.clusters.iter().map(|cluster| cluster.output).collect();
-        let (mut proxies, mut state) = (settled.open(Ids::List(&places))?, Gaussians::zeros(0, 0));
+        let (mut proxies, mut state) = (merged.open(Ids::List(&places))?, Gaussians::zeros(0, 0));
         let by = &reduction.change.0;
         write_like(
             self.npz(),
@@ -150,10 +150,10 @@ impl Params {
                 let column = match name {
                     MEANS => Columns::POSITION,
                     ROTATIONS => Columns::ROTATION,
-                    COLOURS => Columns::SH,
+                    COLORS => Columns::SH,
                     LOG_SCALES => Columns::LOG_SCALE,
                     OPACITIES => Columns::OPACITY,
-                    // Segments are the leader's.
+                    // Proxies keep the segment of their leader.
                     _ => return Ok(Vec::new()),
                 };
                 let (width, is_color) = (column.width(0), column == Columns::SH);

@@ -1,9 +1,10 @@
-//! `params.npz` of Dynamic3DGaussians: where every Gaussian is at every frame, how it is turned and colored; its size and
-//! opacity once for all.
+//! `params.npz` of Dynamic3DGaussians: position, rotation and color of every Gaussian at every frame; scale and opacity
+//! constant in time.
 //!
-//! Arrays, of T frames and N Gaussians: `means3D` [T, N, 3], scene units; `unnorm_rotations` [T, N, 4], wxyz of any length;
-//! `rgb_colors` [T, N, 3], a color from all sides; `log_scales` [N, 3]; `logit_opacities` [N, 1]; `seg_colors` [N, 3], red
-//! above ½ in the foreground. Further ones are no matter of a picture. Source: `load_scene_data` of the authors' visualiser.
+//! Arrays, with T frames and N Gaussians: `means3D` [T, N, 3], scene units; `unnorm_rotations` [T, N, 4], wxyz of any
+//! length; `rgb_colors` [T, N, 3], a color independent of direction; `log_scales` [N, 3]; `logit_opacities` [N, 1];
+//! `seg_colors` [N, 3], red above ½ in the foreground. Other arrays do not affect renders. Source: `load_scene_data` of
+//! the authors' visualizer.
 
 use std::path::{Path, PathBuf};
 
@@ -13,17 +14,23 @@ use crate::files::npz::{Floats, Npz, NpzArray};
 use crate::model::{Columns, Gaussians, SequenceInfo, harmonic};
 use crate::source::{BlockReader, Count, FrameSource, Ids, Reads};
 
+/// Array of positions.
 pub(super) const MEANS: &str = "means3D";
+/// Array of quaternions.
 pub(super) const ROTATIONS: &str = "unnorm_rotations";
-pub(super) const COLOURS: &str = "rgb_colors";
+/// Array of colors.
+pub(super) const COLORS: &str = "rgb_colors";
+/// Array of log scales.
 pub(super) const LOG_SCALES: &str = "log_scales";
+/// Array of opacity logits.
 pub(super) const OPACITIES: &str = "logit_opacities";
+/// Array of segment colors.
 const SEGMENTS: &str = "seg_colors";
 
-/// Above it a segment's red is foreground.
+/// Red value of a segment color above which a Gaussian is foreground.
 const FOREGROUND: f32 = 0.5;
 
-/// An open model.
+/// Open `params.npz`.
 #[derive(Debug)]
 pub(super) struct Params {
     npz: Npz,
@@ -38,10 +45,11 @@ pub(super) struct Params {
 }
 
 impl Params {
-    /// Opens `path`. Frame i of T has time i / (T − 1). What is compressed or no f32 is decoded into `scratch`.
+    /// Opens `path`. Frame i of T has time i / (T − 1). Arrays that are compressed or not f32 are decoded into
+    /// `scratch`.
     ///
     /// # Errors
-    /// No archive; arrays that are missing or of another shape; a static model.
+    /// Fails if the file is not an archive, if arrays are missing or have other shapes, or if the model is static.
     pub(super) fn open(path: &Path, scratch: &Path) -> Result<Params> {
         let npz = Npz::open(path)?;
         let [frames, count] = match npz.entry(MEANS).map(|entry| &entry.shape[..]) {
@@ -55,21 +63,21 @@ impl Params {
                 return Err(Error::input(path, MEANS, "shape [T, N, 3], T at least 1", found));
             }
         };
-        let said = |shape: &[usize]| format!("shape {shape:?}");
+        let shape_text = |shape: &[usize]| format!("shape {shape:?}");
         let has_segments = npz.entry(SEGMENTS).is_some();
         let expected: [(&str, &[usize]); 6] = [
             (MEANS, &[frames, count, 3]),
             (ROTATIONS, &[frames, count, 4]),
-            (COLOURS, &[frames, count, 3]),
+            (COLORS, &[frames, count, 3]),
             (LOG_SCALES, &[count, 3]),
             (OPACITIES, &[count, 1]),
             (SEGMENTS, &[count, 3]),
         ];
         let expected = &expected[..if has_segments { 6 } else { 5 }];
-        // All shapes and types, before any array is decoded.
+        // Check all shapes and types before decoding any array.
         for &(name, shape) in expected {
             if let Some(entry) = npz.entry(name).filter(|entry| entry.shape != shape) {
-                return Err(Error::input(path, name, said(shape), said(&entry.shape))
+                return Err(Error::input(path, name, shape_text(shape), shape_text(&entry.shape))
                     .hint(format!("{MEANS} has {frames} frames of {count} Gaussians: all arrays must")));
             }
         }
@@ -87,7 +95,7 @@ impl Params {
         Ok(Params {
             means: floats(MEANS)?,
             rotations: floats(ROTATIONS)?,
-            colors: floats(COLOURS)?,
+            colors: floats(COLORS)?,
             log_scales: floats(LOG_SCALES)?,
             opacities: floats(OPACITIES)?,
             segments,
@@ -97,34 +105,34 @@ impl Params {
         })
     }
 
-    /// The same frames at other times.
+    /// Returns the same frames at other times.
     ///
     /// # Errors
-    /// A number of times other than T; times that are not finite or do not increase.
+    /// Fails if the number of times is not T, or if times are not finite or do not increase.
     pub(super) fn with_times(mut self, times: Vec<f64>) -> Result<Params> {
         self.info = self.info.with_times(times)?;
         Ok(self)
     }
 
-    /// The file.
+    /// Returns the open file.
     pub(super) fn npz(&self) -> &Npz {
         &self.npz
     }
 
-    /// The file's path.
+    /// Returns the path of the file.
     pub(super) fn path(&self) -> PathBuf {
         self.npz.path().to_owned()
     }
 
-    /// Whether a Gaussian is part of the foreground; none where the model does not say.
+    /// Returns whether a Gaussian belongs to the foreground; `None` if the model has no segments.
     pub(super) fn is_foreground(&self, id: usize) -> Option<bool> {
         self.segments.as_ref().map(|segments| segments.row::<1>(3 * id)[0] > FOREGROUND)
     }
 
-    /// Along which axis Gaussians are counted in an array.
+    /// Returns the axis of an array that counts Gaussians.
     pub(super) fn axis(entry: &NpzArray) -> ArrayRows {
         match entry.name.as_str() {
-            MEANS | ROTATIONS | COLOURS => ArrayRows::Second,
+            MEANS | ROTATIONS | COLORS => ArrayRows::Second,
             LOG_SCALES | OPACITIES | SEGMENTS => ArrayRows::First,
             _ => ArrayRows::None,
         }
@@ -149,7 +157,7 @@ impl FrameSource for Params {
     }
 }
 
-/// Some Gaussians of a model.
+/// Reader of some Gaussians.
 struct TrajectoryBlock<'a> {
     params: &'a Params,
     ids: Vec<usize>,

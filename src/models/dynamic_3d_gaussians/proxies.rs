@@ -1,7 +1,7 @@
-//! Proxies of a model whose Gaussians move, turn and change their color freely, but keep their size and opacity.
+//! Proxies of a model whose positions, rotations and colors vary freely, but whose scales and opacities are constant.
 //!
-//! A proxy's path, turn and color are the moment match of its members at every frame; its size and opacity are their
-//! means along time.
+//! Position, rotation and color of a proxy are the moment match of its members at every frame. Scale and opacity are
+//! the means of the moment matches over time.
 
 use super::params::Params;
 use crate::compressed_model::{Cluster, CompressedModel, Proxies};
@@ -13,16 +13,16 @@ use crate::passes::{Changed, gather_all};
 use crate::recipe::MergeParams;
 use crate::source::{BlockReader, FrameSource, Ids, ReadPlan, Reads};
 
-/// Frames over which sizes and opacities are averaged.
+/// Maximum number of frames over which scales and opacities are averaged.
 const SAMPLED_FRAMES: usize = 16;
-/// What does not change with time.
+/// Columns that are constant in time.
 const CONSTANT: Columns = Columns::LOG_SCALE.union(Columns::OPACITY);
 
-/// Sizes and opacities of the proxies of `clusters`, as rows of [`Proxies::raw`]: the geometric means of the sizes, the means
-/// of the opacities.
+/// Returns the scales and opacities of the proxies of `clusters` as rows of [`Proxies::raw`]: geometric means of
+/// scales, arithmetic means of opacities.
 ///
 /// # Errors
-/// Frames that cannot be read.
+/// Fails if frames cannot be read.
 pub(super) fn solve(params: &Params, clusters: &[Cluster], merge: &MergeParams) -> Result<Proxies> {
     let leaders: Vec<u32> = clusters.iter().map(|cluster| cluster.leader).collect();
     let members = clusters.iter().zip(0..).map(|(cluster, place)| (place, &cluster.members[..]));
@@ -47,30 +47,31 @@ pub(super) fn solve(params: &Params, clusters: &[Cluster], merge: &MergeParams) 
     Ok(Proxies { raw: Some(raw.into()), ..Proxies::default() })
 }
 
-/// The frames of what `reduction` leaves of `params`.
+/// Returns the frames of the compressed model `reduction`.
 pub(super) fn reduced<'a>(params: &'a Params, reduction: &'a CompressedModel) -> Box<dyn FrameSource + 'a> {
     Box::new(Changed::new(
-        Box::new(Settled::new(params, reduction)),
+        Box::new(MergedSource::new(params, reduction)),
         &reduction.change,
         &reduction.course,
         reduction.sh_degree,
     ))
 }
 
-/// A merged sequence whose proxies have the sizes and opacities that were solved for.
-pub(super) struct Settled<'a> {
+/// Merged sequence whose proxies have the scales and opacities computed by [`solve`].
+pub(super) struct MergedSource<'a> {
     merged: MergedSequence<'a>,
     reduction: &'a CompressedModel,
     info: SequenceInfo,
 }
 
-impl<'a> Settled<'a> {
-    pub(super) fn new(params: &'a Params, reduction: &'a CompressedModel) -> Settled<'a> {
+impl<'a> MergedSource<'a> {
+    /// Merges `params` as `reduction` says.
+    pub(super) fn new(params: &'a Params, reduction: &'a CompressedModel) -> MergedSource<'a> {
         let info = SequenceInfo { count: reduction.len(), ..params.info().clone() };
-        Settled { merged: merged(params, reduction), reduction, info }
+        MergedSource { merged: merged(params, reduction), reduction, info }
     }
 
-    /// Which of the Gaussians `places` are proxies: row, and number of the proxy.
+    /// Returns the proxies among the output indices `places`: position in `places` and number of the proxy.
     fn proxies(&self, places: impl Iterator<Item = usize>) -> Vec<(usize, usize)> {
         let clusters = &self.reduction.clusters;
         let mut by_output: Vec<(u32, usize)> =
@@ -80,13 +81,14 @@ impl<'a> Settled<'a> {
         places.enumerate().filter_map(|(row, place)| Some((row, by_output[found(place)?].1))).collect()
     }
 
+    /// Wraps a reader of the merged sequence so that proxies get their constant scales and opacities.
     fn reader<'b>(&'b self, reader: Box<dyn BlockReader + 'b>, ids: Ids<'_>) -> Box<dyn BlockReader + 'b> {
         let raw = self.reduction.proxies.raw.as_ref().map(|raw| &raw.gaussians);
-        Box::new(SettledReader { reader, proxies: self.proxies(ids.iter()), raw })
+        Box::new(MergedReader { reader, proxies: self.proxies(ids.iter()), raw })
     }
 }
 
-impl FrameSource for Settled<'_> {
+impl FrameSource for MergedSource<'_> {
     fn info(&self) -> &SequenceInfo {
         &self.info
     }
@@ -105,13 +107,15 @@ impl FrameSource for Settled<'_> {
     }
 }
 
-struct SettledReader<'a> {
+/// Reader that replaces the scales and opacities of proxies.
+struct MergedReader<'a> {
     reader: Box<dyn BlockReader + 'a>,
+    /// Row and number of each proxy that is read.
     proxies: Vec<(usize, usize)>,
     raw: Option<&'a Gaussians>,
 }
 
-impl BlockReader for SettledReader<'_> {
+impl BlockReader for MergedReader<'_> {
     fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
         self.reader.read(frame, want, out)?;
         let Some(raw) = self.raw else { return Ok(()) };

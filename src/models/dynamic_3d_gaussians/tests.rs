@@ -14,10 +14,10 @@ use crate::passes::gather_all;
 use crate::progress::Events;
 use crate::recipe::Recipe;
 
-/// Arrays of a model, by name: shape and values.
+/// Name, shape and values of each array of a model.
 type Arrays = Vec<(&'static str, Vec<u64>, Vec<f32>)>;
 
-/// Three frames of five Gaussians, the last two in the foreground.
+/// Returns three frames of five Gaussians; the last two are in the foreground.
 fn arrays() -> Arrays {
     let ramp = |n: usize, from: f32, by: f32| (0..n).map(|i| from + by * (i % 17) as f32).collect::<Vec<f32>>();
     vec![
@@ -50,13 +50,13 @@ fn message(path: &Path) -> String {
     open(path).err().expect("it must be refused").to_string()
 }
 
-fn states(family: &dyn InputModel) -> Vec<Gaussians> {
-    let source = family.source();
+fn states(model: &dyn InputModel) -> Vec<Gaussians> {
+    let source = model.source();
     (0..source.info().times.len()).map(|frame| gather_all(source, frame, Columns::all()).unwrap()).collect()
 }
 
 #[test]
-fn states_are_the_arrays_values_compressed_or_not() {
+fn states_are_the_array_values_compressed_or_not() {
     let folder = tempfile::tempdir().unwrap();
     let [stored, small] = ["params.npz", "small.npz"].map(|name| folder.path().join(name));
     write(&stored, &arrays(), CompressionMethod::Stored);
@@ -84,7 +84,7 @@ fn states_are_the_arrays_values_compressed_or_not() {
 }
 
 #[test]
-fn what_stays_keeps_its_bytes_and_everything_else_its_place() {
+fn kept_rows_keep_their_bytes() {
     for method in [CompressionMethod::Stored, CompressionMethod::Deflated] {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("params.npz");
@@ -99,14 +99,14 @@ fn what_stays_keeps_its_bytes_and_everything_else_its_place() {
             model.write(reduction, OutputKind::Model, &result, &limits, &Events::IGNORED).unwrap();
             fs::read(result.join(FILE)).unwrap()
         };
-        let of = |name: &str| {
+        let read_array = |name: &str| {
             let mut npz = npyz::npz::NpzArchive::open(result.join(FILE)).unwrap();
             let array = npz.by_name(name).unwrap().unwrap();
             (array.shape().to_vec(), array.into_vec::<f32>().unwrap())
         };
         written(&CompressedModel::pruned(vec![1, 4], &rule));
         for (name, shape, values) in arrays() {
-            let (found_shape, found) = of(name);
+            let (found_shape, found) = read_array(name);
             let (outer, width) =
                 (if shape.len() == 3 { shape[0] as usize } else { 1 }, *shape.last().unwrap() as usize);
             let expected: Vec<f32> = match name {
@@ -120,7 +120,7 @@ fn what_stays_keeps_its_bytes_and_everything_else_its_place() {
             let bits = |values: &[f32]| values.iter().map(|x| x.to_bits()).collect::<Vec<_>>();
             assert_eq!(bits(&found), bits(&expected), "{name}");
         }
-        // All of them: the bytes of every array, and the same file each time.
+        // Writing all Gaussians keeps the values of every array and gives the same file each time.
         let all = CompressedModel::pruned((0..5).collect(), &rule);
         assert_eq!(written(&all), written(&all));
         assert_eq!(states(&*open(&result).unwrap()), states(&*model));
@@ -128,7 +128,7 @@ fn what_stays_keeps_its_bytes_and_everything_else_its_place() {
 }
 
 #[test]
-fn merged_and_changed_ones_read_back_as_they_were_shown() {
+fn written_proxies_and_deltas_read_back() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("params.npz");
     write(&path, &arrays(), CompressionMethod::Stored);
@@ -152,7 +152,7 @@ fn merged_and_changed_ones_read_back_as_they_were_shown() {
             let pairs = state.column(column).planes().iter().zip(expected.column(column).planes());
             pairs.for_each(|(a, b)| assert!((a - b).abs() < 1e-6, "{} {a} {b}", column.name()));
         }
-        // The weighted mean of where its members are.
+        // A proxy is at the weighted mean of its members.
         let at = |id: usize| gather_all(model.source(), frame, Columns::all()).unwrap().position.row::<3>(id);
         let mean: [f32; 3] = std::array::from_fn(|c| 0.75 * at(3)[c] + 0.25 * at(4)[c]);
         let found = state.position.row::<3>(1);
@@ -162,28 +162,28 @@ fn merged_and_changed_ones_read_back_as_they_were_shown() {
 }
 
 #[test]
-fn what_is_wrong_is_named() {
+fn errors_name_the_array_and_the_problem() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("params.npz");
-    let said = |change: &dyn Fn(&mut Arrays)| {
+    let error_of = |change: &dyn Fn(&mut Arrays)| {
         let mut arrays = arrays();
         change(&mut arrays);
         write(&path, &arrays, CompressionMethod::Stored);
         message(&path)
     };
-    let missing = said(&|arrays| drop(arrays.remove(3)));
+    let missing = error_of(&|arrays| drop(arrays.remove(3)));
     assert!(missing.contains("unnorm_rotations") && missing.contains("params.npz"), "{missing}");
-    let fewer = said(&|arrays| {
+    let fewer = error_of(&|arrays| {
         arrays[5].1 = vec![4, 3];
         arrays[5].2.truncate(12);
     });
     assert!(fewer.contains("log_scales") && fewer.contains("[5, 3]") && fewer.contains("[4, 3]"), "{fewer}");
-    let flat = said(&|arrays| {
+    let flat = error_of(&|arrays| {
         arrays[0].1 = vec![15, 3];
         arrays.push(("cam_unnorm_rots", vec![1], vec![0.0]));
     });
     assert!(flat.contains("SplaTAM"), "{flat}");
-    let none = said(&|arrays| {
+    let none = error_of(&|arrays| {
         arrays[0].1 = vec![0, 5, 3];
         arrays[0].2.clear();
     });
@@ -194,7 +194,7 @@ fn what_is_wrong_is_named() {
 }
 
 #[test]
-fn a_file_cut_anywhere_is_refused_and_shapes_that_overflow_are_too() {
+fn truncated_files_and_huge_shapes_are_refused() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("params.npz");
     write(&path, &arrays(), CompressionMethod::Stored);

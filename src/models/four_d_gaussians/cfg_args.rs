@@ -1,4 +1,4 @@
-//! `cfg_args` of a 4DGaussians model: the text of a Python `Namespace(...)`, parsed and never evaluated.
+//! `cfg_args` of a 4DGaussians model: the text of a Python `Namespace(...)`. It is parsed and never evaluated.
 
 use std::path::Path;
 
@@ -9,70 +9,74 @@ use crate::model::Columns;
 use crate::files::open::read_small;
 use crate::files::python_literal::{Literal, parse_call};
 
-/// Larger than any namespace an argument parser prints.
+/// Maximum bytes of a file; larger than any namespace that an argument parser prints.
 const MAX_BYTES: u64 = 1 << 20;
-/// What is called in it.
-pub(in crate::models) const NAME: &str = "Namespace";
+/// Name of the Python call in the file.
+pub(in crate::models) const CALL_NAME: &str = "Namespace";
+/// Key of the SH degree.
 const SH_DEGREE: &str = "sh_degree";
 
-/// The hyper-parameters of a model, with the defaults of the original where `cfg_args` lacks a key.
+/// Hyperparameters of a model, with the defaults of the original for keys that `cfg_args` lacks.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ModelConfig {
-    /// Largest degree of the spherical harmonics; default 3.
+    /// Maximum SH degree; default 3.
     pub sh_degree: i64,
-    /// Folder of the data set the model was trained on.
+    /// Folder of the training data.
     pub source_path: Option<String>,
-    /// Background is white rather than black; default false.
+    /// Whether the background is white rather than black; default false.
     pub white_background: bool,
-    /// Width of the network; default 64. The tensors' shapes outrank it.
+    /// Width of the network; default 64. The shapes of the tensors take precedence.
     pub net_width: i64,
-    /// Layers of the trunk; default 1, and 0 behaves as 1. The tensors' shapes outrank it.
+    /// Number of layers of the trunk; default 1, and 0 means 1. The shapes of the tensors take precedence.
     pub defor_depth: i64,
-    /// Spatial resolution of each level as a multiple; default `[1, 2, 4, 8]`. The tensors' shapes outrank it.
+    /// Spatial resolution of each level as a multiple; default `[1, 2, 4, 8]`. The shapes of the tensors take
+    /// precedence.
     pub multires: Vec<i64>,
-    /// Resolution of the planes along x, y, z, t at level multiple 1; default `[64, 64, 64, 25]`.
-    /// The tensors' shapes outrank it.
+    /// Resolution of the planes along x, y, z, t at level multiple 1; default `[64, 64, 64, 25]`. The shapes of the
+    /// tensors take precedence.
     pub resolution: Vec<i64>,
-    /// Channels of a plane; default 32. The tensors' shapes outrank it.
+    /// Number of channels of a plane; default 32. The shapes of the tensors take precedence.
     pub channels: i64,
-    /// Half size of the field's initial box; default 1.6. The stored box outranks it.
+    /// Half size of the initial box of the field; default 1.6. The stored box takes precedence.
     pub bounds: f64,
-    /// No position head.
+    /// Whether the position head is missing.
     pub no_dx: bool,
-    /// No scale head.
+    /// Whether the scale head is missing.
     pub no_ds: bool,
-    /// No rotation head.
+    /// Whether the rotation head is missing.
     pub no_dr: bool,
-    /// No opacity head; default true.
+    /// Whether the opacity head is missing; default true.
     pub no_do: bool,
-    /// No spherical-harmonics head; default true.
+    /// Whether the SH head is missing; default true.
     pub no_dshs: bool,
-    /// The network reads positions instead of planes.
+    /// Whether the network reads positions instead of planes.
     pub no_grid: bool,
-    /// A head masks the raw parameters.
+    /// Whether a network masks the raw parameters.
     pub static_mlp: bool,
-    /// A voxel grid masks the raw parameters.
+    /// Whether a voxel grid masks the raw parameters.
     pub empty_voxel: bool,
-    /// Frequency of the features' sine and cosine; default 0, none.
+    /// Number of sine and cosine frequencies added to the features; default 0, none.
     pub grid_pe: i64,
-    /// The rotation delta multiplies.
+    /// Whether the rotation delta multiplies the raw quaternion instead of being added.
     pub apply_rotation: bool,
 }
 
 impl ModelConfig {
     /// Reads the `cfg_args` file at `path`.
+    ///
+    /// # Errors
+    /// Fails if the file cannot be read, is no `Namespace(...)`, or a known key has a value of the wrong type.
     pub fn read(path: &Path) -> Result<Self> {
         Self::parse(&read(path)?, path)
     }
 
     /// Parses the text of `cfg_args`; `path` is for error messages.
     ///
-    /// Keys this program does not need may hold anything, written in any syntax that keeps its
-    /// brackets and quotes balanced.
+    /// Unknown keys may hold any text whose brackets and quotes are balanced.
     pub fn parse(text: &str, path: &Path) -> Result<Self> {
-        let keys = parse_call(text, NAME).map_err(|error| error.in_file(path, text))?;
+        let keys = parse_call(text, CALL_NAME).map_err(|error| error.in_file(path, text))?;
         let get = |name: &'static str| {
-            // Python would refuse a repeated keyword; of a hand-edited file take the last one.
+            // Python would refuse a repeated keyword. In a hand-edited file the last one counts.
             keys.iter().rev().find(|key| key.name == name).map_or(
                 ConfigKey { name, value: &Literal::None, path },
                 |found| ConfigKey { name, value: &found.value, path },
@@ -103,7 +107,7 @@ impl ModelConfig {
         Ok(config)
     }
 
-    /// A note for what it says of the network and the weights do not have; of both the weights are believed.
+    /// Returns a note for each hyperparameter that contradicts the shapes of the weights. The weights take precedence.
     pub(super) fn contradicted_by(&self, tensors: &Tensors) -> Vec<String> {
         const TRUNK: &str = "deformation_net.feature_out.";
         const GRIDS: &str = "deformation_net.grid.grids.";
@@ -122,7 +126,7 @@ impl ModelConfig {
         if !self.no_grid {
             let least = |list: &[i64]| list.first().copied().unwrap_or(1);
             let x = self.resolution.first().copied().unwrap_or(0) * least(&self.multires);
-            // Planes xy, xz, xt, yz, yt, zt, the first axis last.
+            // Planes xy, xz, xt, yz, yt, zt; the first axis is the last dimension.
             found.extend([
                 (
                     "multires (levels)",
@@ -134,16 +138,17 @@ impl ModelConfig {
                 ("resolution along t", self.resolution.get(3).copied().unwrap_or(0), side(format!("{GRIDS}0.2"), 2)),
             ]);
         }
-        let differs = |(what, said, there): (&str, i64, Option<i64>)| {
-            let there = there.filter(|&there| there != said)?;
+        let differs = |(key, configured, actual): (&str, i64, Option<i64>)| {
+            let actual = actual.filter(|&actual| actual != configured)?;
             Some(format!(
-                "cfg_args says {what} = {said}, the weights in deformation.pth have {there}: the weights are believed"
+                "cfg_args says {key} = {configured}, but the weights in deformation.pth have {actual}: the weights \
+                 are used"
             ))
         };
         found.into_iter().filter_map(differs).collect()
     }
 
-    /// What decides the evaluation of the deformation field.
+    /// Returns the settings that determine the evaluation of the deformation field.
     pub fn field(&self) -> FieldConfig {
         let off = [
             (self.no_dx, Columns::POSITION),
@@ -168,14 +173,14 @@ pub(in crate::models) fn read(path: &Path) -> Result<String> {
     let bytes = read_small(path, MAX_BYTES, "a cfg_args")?;
     String::from_utf8(bytes).map_err(|error| {
         let valid = error.utf8_error().valid_up_to();
-        Error::input(path, format!("byte {valid}"), "UTF-8 text", "a byte that is not")
+        Error::input(path, format!("byte {valid}"), "UTF-8 text", "an invalid byte")
     })
 }
 
-/// `text`, that of `path`, with harmonics of `degree`, and all other bytes as they were. Where it does not say the degree,
-/// that comes first.
+/// Returns `text` with SH degree `degree` and all other bytes unchanged. If `text` does not give the degree, it becomes
+/// the first key. `path` is for error messages.
 pub(in crate::models) fn with_sh_degree(text: &str, degree: usize, path: &Path) -> Result<String> {
-    let keys = parse_call(text, NAME).map_err(|error| error.in_file(path, text))?;
+    let keys = parse_call(text, CALL_NAME).map_err(|error| error.in_file(path, text))?;
     let (place, value) = match keys.iter().rev().find(|key| key.name == SH_DEGREE) {
         Some(key) => (key.place.clone(), degree.to_string()),
         None => {
@@ -187,18 +192,18 @@ pub(in crate::models) fn with_sh_degree(text: &str, degree: usize, path: &Path) 
     Ok([&text[..place.start], &value, &text[place.end..]].concat())
 }
 
-/// Returns the text of the `cfg_args` file at `path` of a model with SH degree `own`, for a result with SH degree `degree`:
-/// as it is unless the degree becomes lower.
+/// Returns the text of the `cfg_args` file at `path`, for an output with SH degree `degree` of a model with SH degree
+/// `own`. The text is unchanged unless the degree becomes lower.
 pub(in crate::models) fn read_for_degree(path: &Path, own: usize, degree: usize) -> Result<String> {
     let text = read(path)?;
     if degree < own { with_sh_degree(&text, degree, path) } else { Ok(text) }
 }
 
-/// Returns `text`, the content of `path`, for an archive, which is made to be sent: without folders of the machine the
-/// model was trained on. The strings of `source_path` and `model_path`, and all strings that are absolute paths, become
-/// their last names; every other byte stays.
+/// Returns `text`, the content of `path`, without the folders of the training machine. Used for archives, which are
+/// made to be shared. The strings of `source_path` and `model_path`, and all strings that are absolute paths, are
+/// replaced by their last components; all other bytes are unchanged.
 pub(in crate::models) fn without_folders(text: &str, path: &Path) -> Result<String> {
-    let keys = parse_call(text, NAME).map_err(|error| error.in_file(path, text))?;
+    let keys = parse_call(text, CALL_NAME).map_err(|error| error.in_file(path, text))?;
     let (mut out, mut end) = (String::with_capacity(text.len()), 0);
     for key in &keys {
         out += &text[end..key.place.start];
@@ -208,7 +213,8 @@ pub(in crate::models) fn without_folders(text: &str, path: &Path) -> Result<Stri
     Ok(out + &text[end..])
 }
 
-/// Returns a Python expression whose strings are their last names: `all` of them, else those that are absolute paths.
+/// Replaces strings in a Python expression by their last path components: all strings if `all`, else absolute paths
+/// only.
 fn without_paths(expression: &str, all: bool) -> String {
     let mut out = String::with_capacity(expression.len());
     let mut rest = expression;
@@ -221,7 +227,7 @@ fn without_paths(expression: &str, all: bool) -> String {
             is_escaped = c == '\\' && !is_escaped;
             ends
         });
-        // Text that ends within a string is no string.
+        // A quote without an end does not begin a string.
         let Some(end) = end else { break };
         let string = &content[..end];
         let is_absolute = string.starts_with(['/', '~', '\\']) || string.get(1..2) == Some(":");
@@ -237,7 +243,7 @@ fn without_paths(expression: &str, all: bool) -> String {
     out + rest
 }
 
-/// One key and its value; `None` stands for a missing key too, and takes the default.
+/// Key and its value. A missing key has the value `None`, which selects the default.
 #[derive(Clone, Copy)]
 pub(in crate::models) struct ConfigKey<'a> {
     pub(in crate::models) name: &'static str,
@@ -246,10 +252,12 @@ pub(in crate::models) struct ConfigKey<'a> {
 }
 
 impl<'a> ConfigKey<'a> {
+    /// Returns the error that the value is not what was `expected`.
     pub(in crate::models) fn wrong(&self, expected: &str) -> Error {
         Error::input(self.path, format!("key {}", self.name), expected, self.value.to_string())
     }
 
+    /// Returns the value as a boolean; 0 and 1 count as booleans.
     pub(in crate::models) fn bool(&self, default: bool) -> Result<bool> {
         match self.value {
             Literal::None => Ok(default),
@@ -259,7 +267,8 @@ impl<'a> ConfigKey<'a> {
         }
     }
 
-    /// Python's `True` is the integer 1; `grid_pe=False` is written by some forks.
+    /// Returns the value as an integer. Accepts booleans: Python's `True` is the integer 1, and some forks write
+    /// `grid_pe=False`.
     pub(in crate::models) fn int(&self, default: i64) -> Result<i64> {
         match self.value {
             Literal::None => Ok(default),
@@ -269,6 +278,7 @@ impl<'a> ConfigKey<'a> {
         }
     }
 
+    /// Returns the value as a number.
     pub(in crate::models) fn float(&self, default: f64) -> Result<f64> {
         match self.value {
             Literal::None => Ok(default),
@@ -278,6 +288,7 @@ impl<'a> ConfigKey<'a> {
         }
     }
 
+    /// Returns the value as a string, if there is one.
     pub(in crate::models) fn string(&self) -> Result<Option<String>> {
         match self.value {
             Literal::None => Ok(None),
@@ -286,6 +297,7 @@ impl<'a> ConfigKey<'a> {
         }
     }
 
+    /// Returns the value as a list of integers.
     fn ints(&self, default: &[i64]) -> Result<Vec<i64>> {
         match self.value {
             Literal::None => Ok(default.to_vec()),
@@ -296,7 +308,7 @@ impl<'a> ConfigKey<'a> {
         }
     }
 
-    /// The value of `name` in this dictionary.
+    /// Returns the value of `name` in this dictionary.
     fn entry(&self, name: &'static str) -> Result<ConfigKey<'a>> {
         let value = match self.value {
             Literal::None => &Literal::None,
@@ -451,7 +463,7 @@ mod tests {
     #[test]
     fn nesting_is_bounded() {
         assert!(refusal(&format!("Namespace(a={})", "[".repeat(100_000))).contains("32 levels"));
-        // Opaque text nests without a stack frame per level.
+        // Values that are not interpreted may nest deeply without using the stack.
         parse(&format!("Namespace(a=f{}{})", "(".repeat(100_000), ")".repeat(100_000))).unwrap();
     }
 

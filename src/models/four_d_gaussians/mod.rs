@@ -1,8 +1,8 @@
-//! 4DGaussians model folders as a family: a canonical cloud, and a field that deforms it.
+//! 4DGaussians model folders as a model format: canonical Gaussians and a field that deforms them.
 //!
-//! The result is a folder of the same layout with a smaller point cloud. The configuration stays byte for byte as it
-//! was, but for the SH degree where that is lower; so does the field, or its tensors keep their names and shapes and take
-//! fewer bytes.
+//! The output is a folder of the same layout with a smaller point cloud file. The configuration is copied byte for
+//! byte, except for the SH degree if that is lowered. The field is copied too, or written in half precision with the
+//! same tensor names and shapes.
 
 pub(super) mod cfg_args;
 mod model_folder;
@@ -26,7 +26,7 @@ use crate::files::state_dict::{StoredTensor, TensorValues, is_floating, read_sta
 use crate::limits::Limits;
 use crate::model::{Columns, Gaussians, Jacobian};
 use crate::models::input_model::{InputModel, MemoryProfile, ModelFormat, Timing};
-use crate::models::motion_model::left;
+use crate::models::motion_model::compressed_raw;
 use crate::outputs::container::GAUSSIAN_BLOCK;
 use crate::outputs::kind::OutputKind;
 use crate::progress::Events;
@@ -34,7 +34,7 @@ use crate::recipe::{MergeParams, Precision};
 use crate::source::{Deformation, FrameSource};
 pub use model_folder::ModelFolder;
 
-/// A model folder.
+/// 4DGaussians model folder.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
     recognizes: |found| {
         found.is_folder && (found.path.join("cfg_args").exists() || found.path.join("point_cloud").is_dir())
@@ -59,7 +59,7 @@ impl InputModel for ModelFolder {
         Ok(self.size()?.whole())
     }
 
-    /// Without `deformation_table.pth` and `deformation_accum.pth`: no renderer needs them, and no result has them.
+    /// Excludes `deformation_table.pth` and `deformation_accum.pth`: no renderer needs them, and no output has them.
     fn size(&self) -> Result<Size> {
         let paths = self.paths();
         size_of(&paths.point_cloud, &paths.deformation, &paths.cfg_args)
@@ -72,7 +72,7 @@ impl InputModel for ModelFolder {
                 size_of(&folder.join("point_cloud.ply"), &folder.join("deformation.pth"), &path.join("cfg_args"))
             }
             OutputKind::Ply => Ok(Size { cloud: bytes_of([path])?, ..Size::default() }),
-            // Neither archive nor .splatv is written here.
+            // Archives and `.splatv` are written elsewhere.
             _ => Ok(Size::of_frames(bytes_below(path)?)),
         }
     }
@@ -81,20 +81,20 @@ impl InputModel for ModelFolder {
         let whole = state_bytes(self.info().sh_degree, Columns::all());
         MemoryProfile {
             per_gaussian: whole,
-            // Normals and the like stand beside the values.
+            // Normals and other extra properties are stored beside the attributes.
             opening: whole + 24,
-            // A copy of the canonical values, what is prepared of them, and their changes.
+            // A copy of the canonical values, values prepared from them, and their deltas.
             reader: 2 * whole + self.field().bytes_per_gaussian() as u64 + 128,
-            // The canonical values of what is left, and while they are made once more.
+            // The canonical values of the compressed model, and a copy while they are computed.
             reduced: 2 * whole,
             jacobian: Jacobian::BYTES_PER_GAUSSIAN as u64,
             file: whole + 24,
-            // Tensors as they are read and as they are used.
+            // Tensors as read and as used.
             fixed: 2 * self.tensor_bytes(),
             frame_block: 0,
             gaussian_block: GAUSSIAN_BLOCK as u64,
             columns: 0,
-            // `benches/deform.rs`, by the size of the network.
+            // Measured by `benches/deform.rs`, as a function of the size of the network.
             seconds_per_state: 1e-7 + 2e-11 * self.field().multiplications() as f64,
             decoded: 0,
         }
@@ -140,14 +140,15 @@ impl InputModel for ModelFolder {
         let paths = self.paths();
         if !self.can_round_field()? {
             return Err(Error::usage(format!(
-                "an archive holds tensors of 32-bit and 16-bit floating-point numbers: {} has others",
+                "{}: some tensors are not 32-bit or 16-bit floating-point numbers, and an archive holds only these\n  \
+                 write a model folder instead",
                 paths.deformation.shown()
             )));
         }
         let tensors = read_state_dict(&paths.deformation, self.memory())?;
         let role = |(name, tensor): (&String, &Tensor)| {
             let role = match role(self.config().field(), name) {
-                // No level that is read.
+                // The tensor does not have the shape of a plane, so the field does not read it as one.
                 Role::Plane(_) | Role::TimePlane(_) if !matches!(tensor.shape[..], [1, _, _, _]) => Role::Exact,
                 role => role,
             };
@@ -155,7 +156,7 @@ impl InputModel for ModelFolder {
         };
         let first = self.info().times.first().copied().unwrap_or(0.0).min(0.0);
         let last = self.info().times.last().copied().unwrap_or(1.0).max(1.0);
-        let cloud = left(self.stored(), reduction).gaussians;
+        let cloud = compressed_raw(self.stored(), reduction).gaussians;
         let cfg_args = self.cfg_args(cloud.sh_degree())?;
         let cfg_args = cfg_args::without_folders(&cfg_args, &paths.cfg_args)?.into_bytes();
         let mut content = Content {
@@ -178,7 +179,7 @@ impl InputModel for ModelFolder {
     }
 
     fn reduced<'a>(&'a self, reduction: &'a CompressedModel) -> Result<Box<dyn FrameSource + 'a>> {
-        let model = self.with_canonical(left(self.stored(), reduction).gaussians);
+        let model = self.with_canonical(compressed_raw(self.stored(), reduction).gaussians);
         Ok(Box::new(match reduction.field {
             Precision::Exact => model,
             Precision::Half => model.rounded()?,
@@ -190,7 +191,10 @@ impl InputModel for ModelFolder {
     }
 
     fn needs_all_bands(&self) -> Option<&'static str> {
-        self.field().active().contains(Columns::SH).then_some("the field's SH head adds to all of them")
+        self.field().active().contains(Columns::SH).then_some(
+            "the SH head of the deformation field adds to \
+                                                               coefficients of every degree",
+        )
     }
 
     fn write(
@@ -215,13 +219,18 @@ impl InputModel for ModelFolder {
                 let bytes = bytes_of(training.map(PathBuf::as_path))?;
                 if bytes > 0 {
                     notes.push(format!(
-                        "deformation_table.pth and deformation_accum.pth, {bytes} bytes that only training reads, were \
-                         left out, and count on neither side"
+                        "deformation_table.pth and deformation_accum.pth ({bytes} bytes, read by training only) were \
+                         not copied; sizes do not include them"
                     ));
                 }
             }
             OutputKind::Ply => self.write_cloud(reduction, path)?,
-            OutputKind::Archive => return Err(Error::internal("an archive is made of a content")),
+            OutputKind::Archive => {
+                return Err(Error::internal(
+                    "an archive is written from its content, not by the \
+                                                               model",
+                ));
+            }
             _ => notes.extend(write_sequence(&*self.reduced(reduction)?, kind, path, limits.frames_held, events)?),
         }
         Ok(notes)
@@ -229,12 +238,12 @@ impl InputModel for ModelFolder {
 }
 
 impl ModelFolder {
-    /// Returns the text of `cfg_args` with the SH degree up to `sh_degree`.
+    /// Returns the text of `cfg_args` with the SH degree limited to `sh_degree`.
     fn cfg_args(&self, sh_degree: usize) -> Result<String> {
         cfg_args::read_for_degree(&self.paths().cfg_args, self.info().sh_degree, sh_degree)
     }
 
-    /// Writes the field's state dict.
+    /// Writes the state dict of the field with the given precision.
     fn write_field(&self, precision: Precision, path: &Path) -> Result<()> {
         let own = &self.paths().deformation;
         match precision {
@@ -246,7 +255,7 @@ impl ModelFolder {
         }
     }
 
-    /// Writes the canonical cloud of what is left with the properties and comments that the model's has.
+    /// Writes the point cloud file of the compressed model with the properties and comments of the input's.
     fn write_cloud(&self, reduction: &CompressedModel, path: &Path) -> Result<()> {
         let none = Gaussians::zeros(0, self.info().sh_degree);
         let proxies = reduction.proxies.raw.as_ref().map_or(&none, |raw| &raw.gaussians);
@@ -255,22 +264,22 @@ impl ModelFolder {
     }
 }
 
-/// The folder of a training iteration in the model at `root`.
+/// Returns the folder of a training iteration in the model folder `root`.
 pub(super) fn iteration_folder(root: &Path, iteration: u32) -> PathBuf {
     root.join("point_cloud").join(format!("iteration_{iteration}"))
 }
 
-/// Of a model's files.
+/// Returns the sizes of the files of a model.
 fn size_of(cloud: &Path, field: &Path, configuration: &Path) -> Result<Size> {
     let (cloud, field, rest) = (bytes_of([cloud])?, bytes_of([field])?, bytes_of([configuration])?);
     Ok(Size { cloud, field, rest, ..Size::default() })
 }
 
-/// What a tensor is to the evaluation of a field.
+/// Returns the role of a tensor in the evaluation of the field.
 fn role(config: FieldConfig, name: &str) -> Role {
     let Some(name) = name.strip_prefix("deformation_net.") else { return Role::Unread };
     let part = name.split('.').next().unwrap_or_default();
-    let reads = |is_read: bool, as_what: Role| if is_read { as_what } else { Role::Unread };
+    let reads = |is_read: bool, role_if_read: Role| if is_read { role_if_read } else { Role::Unread };
     match part {
         "grid" if config.no_grid => Role::Unread,
         "grid" => match name.rsplit('.').next() {
@@ -290,12 +299,12 @@ fn role(config: FieldConfig, name: &str) -> Role {
         "shs_deform" => reads(config.active.contains(Columns::SH), Role::Weights),
         "static_mlp" => reads(config.static_mlp, Role::Weights),
         "empty_voxel" => reads(config.empty_voxel, Role::Exact),
-        // Of a version that this one does not know.
+        // The tensor belongs to a version of the trainer that is not known here.
         _ => Role::Exact,
     }
 }
 
-/// Writes the tensors of a field as the file that they are read from.
+/// Writes the tensors of a field as a state dict in single precision.
 pub(super) fn write_field(tensors: &Tensors, path: &Path) -> Result<()> {
     let stored = tensors.iter().map(|(name, tensor)| {
         StoredTensor::dense(name.clone(), tensor.shape.clone(), TensorValues::F32(tensor.data.clone()))

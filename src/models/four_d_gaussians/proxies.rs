@@ -1,5 +1,5 @@
-//! Proxies of a model with a deformation field: raw parameters whose state at the reference frame is
-//! the merged one (method.md, section 5.6).
+//! Proxies of a model with a deformation field: raw parameters whose state at the reference frame is the merged state
+//! (method.md, section 5.6).
 
 use super::ModelFolder;
 use crate::compressed_model::{Cluster, Proxies, Reference};
@@ -11,15 +11,18 @@ use crate::passes::{BLOCK, gather};
 use crate::recipe::{MergeParams, Placement};
 use crate::source::FrameSource;
 
-/// Frames at which proxies are compared with their members.
+/// Maximum number of frames at which proxies are compared with their members.
 const SAMPLED_FRAMES: usize = 16;
 
-/// Raw parameters of the proxies of `clusters`: their states at the reference frame minus the field's
-/// deltas at their leaders' canonical positions.
+/// Returns the raw parameters of the proxies of `clusters`: their states at the reference frame minus the field's
+/// deltas at the canonical positions of their leaders.
 ///
-/// A proxy placed at the mean is moved by the field there, not by its members' field. One that strays
-/// further than `max_drift` from its members goes back to its leader's canonical position, its shape about
-/// the mean unchanged; so does one for which no raw parameters exist, with all of its leader's parameters.
+/// A proxy placed at the mean is moved by the field at the mean, not by the field of its members. If it drifts further
+/// than `max_drift` from its members, it is placed at its leader's canonical position; its shape about the mean stays
+/// the same. A proxy without a finite solution gets all parameters of its leader.
+///
+/// # Errors
+/// Fails if frames cannot be evaluated.
 pub(super) fn solve(
     model: &ModelFolder,
     all: &[Cluster],
@@ -33,7 +36,7 @@ pub(super) fn solve(
     if leaders.is_empty() {
         return Ok(Proxies { raw: Some(raw.into()), notes, ..Proxies::default() });
     }
-    // At the leader, the canonical position is the leader's to the bit, and so is the path.
+    // A proxy placed at its leader has the canonical position of the leader to the bit, and so the same path.
     let solved = match merge.placement {
         Placement::Mean => Columns::all(),
         Placement::Leader => Columns::all().difference(Columns::POSITION),
@@ -48,7 +51,10 @@ pub(super) fn solve(
     }
     let unsolved = restore_unsolved(&mut raw, &of_leaders);
     if unsolved > 0 {
-        notes.push(format!("{unsolved} proxies kept their leader's parameters: the field's mask leaves no others"));
+        notes.push(format!(
+            "{unsolved} proxies kept the parameters of their leaders: the mask of the deformation \
+                            field allows no others"
+        ));
     }
     let mut placements = vec![merge.placement; leaders.len()];
     let mut deviations = deviations(model, reference, all, &raw, &placements)?;
@@ -59,14 +65,17 @@ pub(super) fn solve(
             raw.position.set_row::<3>(proxy, of_leaders.position.row(proxy));
             placements[proxy] = Placement::Leader;
         }
-        notes.push(format!("{} proxies strayed from their members and were placed at their leaders", strayed.len()));
+        notes.push(format!(
+            "{} proxies drifted too far from their members and were placed at their leaders",
+            strayed.len()
+        ));
         deviations = self::deviations(model, reference, all, &raw, &placements)?;
     }
     let deviation = deviations.into_iter().reduce(f64::max);
     Ok(Proxies { raw: Some(raw.into()), deviation, notes, ..Proxies::default() })
 }
 
-/// States of the proxies of `clusters` at the reference frame.
+/// Returns the states of the proxies of `clusters` at the reference frame.
 fn merged_states(
     model: &ModelFolder,
     reference: Reference,
@@ -90,14 +99,14 @@ fn merged_states(
     Ok(states)
 }
 
-/// The merged states with rotations as long as their leaders' at that frame: the field adds its change of
-/// rotation to the raw quaternion, so how far it turns depends on the length.
+/// Returns the merged states with quaternions of the same length as those of their leaders at that frame. The field
+/// adds its delta to the raw quaternion, so the angle of rotation depends on the length.
 fn with_leader_lengths(deltas: &Deltas, of_leaders: &Gaussians, mut states: Gaussians) -> Gaussians {
     let mut leaders = Gaussians { rotation: of_leaders.rotation.clone(), ..Gaussians::default() };
     deltas.apply(of_leaders, Columns::ROTATION, &mut leaders);
     for row in 0..states.len() {
         let length = leaders.rotation.row::<4>(row).iter().map(|x| x * x).sum::<f32>().sqrt();
-        // A leader without a direction leaves the proxy its unit quaternion.
+        // If the leader's quaternion has no direction, the proxy keeps its unit quaternion.
         if length > 0.0 && length.is_finite() {
             states.rotation.set_row(row, states.rotation.row::<4>(row).map(|x| x * length));
         }
@@ -105,7 +114,7 @@ fn with_leader_lengths(deltas: &Deltas, of_leaders: &Gaussians, mut states: Gaus
     states
 }
 
-/// Gives rows with a value that is not finite the leader's parameters; counts them.
+/// Replaces rows that have a value that is not finite by the parameters of their leaders. Returns their number.
 fn restore_unsolved(raw: &mut Gaussians, leaders: &Gaussians) -> usize {
     let columns: Vec<Columns> = Columns::all().iter().collect();
     let planes = |state: &Gaussians, row: usize| -> Vec<f32> {
@@ -128,8 +137,9 @@ fn restore_unsolved(raw: &mut Gaussians, leaders: &Gaussians) -> usize {
     unsolved.len()
 }
 
-/// For every proxy how far, at most over sampled frames, it is from where it should be: at the mean, from
-/// the weighted mean of its members; at the leader, from its offset to that mean at the reference frame.
+/// Returns the largest distance of each proxy from its expected position over sampled frames, scene units. A proxy
+/// placed at the mean is expected at the weighted mean of its members; one placed at its leader, at the offset from
+/// that mean that it has at the reference frame.
 fn deviations(
     model: &ModelFolder,
     reference: Reference,
@@ -173,7 +183,7 @@ fn deviations(
     Ok(largest)
 }
 
-/// At most [`SAMPLED_FRAMES`] of `frames`, evenly spread, first and last among them.
+/// Returns at most [`SAMPLED_FRAMES`] of `frames`, evenly spread, with the first and last among them.
 fn sampled(frames: usize) -> impl Iterator<Item = usize> {
     let count = frames.min(SAMPLED_FRAMES);
     (0..count).map(move |k| if count < 2 { 0 } else { k * (frames - 1) / (count - 1) })

@@ -1,7 +1,8 @@
-//! The field's state dict in fewer bytes: half precision, what is constant once, and of time planes only what is read.
+//! Compact form of the field's state dict: half precision, constant tensors stored as one value, and only the rows of
+//! time planes that are read.
 //!
-//! Data in: the tensors of a state dict. Data out: tensors of the same names and shapes, as a file stores them; the
-//! original's loader copies them into its own parameters of single precision. Memory: the tensors once more.
+//! Input: the tensors of a state dict. Output: tensors of the same names and shapes, as a file stores them; the loader
+//! of the original copies them into its own single-precision parameters. Memory: one copy of the tensors.
 
 use half::f16;
 use half::slice::HalfFloatSliceExt;
@@ -10,14 +11,14 @@ use half::vec::HalfFloatVecExt;
 use crate::deform::{Tensor, Tensors, rows_before_zero};
 use crate::files::state_dict::{MAX_EXPANSION, StoredTensor, TensorValues};
 
-/// Tensors of fewer values keep theirs: biases, the ends of heads and the field's box take next to no bytes, and
-/// whatever passes through the field passes through them.
-const FEW: usize = 1024;
-/// Root mean square error of a tensor in half precision, as a part of its own: what rounding makes at most of values
-/// within range. Values too large or too small for half precision make more.
-const MOST_ERROR: f64 = 1.0 / 2048.0;
+/// Number of values below which a tensor stays in single precision. Biases, the last layers of heads and the box of the
+/// field take few bytes, and every value of the field depends on them.
+const MIN_HALF_VALUES: usize = 1024;
+/// Maximum root mean square error of a tensor in half precision, relative to its root mean square. Rounding of values
+/// within range stays below it; values too large or too small for half precision exceed it.
+const MAX_ERROR: f64 = 1.0 / 2048.0;
 
-/// `tensors` with the values that they have once they are stored in half precision.
+/// Returns the tensors with the values that they have after storage in half precision.
 pub(super) fn rounded(mut tensors: Tensors) -> Tensors {
     for tensor in tensors.values_mut() {
         if let Some(halves) = halves(tensor) {
@@ -27,8 +28,8 @@ pub(super) fn rounded(mut tensors: Tensors) -> Tensors {
     tensors
 }
 
-/// `tensors` in as few bytes as that takes; of time planes only what times from 0 on read, if that is all there are
-/// (`from_zero`): elements that are never read then share the values of others.
+/// Returns the tensors in compact form. If `from_zero`, no time below 0 is read; rows of time planes that are then
+/// never read share the storage of other rows.
 pub(super) fn stored(tensors: &Tensors, from_zero: bool) -> Vec<StoredTensor> {
     let pack = |shares: bool| -> Vec<StoredTensor> {
         let pack = |(name, tensor): (&String, &Tensor)| match shares {
@@ -38,14 +39,14 @@ pub(super) fn stored(tensors: &Tensors, from_zero: bool) -> Vec<StoredTensor> {
         tensors.iter().map(pack).collect()
     };
     let small = pack(true);
-    let bytes = |values: usize, of: &StoredTensor| (values * of.values.width()) as u64;
-    let kept: u64 = small.iter().map(|tensor| bytes(tensor.values.len(), tensor)).sum();
-    let meant: u64 = small.iter().map(|tensor| bytes(tensor.shape.iter().product(), tensor)).sum();
-    // What means more than a reader lets a file mean is written out.
-    if meant > MAX_EXPANSION * kept { pack(false) } else { small }
+    let bytes = |values: usize, tensor: &StoredTensor| (values * tensor.values.width()) as u64;
+    let stored_bytes: u64 = small.iter().map(|tensor| bytes(tensor.values.len(), tensor)).sum();
+    let expanded_bytes: u64 = small.iter().map(|tensor| bytes(tensor.shape.iter().product(), tensor)).sum();
+    // Readers limit the ratio of expanded to stored bytes; beyond the limit, tensors are written out in full.
+    if expanded_bytes > MAX_EXPANSION * stored_bytes { pack(false) } else { small }
 }
 
-/// One tensor.
+/// Returns the compact form of one tensor.
 fn packed(name: &str, tensor: &Tensor, from_zero: bool) -> StoredTensor {
     let is_first = |value: &f32| value.to_bits() == tensor.data[0].to_bits();
     if tensor.data.len() > 1 && tensor.data.iter().all(is_first) {
@@ -58,7 +59,8 @@ fn packed(name: &str, tensor: &Tensor, from_zero: bool) -> StoredTensor {
     if unread == 0 {
         return dense(&tensor.data);
     }
-    // Every channel's first rows lie where the last ones of the channel before lie; the first channel's are its own.
+    // The unread first rows of each channel share storage with the last rows of the channel before. The first channel
+    // has rows of its own.
     let mut data = tensor.data[..unread * columns].to_vec();
     for channel in tensor.data.chunks_exact(rows * columns) {
         data.extend(&channel[unread * columns..]);
@@ -69,7 +71,7 @@ fn packed(name: &str, tensor: &Tensor, from_zero: bool) -> StoredTensor {
     stored
 }
 
-/// `data`, some of the values of `tensor`, in the precision that these are stored in.
+/// Returns `data`, some of the values of `tensor`, in the precision in which `tensor` is stored.
 fn values(tensor: &Tensor, data: &[f32]) -> TensorValues {
     match halves(tensor) {
         Some(_) => TensorValues::F16(Vec::from_f32_slice(data)),
@@ -77,28 +79,28 @@ fn values(tensor: &Tensor, data: &[f32]) -> TensorValues {
     }
 }
 
-/// The values of a tensor in half precision, unless it is small or they lose too much.
+/// Returns the tensor in half precision; `None` if it has few values or would lose too much.
 fn halves(tensor: &Tensor) -> Option<Vec<f16>> {
     let halves = Vec::<f16>::from_f32_slice(&tensor.data);
     let square = |values: &mut dyn Iterator<Item = f64>| values.map(|value| value * value).sum::<f64>();
     let error = square(&mut tensor.data.iter().zip(&halves).map(|(x, half)| f64::from(*x) - half.to_f64()));
     let all = square(&mut tensor.data.iter().map(|&x| f64::from(x)));
-    // False of what is not finite.
-    (halves.len() >= FEW && error <= MOST_ERROR.powi(2) * all).then_some(halves)
+    // The comparison is false for values that are not finite.
+    (halves.len() >= MIN_HALF_VALUES && error <= MAX_ERROR.powi(2) * all).then_some(halves)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    /// A tensor of values between −1 and 1, no two the same.
+    /// Returns a tensor of distinct values between −`scale`/2 and `scale`/2.
     fn tensor(shape: &[usize], scale: f32) -> Tensor {
         let count: usize = shape.iter().product();
         let data = (0..count).map(|i| scale * ((i as f32 * 0.618_034).fract() - 0.5)).collect();
         Tensor { shape: shape.to_vec(), data }
     }
 
-    /// What a reader makes of it, by the definition of strides.
+    /// Expands a stored tensor by the definition of strides.
     fn read(stored: &StoredTensor) -> Tensor {
         let mut data = vec![stored.offset];
         for (&extent, &stride) in stored.shape.iter().zip(&stored.stride) {
@@ -111,10 +113,11 @@ mod tests {
         Tensor { shape: stored.shape.clone(), data: data.into_iter().map(value).collect() }
     }
 
+    /// Name of a time plane.
     const TIME: &str = "deformation_net.grid.grids.1.4";
 
     #[test]
-    fn rows_of_time_that_are_read_keep_their_values_and_the_others_take_no_bytes() {
+    fn unread_time_rows_take_no_bytes() {
         for rows in [1, 2, 25, 50] {
             let plane = tensor(&[1, 16, rows, 8], 1.0);
             let tensors = Tensors::from([(TIME.to_owned(), plane.clone())]);
@@ -135,8 +138,8 @@ mod tests {
     }
 
     #[test]
-    fn what_half_precision_cannot_hold_stays_and_so_does_what_is_small() {
-        let few = tensor(&[FEW - 1], 1.0);
+    fn small_or_unrepresentable_tensors_stay_exact() {
+        let few = tensor(&[MIN_HALF_VALUES - 1], 1.0);
         let mut large = tensor(&[64, 32], 1.0);
         large.data[77] = 65_520.0;
         let mut odd = tensor(&[64, 32], 1.0);
@@ -163,7 +166,7 @@ mod tests {
     }
 
     #[test]
-    fn a_constant_is_stored_once_as_long_as_the_file_may_mean_so_much() {
+    fn constant_tensor_is_stored_once_within_the_limit() {
         let constant = Tensor { shape: vec![40, 50], data: vec![0.1; 2000] };
         let zeros = |sign: f32| Tensor { shape: vec![2], data: vec![0.0, sign * 0.0] };
         let tensors = |more: usize| {
@@ -181,7 +184,7 @@ mod tests {
     }
 
     #[test]
-    fn rounding_twice_is_rounding_once() {
+    fn rounding_twice_equals_rounding_once() {
         let tensors = Tensors::from([("a".to_owned(), tensor(&[80, 90], 3.0)), ("b".to_owned(), tensor(&[9], 3.0))]);
         let once = rounded(tensors);
         assert_eq!(rounded(once.clone()), once);

@@ -1,27 +1,30 @@
-//! Checkpoints of gsplat, static or of FreeTimeGS.
+//! Checkpoints of gsplat: static models, or FreeTimeGS.
 //!
-//! In: `ckpts/ckpt_K.pt` of a result's folder, or the file: `{"step", "splats": state dict, "optimizers": {name: Adam state}}`.
-//! `splats` has `means` [N, 3], `scales` [N, 3] log, `quats` [N, 4] wxyz of any length, `opacities` [N] logit, `sh0` [N, 1, 3],
-//! `shN` [N, K, 3]; of FreeTimeGS also `times` [N, 1], `durations` [N, 1] log, `velocities` [N, 3]. Out: the same checkpoint with
-//! fewer rows. Cameras are those of the trainer's parser: it normalizes the world, and does not store how.
+//! Input: `ckpts/ckpt_K.pt` in a result folder, or the file itself: `{"step", "splats": state dict, "optimizers":
+//! {name: Adam state}}`. `splats` holds `means` [N, 3], `scales` [N, 3] log, `quats` [N, 4] wxyz of any length,
+//! `opacities` [N] logit, `sh0` [N, 1, 3], `shN` [N, K, 3]; for FreeTimeGS also `times` [N, 1], `durations` [N, 1] log,
+//! `velocities` [N, 3]. Output: the same checkpoint with fewer rows. Cameras must be those of the trainer's parser: it
+//! normalizes the world and does not store how.
 
-mod law;
+mod frame_state;
 
 use std::path::{Path, PathBuf};
 
 use super::in_checkpoint::still::Still;
-use super::in_checkpoint::{About, InCheckpoint, Reading, RowElement, count_of, numbered};
+use super::in_checkpoint::{
+    CheckpointModel, CheckpointReader, ModelDescription, RowElement, numbered_files, row_count,
+};
 use crate::error::{Error, Result, quoted};
 use crate::files::checkpoint::{Checkpoint, NodeId};
 use crate::limits::ReadLimit;
 use crate::model::{Columns, HIGHEST_DEGREE, sh_coefficients};
 use crate::models::input_model::{InputModel, ModelFormat, OpenOptions};
-use law::{DURATION, FreeTime, OWN, TIME, VELOCITY};
+use frame_state::{DURATION, FreeTime, OWN, TIME, VELOCITY};
 
-/// Where a result's folder has its checkpoints.
-const FOLDER: &str = "ckpts";
+/// Name of the subfolder of a result folder that holds the checkpoints.
+const CHECKPOINT_FOLDER: &str = "ckpts";
 
-/// A checkpoint, or the folder of a result.
+/// gsplat checkpoint, or the result folder of a training.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
     recognizes: |found| match found.is_folder {
         true => !checkpoints(found.path).is_empty(),
@@ -38,23 +41,26 @@ pub(super) const ENTRY: ModelFormat = ModelFormat {
                 (None, path.to_owned(), Vec::new())
             }
         };
-        open(About { root, file, notes, ..About::default() }, options)
+        open(ModelDescription { root, file, notes, ..ModelDescription::default() }, options)
     },
 };
 
-/// The checkpoints of a result's folder, or of that of its checkpoints.
+/// Returns the checkpoints of a result folder, or of a folder of checkpoints, in order of iteration.
 fn checkpoints(path: &Path) -> Vec<(u32, PathBuf)> {
-    let of = |folder: &Path| {
-        let (mut one, first) = (numbered(folder, "ckpt_", ".pt"), numbered(folder, "ckpt_", "_rank0.pt"));
+    let in_folder = |folder: &Path| {
+        let (mut one, first) = (numbered_files(folder, "ckpt_", ".pt"), numbered_files(folder, "ckpt_", "_rank0.pt"));
         one.extend(first);
         one.sort();
         one
     };
-    let inner = of(&path.join(FOLDER));
-    if inner.is_empty() { of(path) } else { inner }
+    let inner = in_folder(&path.join(CHECKPOINT_FOLDER));
+    if inner.is_empty() { in_folder(path) } else { inner }
 }
 
-/// The one that `options` name, or the last.
+/// Returns the checkpoint of the requested iteration, or the last one with a note.
+///
+/// # Errors
+/// Fails if there is no such checkpoint, or if the model is divided among several ranks.
 fn choose(path: &Path, options: &OpenOptions) -> Result<(PathBuf, Vec<String>)> {
     let found = checkpoints(path);
     let names = || found.iter().map(|(k, _)| k.to_string()).collect::<Vec<_>>().join(", ");
@@ -63,26 +69,27 @@ fn choose(path: &Path, options: &OpenOptions) -> Result<(PathBuf, Vec<String>)> 
         None => found.last(),
     };
     let expected = || options.iteration.map_or("a checkpoint".to_owned(), |k| format!("a checkpoint ckpt_{k}.pt"));
-    let (_, file) = chosen.ok_or_else(|| Error::input(path, FOLDER, expected(), names()))?;
-    let second = file.to_string_lossy().replace("_rank0.pt", "_rank1.pt");
-    if second != file.to_string_lossy() && Path::new(&second).exists() {
+    let (_, file) = chosen.ok_or_else(|| Error::input(path, CHECKPOINT_FOLDER, expected(), names()))?;
+    let second_rank = file.to_string_lossy().replace("_rank0.pt", "_rank1.pt");
+    if second_rank != file.to_string_lossy() && Path::new(&second_rank).exists() {
         return Err(Error::input(file, "", "a model in one file", "one of several ranks")
             .hint("join their tensors along the first axis with torch.cat, and save the checkpoint again"));
     }
     let name = file.file_name().unwrap_or_default().to_string_lossy();
-    let note = format!("{} checkpoints: {name} is read (--iteration)", found.len());
+    let note = format!("{} checkpoints found: {name} is read (choose another with --iteration)", found.len());
     Ok((file.clone(), if found.len() > 1 && options.iteration.is_none() { vec![note] } else { Vec::new() }))
 }
 
-/// Whether the checkpoint at `path` has Gaussians as gsplat names them.
+/// Returns whether the checkpoint at `path` holds Gaussians under the names of gsplat.
 fn splats_in(path: &Path, memory: ReadLimit) -> bool {
     let Ok(checkpoint) = Checkpoint::open(path, memory) else { return false };
     let pickle = checkpoint.pickle();
     pickle.item(pickle.root(), "splats").is_some_and(|splats| pickle.item(splats, "means").is_some())
 }
 
-fn open(about: About, options: &OpenOptions) -> Result<Box<dyn InputModel>> {
-    let checkpoint = Checkpoint::open(&about.file, options.memory)?;
+/// Opens a checkpoint as FreeTimeGS if it has velocities, else as a static model.
+fn open(description: ModelDescription, options: &OpenOptions) -> Result<Box<dyn InputModel>> {
+    let checkpoint = Checkpoint::open(&description.file, options.memory)?;
     let pickle = checkpoint.pickle();
     let Some(splats) = pickle.item(pickle.root(), "splats") else {
         let found = checkpoint.describe(pickle.root());
@@ -92,31 +99,31 @@ fn open(about: About, options: &OpenOptions) -> Result<Box<dyn InputModel>> {
     let find = |name: &'static str| pickle.item(splats, name).ok_or_else(|| missing(name));
     if let Some(name) = ["accels", "jerks"].into_iter().find(|name| pickle.item(splats, name).is_some()) {
         return Err(checkpoint
-            .wrong(&place(name), "straight motion", "a further term of a polynomial, of a fork")
-            .hint("write its frames as PLY files or as a frame stream with its own renderer, and give those"));
+            .wrong(&place(name), "motion along straight lines", "a motion term of higher order, written by a fork")
+            .hint("export its frames with its own renderer, as PLY files or as a frame stream, and give those"));
     }
     if let Some(name) = ["features", "colors"].into_iter().find(|name| pickle.item(splats, name).is_some()) {
         return Err(checkpoint
-            .wrong(&place(name), "sh0 and shN", "colours of an appearance network")
-            .hint("train without --app_opt, or write its frames as PLY files with its own renderer"));
+            .wrong(&place(name), "sh0 and shN", "colors of an appearance network")
+            .hint("train without --app_opt, or export its frames as PLY files with its own renderer"));
     }
     let names = ["means", "scales", "quats", "opacities", "sh0", "shN"];
     let nodes = names.iter().map(|name| find(name)).collect::<Result<Vec<NodeId>>>()?;
-    let moves = pickle.item(splats, "velocities").is_some();
-    let own = if moves {
+    let has_motion = pickle.item(splats, "velocities").is_some();
+    let motion_nodes = if has_motion {
         ["times", "durations", "velocities"].iter().map(|name| find(name)).collect::<Result<_>>()?
     } else {
         Vec::new()
     };
     let optimizers = pickle.item(pickle.root(), "optimizers");
-    let mut beside = Vec::new();
+    let mut training_nodes = Vec::new();
     for (_, state) in optimizers.and_then(|id| pickle.items(id)).into_iter().flatten() {
         let state = pickle.item(state, "state").and_then(|id| pickle.pairs(id));
         for (_, of_parameter) in state.into_iter().flatten() {
-            beside.extend(pickle.items(*of_parameter).into_iter().flatten().map(|(_, id)| id));
+            training_nodes.extend(pickle.items(*of_parameter).into_iter().flatten().map(|(_, id)| id));
         }
     }
-    let count = count_of(&checkpoint, nodes[0], &place("means"))?;
+    let count = row_count(&checkpoint, nodes[0], &place("means"))?;
     let rest = checkpoint.float_tensor(nodes[5], &place("shN"))?;
     let bands = rest.shape.get(1).map(|bands| bands + 1);
     let Some(degree) = (0..=HIGHEST_DEGREE).find(|&degree| bands == Some(sh_coefficients(degree))) else {
@@ -127,7 +134,7 @@ fn open(about: About, options: &OpenOptions) -> Result<Box<dyn InputModel>> {
         ));
     };
     let bands = sh_coefficients(degree);
-    let mut reading = Reading::new(checkpoint, count, degree, if moves { OWN } else { 0 })?;
+    let mut reader = CheckpointReader::new(checkpoint, count, degree, if has_motion { OWN } else { 0 })?;
     let planes = [
         (Columns::POSITION, &[3][..], 0, 3),
         (Columns::LOG_SCALE, &[3], 0, 3),
@@ -137,25 +144,28 @@ fn open(about: About, options: &OpenOptions) -> Result<Box<dyn InputModel>> {
         (Columns::SH, &[bands - 1, 3], 3, 3 * (bands - 1)),
     ];
     for ((name, id), (column, row, skipped, width)) in names.iter().zip(nodes).zip(planes) {
-        reading.read(id, &place(name), row, RowElement::all_of(column, skipped, width))?;
+        reader.read(id, &place(name), row, RowElement::all_of(column, skipped, width))?;
     }
-    let of_own = [("times", &[1][..], TIME, 1), ("durations", &[1], DURATION, 1), ("velocities", &[3], VELOCITY, 3)];
-    for (id, (name, row, first, width)) in own.into_iter().zip(of_own) {
-        reading.read(id, &place(name), row, RowElement::own(first, width))?;
+    let motion_tensors =
+        [("times", &[1][..], TIME, 1), ("durations", &[1], DURATION, 1), ("velocities", &[3], VELOCITY, 3)];
+    for (id, (name, row, first, width)) in motion_nodes.into_iter().zip(motion_tensors) {
+        reader.read(id, &place(name), row, RowElement::own(first, width))?;
     }
-    beside.into_iter().for_each(|id| reading.beside(id));
-    Ok(match moves {
+    training_nodes.into_iter().for_each(|id| reader.add_training_tensor(id));
+    Ok(match has_motion {
         true => {
-            let about = About { kind: "FreeTimeGS checkpoint", seconds_per_state: 3e-8, ..about };
-            Box::new(InCheckpoint::new(reading, FreeTime, about)?)
+            let description =
+                ModelDescription { kind: "FreeTimeGS checkpoint", seconds_per_state: 3e-8, ..description };
+            Box::new(CheckpointModel::new(reader, FreeTime, description)?)
         }
         false => {
-            let about = About { kind: "gsplat checkpoint", seconds_per_state: 1e-8, ..about };
-            Box::new(InCheckpoint::new(reading, Still, about)?)
+            let description = ModelDescription { kind: "gsplat checkpoint", seconds_per_state: 1e-8, ..description };
+            Box::new(CheckpointModel::new(reader, Still, description)?)
         }
     })
 }
 
+/// Returns the name of a tensor for messages.
 fn place(name: &str) -> String {
     format!("splats[{}]", quoted(name))
 }

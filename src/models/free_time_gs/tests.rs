@@ -19,35 +19,36 @@ fn noise(n: usize, seed: f64) -> Vec<f32> {
     (0..n).map(|i| ((i as f64 * 0.754_877 + seed * 0.569_84).fract() - 0.5) as f32).collect()
 }
 
-/// Name, shape of a row, values.
+/// Name, shape of a row, and values of each tensor.
 type Splats = Vec<(&'static str, Vec<usize>, Vec<f32>)>;
 
 fn splats() -> Splats {
-    let of = |name, row: &[usize], seed: f64, by: f32| {
+    let random_tensor = |name, row: &[usize], seed: f64, by: f32| {
         let values = noise(COUNT * row.iter().product::<usize>(), seed).into_iter().map(|x| x + by).collect();
         (name, row.to_vec(), values)
     };
     vec![
-        of("means", &[3], 1.0, 0.0),
-        of("scales", &[3], 2.0, -2.0),
-        of("quats", &[4], 3.0, 0.3),
-        of("opacities", &[], 4.0, 0.5),
-        of("sh0", &[1, 3], 5.0, 0.0),
-        of("shN", &[15, 3], 6.0, 0.0),
-        of("times", &[1], 7.0, 0.5),
-        // Some are shorter than the shortest that counts.
-        of("durations", &[1], 8.0, -3.6),
-        of("velocities", &[3], 9.0, 0.0),
+        random_tensor("means", &[3], 1.0, 0.0),
+        random_tensor("scales", &[3], 2.0, -2.0),
+        random_tensor("quats", &[4], 3.0, 0.3),
+        random_tensor("opacities", &[], 4.0, 0.5),
+        random_tensor("sh0", &[1, 3], 5.0, 0.0),
+        random_tensor("shN", &[15, 3], 6.0, 0.0),
+        random_tensor("times", &[1], 7.0, 0.5),
+        // Some durations are below the minimum.
+        random_tensor("durations", &[1], 8.0, -3.6),
+        random_tensor("velocities", &[3], 9.0, 0.0),
     ]
 }
 
 fn file(splats: &Splats) -> Vec<u8> {
-    let of = |k: usize, row: &[usize], values: &[f32]| {
+    let stored_tensor = |k: usize, row: &[usize], values: &[f32]| {
         tensor(k, &[&[values.len() / row.iter().product::<usize>().max(1)], row].concat(), values)
     };
-    let own = splats.iter().enumerate().map(|(k, (name, row, values))| (*name, Made::Tensor(of(k, row, values))));
+    let own =
+        splats.iter().enumerate().map(|(k, (name, row, values))| (*name, Made::Tensor(stored_tensor(k, row, values))));
     let adam = splats.iter().enumerate().map(|(k, (name, row, values))| {
-        let average = |storage| Made::Tensor(MadeTensor { storage, ..of(k, row, values) });
+        let average = |storage| Made::Tensor(MadeTensor { storage, ..stored_tensor(k, row, values) });
         let step = Made::Tensor(tensor(20 + k, &[], &[7.0]));
         let state = named(vec![("step", step), ("exp_avg", average(40 + k)), ("exp_avg_sq", average(60 + k))]);
         (*name, Made::Dict(named(vec![("state", Made::Dict(vec![(Made::Int(0), Made::Dict(state))]))])))
@@ -60,14 +61,14 @@ fn file(splats: &Splats) -> Vec<u8> {
     Made::Dict(root).file()
 }
 
-struct Place(tempfile::TempDir);
+struct ResultFolder(tempfile::TempDir);
 
-impl Place {
-    fn put(splats: &Splats) -> Place {
-        let place = Place(tempfile::tempdir().unwrap());
-        fs::create_dir_all(place.0.path().join("result/ckpts")).unwrap();
-        fs::write(place.path("result/ckpts/ckpt_59999.pt"), file(splats)).unwrap();
-        place
+impl ResultFolder {
+    fn put(splats: &Splats) -> ResultFolder {
+        let folder = ResultFolder(tempfile::tempdir().unwrap());
+        fs::create_dir_all(folder.0.path().join("result/ckpts")).unwrap();
+        fs::write(folder.path("result/ckpts/ckpt_59999.pt"), file(splats)).unwrap();
+        folder
     }
 
     fn path(&self, name: &str) -> PathBuf {
@@ -95,51 +96,51 @@ fn rule() -> MergeParams {
 }
 
 #[test]
-fn states_are_those_of_the_formulas() {
+fn states_follow_the_formulas() {
     let splats = splats();
-    let place = Place::put(&splats);
-    let model = open(&place.path("result")).unwrap();
+    let folder = ResultFolder::put(&splats);
+    let model = open(&folder.path("result")).unwrap();
     assert_eq!(model.kind(), "FreeTimeGS checkpoint");
-    let of = |k: usize, row: usize| -> Vec<f64> {
+    let values = |k: usize, row: usize| -> Vec<f64> {
         let width = splats[k].2.len() / COUNT;
         splats[k].2[row * width..][..width].iter().map(|&x| f64::from(x)).collect()
     };
     let mut clamped = [0; 2];
     for (state, time) in states(&*model).iter().zip(TIMES) {
         for row in 0..COUNT {
-            let dt = time - of(6, row)[0];
-            let s = of(7, row)[0].exp().max(0.02) + 1e-8;
-            clamped[usize::from(of(7, row)[0].exp() > 0.02)] += 1;
+            let dt = time - values(6, row)[0];
+            let s = values(7, row)[0].exp().max(0.02) + 1e-8;
+            clamped[usize::from(values(7, row)[0].exp() > 0.02)] += 1;
             for c in 0..3 {
-                let expected = of(0, row)[c] + of(8, row)[c] * dt;
+                let expected = values(0, row)[c] + values(8, row)[c] * dt;
                 assert!((f64::from(state.position.plane(c)[row]) - expected).abs() < 1e-7);
             }
-            let expected = ((-0.5 * (dt / s).powi(2)).exp() / (1.0 + (-of(3, row)[0]).exp())).max(1e-4);
+            let expected = ((-0.5 * (dt / s).powi(2)).exp() / (1.0 + (-values(3, row)[0]).exp())).max(1e-4);
             let got = opacity(state.opacity_logit.plane(0)[row]);
             assert!((got - expected).abs() < 1e-7, "{got} {expected}");
-            assert_eq!(state.rotation.row::<4>(row).map(f64::from).to_vec(), of(2, row));
-            assert_eq!(state.log_scale.row::<3>(row).map(f64::from).to_vec(), of(1, row));
-            assert_eq!(state.sh.row::<48>(row).map(f64::from).to_vec(), [of(4, row), of(5, row)].concat());
+            assert_eq!(state.rotation.row::<4>(row).map(f64::from).to_vec(), values(2, row));
+            assert_eq!(state.log_scale.row::<3>(row).map(f64::from).to_vec(), values(1, row));
+            assert_eq!(state.sh.row::<48>(row).map(f64::from).to_vec(), [values(4, row), values(5, row)].concat());
         }
     }
     assert!(clamped[0] > 0 && clamped[1] > 0, "{clamped:?}");
-    // The folder of checkpoints and the file are the same model.
+    // The folder of checkpoints and the file open as the same model.
     for name in ["result/ckpts", "result/ckpts/ckpt_59999.pt"] {
-        assert_eq!(states(&*open(&place.path(name)).unwrap()), states(&*model));
+        assert_eq!(states(&*open(&folder.path(name)).unwrap()), states(&*model));
     }
 }
 
 #[test]
-fn what_is_left_has_its_rows_in_splats_and_optimizers() {
-    let place = Place::put(&splats());
-    let model = open(&place.path("result")).unwrap();
-    let result = place.written(&*model, &CompressedModel::pruned(vec![0, 3], &rule()));
+fn kept_rows_stay_in_splats_and_optimizers() {
+    let folder = ResultFolder::put(&splats());
+    let model = open(&folder.path("result")).unwrap();
+    let result = folder.written(&*model, &CompressedModel::pruned(vec![0, 3], &rule()));
     let left = open(&result).unwrap();
     states(&*left).iter().zip(states(&*model)).for_each(|(left, whole)| assert_eq!(*left, whole.pick(&[0, 3])));
-    let [before, after] = [place.path("result"), result]
+    let [before, after] = [folder.path("result"), result]
         .map(|root| Checkpoint::open(&root.join("ckpts/ckpt_59999.pt"), ReadLimit::NONE).unwrap());
     let shapes: Vec<Vec<usize>> = after.tensors().map(|tensor| tensor.shape).collect();
-    // Nine of each kind; the steps have no rows.
+    // Nine tensors each of parameters, steps and two averages; only the steps have no rows.
     assert_eq!(shapes.len(), 36);
     assert_eq!(shapes.iter().filter(|shape| shape.first() == Some(&2)).count(), 27);
     assert_eq!(before.storage("20").unwrap(), after.storage("20").unwrap());
@@ -147,25 +148,25 @@ fn what_is_left_has_its_rows_in_splats_and_optimizers() {
 }
 
 #[test]
-fn a_proxy_moves_as_the_mean_of_its_members() {
+fn proxy_moves_as_the_mean_of_its_members() {
     let mut made = splats();
-    // Long lives, and the two that merge lie and go nearly alike.
+    // Long windows, and two members with nearly the same position and velocity.
     made[7].2.fill(-0.5);
     made[6].2.fill(0.5);
-    // Faint ones, whose sum no pixel is full of.
+    // Low opacities, so that their sum does not saturate.
     made[3].2.fill(-3.0);
     for k in [0, 1, 8] {
         (0..3).for_each(|c| made[k].2[6 + c] = made[k].2[c] + 0.01 * (c as f32 + 1.0));
     }
-    let place = Place::put(&made);
-    let model = open(&place.path("result")).unwrap();
+    let folder = ResultFolder::put(&made);
+    let model = open(&folder.path("result")).unwrap();
     let cluster = Cluster { output: 0, leader: 0, members: vec![(0, 0.25), (2, 0.75)] };
     let reference = Reference { frame: 2, extent: 10.0 };
     let proxies = model.solve(std::slice::from_ref(&cluster), reference, &rule()).unwrap();
     assert!(proxies.deviation.is_some_and(|deviation| deviation < 1e-6), "{proxies:?}");
     let pruned = CompressedModel::pruned(vec![0, 1], &rule());
     let reduction = CompressedModel { clusters: vec![cluster], proxies, ..pruned };
-    let left = open(&place.written(&*model, &reduction)).unwrap();
+    let left = open(&folder.written(&*model, &reduction)).unwrap();
     for (left, whole) in states(&*left).iter().zip(states(&*model)) {
         let [a, b] = [0, 2].map(|row| whole.position.row::<3>(row));
         let got = left.position.row::<3>(0);
@@ -175,44 +176,44 @@ fn a_proxy_moves_as_the_mean_of_its_members() {
 }
 
 #[test]
-fn without_velocities_it_is_static_and_of_any_degree() {
+fn model_without_velocities_is_static_with_any_sh_degree() {
     let mut made = splats();
     made.truncate(6);
     made[5].1 = vec![3, 3];
     made[5].2.truncate(9 * COUNT);
-    let place = Place::put(&made);
-    let model = models::open(&place.path("result"), &OpenOptions::default()).unwrap();
+    let folder = ResultFolder::put(&made);
+    let model = models::open(&folder.path("result"), &OpenOptions::default()).unwrap();
     assert_eq!((model.kind(), model.source().info().sh_degree), ("gsplat checkpoint", 1));
     let whole = gather_all(model.source(), 0, Columns::all()).unwrap();
-    let result = place.written(&*model, &CompressedModel::pruned(vec![1, 2], &rule()));
+    let result = folder.written(&*model, &CompressedModel::pruned(vec![1, 2], &rule()));
     let left = models::open(&result, &OpenOptions::default()).unwrap();
     assert_eq!(gather_all(left.source(), 0, Columns::all()).unwrap(), whole.pick(&[1, 2]));
 }
 
 #[test]
-fn what_is_wrong_is_named() {
-    let said = |change: &dyn Fn(&mut Splats)| {
+fn errors_name_the_tensor_and_the_problem() {
+    let error_message = |change: &dyn Fn(&mut Splats)| {
         let mut made = splats();
         change(&mut made);
-        open(&Place::put(&made).path("result")).err().expect("must be refused").to_string()
+        open(&ResultFolder::put(&made).path("result")).err().expect("must be refused").to_string()
     };
     for name in ["accels", "jerks"] {
-        let message = said(&|splats| splats.push((name, vec![3], noise(3 * COUNT, 0.0))));
+        let message = error_message(&|splats| splats.push((name, vec![3], noise(3 * COUNT, 0.0))));
         assert!(message.contains(name) && message.contains("frame stream"), "{message}");
     }
-    let message = said(&|splats| splats[1].1 = vec![1, 3]);
+    let message = error_message(&|splats| splats[1].1 = vec![1, 3]);
     assert!(
         message.contains("splats[\"scales\"]") && message.contains("[5, 3]") && message.contains("[5, 1, 3]"),
         "{message}"
     );
-    let message = said(&|splats| drop(splats.remove(2)));
+    let message = error_message(&|splats| drop(splats.remove(2)));
     assert!(message.contains("splats[\"quats\"]") && message.contains("means, scales"), "{message}");
-    let message = said(&|splats| splats[8].2[4] = f32::INFINITY);
+    let message = error_message(&|splats| splats[8].2[4] = f32::INFINITY);
     assert!(message.contains("splats[\"velocities\"]") && message.contains("inf in row 1"), "{message}");
-    let place = Place::put(&splats());
-    let path = place.path("result/ckpts/ckpt_59999.pt");
-    fs::write(place.path("result/ckpts/ckpt_59999_rank1.pt"), "").unwrap();
-    fs::rename(&path, place.path("result/ckpts/ckpt_59999_rank0.pt")).unwrap();
-    let message = open(&place.path("result")).err().unwrap().to_string();
+    let folder = ResultFolder::put(&splats());
+    let path = folder.path("result/ckpts/ckpt_59999.pt");
+    fs::write(folder.path("result/ckpts/ckpt_59999_rank1.pt"), "").unwrap();
+    fs::rename(&path, folder.path("result/ckpts/ckpt_59999_rank0.pt")).unwrap();
+    let message = open(&folder.path("result")).err().unwrap().to_string();
     assert!(message.contains("ranks"), "{message}");
 }

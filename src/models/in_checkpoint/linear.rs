@@ -1,9 +1,9 @@
 //! Proxies of Gaussians that move along straight lines and fade with the distance in time.
 //!
-//! Paths blend exactly: members re-centered to the proxy's time, then their weighted means, so that the proxy is at the weighted
-//! mean of its members at every time. Windows blend by their moments; each counts by its weight and by how long it lasts. Shape
-//! and opacity follow from the moment matches of the members at frames (least squares). Source: method.md, section 5.6, for
-//! the match at a frame.
+//! Paths are blended exactly: members are re-centered to the proxy's time and averaged by weight, so that the proxy is
+//! at the weighted mean of its members at every time. Windows are blended by their moments, each with its weight times
+//! its duration. Shape and opacity are fitted to the moment matches of the members at sampled frames (least squares).
+//! Source: method.md, section 5.6, for the match at a frame.
 
 use crate::compressed_model::Cluster;
 use crate::error::Result;
@@ -13,32 +13,39 @@ use crate::passes::{BLOCK, gather_all};
 use crate::recipe::MergeParams;
 use crate::source::FrameSource;
 
-/// Most frames at which proxies are matched.
+/// Maximum number of frames at which proxies are matched.
 const SAMPLED_FRAMES: usize = 48;
-/// Where less than this is left of a proxy nothing is matched.
-const SEEN: f64 = 1e-4;
-/// Opacities of proxies lie between these: their logits stay small.
-const OPACITIES: [f64; 2] = [1e-3, 1.0 - 1e-4];
+/// Minimum opacity times window of a proxy at a frame that is used for matching.
+const MIN_VISIBLE: f64 = 1e-4;
+/// Range of proxy opacities, which bounds their logits.
+const OPACITY_RANGE: [f64; 2] = [1e-3, 1.0 - 1e-4];
 
-/// A straight path with a window: x(t) = position + velocity·(t − center), exp(−½((t − center)/deviation)²).
+/// Straight path with a Gaussian window: x(t) = position + velocity·(t − center), window exp(−½((t −
+/// center)/deviation)²).
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(in crate::models) struct LinearPath {
+    /// Position at the center, scene units.
     pub(in crate::models) position: [f64; 3],
+    /// Velocity, scene units per unit of time.
     pub(in crate::models) velocity: [f64; 3],
+    /// Center of the window in time.
     pub(in crate::models) center: f64,
+    /// Standard deviation of the window in time.
     pub(in crate::models) deviation: f64,
 }
 
 impl LinearPath {
-    /// What stands for `members`, each with a weight; they sum to 1.
+    /// Returns the weighted blend of `members`, whose weights sum to 1.
     pub(in crate::models) fn blended(members: &[(f64, LinearPath)]) -> LinearPath {
-        let lasting: f64 = members.iter().map(|(weight, line)| weight * line.deviation).sum();
-        let mean = |of: &dyn Fn(&LinearPath) -> f64| {
-            members.iter().map(|(weight, line)| weight * line.deviation / lasting * of(line)).sum::<f64>()
+        let total_duration: f64 = members.iter().map(|(weight, line)| weight * line.deviation).sum();
+        let mean = |value_of: &dyn Fn(&LinearPath) -> f64| {
+            members.iter().map(|(weight, line)| weight * line.deviation / total_duration * value_of(line)).sum::<f64>()
         };
         let center = mean(&|line| line.center);
         let variance = mean(&|line| line.deviation.powi(2) + (line.center - center).powi(2));
-        let sum = |of: &dyn Fn(&LinearPath) -> f64| members.iter().map(|(weight, line)| weight * of(line)).sum::<f64>();
+        let sum = |value_of: &dyn Fn(&LinearPath) -> f64| {
+            members.iter().map(|(weight, line)| weight * value_of(line)).sum::<f64>()
+        };
         LinearPath {
             position: [0, 1, 2].map(|c| sum(&|line| line.position[c] + line.velocity[c] * (center - line.center))),
             velocity: [0, 1, 2].map(|c| sum(&|line| line.velocity[c])),
@@ -48,40 +55,45 @@ impl LinearPath {
     }
 }
 
-/// A proxy as its members are over frames.
+/// Result of matching a proxy to its members over the sampled frames.
 #[derive(Debug, Clone)]
 pub(in crate::models) struct Matched {
+    /// Blended path and window.
     pub(in crate::models) line: LinearPath,
-    /// Opacity at the center of its window, as a logit, and covariance (xx xy xz yy yz zz); none where no frame shows it.
-    pub(in crate::models) seen: Option<(f32, [f64; 6])>,
+    /// Opacity logit at the center of the window, and covariance (xx xy xz yy yz zz); `None` if the proxy is visible at
+    /// no sampled frame.
+    pub(in crate::models) shape: Option<(f32, [f64; 6])>,
 }
 
-/// A proxy at a frame, as its members are there.
+/// Moment match of a proxy's members at one frame.
 pub(in crate::models) struct ProxyAtFrame<'a> {
-    /// Which proxy.
+    /// Number of the proxy.
     pub(in crate::models) proxy: usize,
+    /// Path and window of the proxy.
     pub(in crate::models) line: &'a LinearPath,
+    /// Time of the frame.
     pub(in crate::models) time: f64,
-    /// How much the frame counts.
+    /// Weight of the frame: window times opacity.
     pub(in crate::models) weight: f64,
+    /// States of the moment matches of a block of proxies.
     pub(in crate::models) state: &'a Gaussians,
-    /// Its row there.
+    /// Row of this proxy in `state`.
     pub(in crate::models) row: usize,
 }
 
-/// The proxies of `clusters`, whose members have the lines `line_of` and windows that let `fades` through. Every frame at
-/// which one is seen is shown to `see`, with the columns `wanted`.
+/// Matches the proxies of `clusters` to their members. `line_of` returns the path of a member, `window` the window of a
+/// path at a time. Calls `visit` for every sampled frame at which a proxy is visible, with the columns `wanted`.
 ///
 /// # Errors
-/// Frames that cannot be evaluated.
-pub(in crate::models) fn match_all(
+/// Fails if frames cannot be evaluated.
+pub(in crate::models) fn match_proxies(
     source: &dyn FrameSource,
     clusters: &[Cluster],
     rule: &MergeParams,
     line_of: impl Fn(u32) -> LinearPath,
-    fades: impl Fn(&LinearPath, f64) -> f64,
+    window: impl Fn(&LinearPath, f64) -> f64,
     wanted: Columns,
-    mut see: impl FnMut(ProxyAtFrame<'_>),
+    mut visit: impl FnMut(ProxyAtFrame<'_>),
 ) -> Result<Vec<Matched>> {
     let times = &source.info().times;
     let sampled = times.len().min(SAMPLED_FRAMES);
@@ -100,47 +112,50 @@ pub(in crate::models) fn match_all(
         for &frame in &frames {
             let (time, state) = (times[frame], gather_all(&merged, frame, wanted)?);
             for (row, (line, sums)) in lines.iter().zip(&mut sums).enumerate() {
-                let (m, alpha) = (fades(line, time), opacity(state.opacity_logit.row::<1>(row)[0]));
+                let (m, alpha) = (window(line, time), opacity(state.opacity_logit.row::<1>(row)[0]));
                 let weight = m * alpha;
-                if weight > SEEN {
+                if weight > MIN_VISIBLE {
                     sums.add(m, alpha, &state, row);
-                    see(ProxyAtFrame { proxy: first + row, line, time, weight, state: &state, row });
+                    visit(ProxyAtFrame { proxy: first + row, line, time, weight, state: &state, row });
                 }
             }
         }
-        matched.extend(lines.iter().zip(&sums).map(|(&line, sums)| Matched { line, seen: sums.mean() }));
+        matched.extend(lines.iter().zip(&sums).map(|(&line, sums)| Matched { line, shape: sums.mean() }));
     }
     Ok(matched)
 }
 
-/// Sums over frames.
+/// Sums over frames for one proxy, with m the window and α the opacity.
 #[derive(Debug, Clone, Default)]
 struct FrameSums {
-    /// Σ m·α and Σ m².
+    /// Σ m·α.
     product: f64,
+    /// Σ m².
     square: f64,
-    /// Σ of covariances, each by m·α.
+    /// Sum of the covariances, each weighted by m·α.
     covariance: [f64; 6],
 }
 
 impl FrameSums {
+    /// Adds a frame.
     fn add(&mut self, m: f64, alpha: f64, state: &Gaussians, row: usize) {
         self.product += m * alpha;
         self.square += m * m;
         let scales = state.log_scale.row::<3>(row).map(|x| f64::from(x).exp());
-        let of = covariance(scales, state.rotation.row::<4>(row).map(f64::from));
-        self.covariance.iter_mut().zip(of).for_each(|(sum, of)| *sum += m * alpha * of);
+        let values = covariance(scales, state.rotation.row::<4>(row).map(f64::from));
+        self.covariance.iter_mut().zip(values).for_each(|(sum, value)| *sum += m * alpha * value);
     }
 
-    /// Opacity and covariance.
+    /// Returns the opacity logit and the mean covariance; `None` without visible frames.
     fn mean(&self) -> Option<(f32, [f64; 6])> {
-        let visible = (self.product / self.square).clamp(OPACITIES[0], OPACITIES[1]);
+        let visible = (self.product / self.square).clamp(OPACITY_RANGE[0], OPACITY_RANGE[1]);
         let found = (logit(visible) as f32, self.covariance.map(|sum| sum / self.product));
         (self.product > 0.0).then_some(found)
     }
 }
 
-/// R diag(s)² Rᵀ, xx xy xz yy yz zz, of a quaternion wxyz of any length but 0, which counts as the identity.
+/// Returns R diag(s)² Rᵀ as xx xy xz yy yz zz. The quaternion wxyz may have any length; length 0 counts as the
+/// identity.
 pub(in crate::models) fn covariance(scales: [f64; 3], quaternion: [f64; 4]) -> [f64; 6] {
     let length = quaternion.iter().map(|x| x * x).sum::<f64>().sqrt();
     let [w, x, y, z] = if length > 0.0 { quaternion.map(|c| c / length) } else { [1.0, 0.0, 0.0, 0.0] };
@@ -158,7 +173,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_blended_path_is_the_weighted_mean_of_its_members_at_every_time() {
+    fn blended_path_is_the_weighted_mean_at_every_time() {
         let line = |k: f64| LinearPath {
             position: [k, 1.0 - k * k, 0.3],
             velocity: [0.2 * k, -1.0 / (1.0 + k), 5.0],
@@ -175,7 +190,7 @@ mod tests {
                 assert!((at(&blended) - mean).abs() < 1e-12, "{time} {c}: {} {mean}", at(&blended));
             }
         }
-        // One alone, and one beside its like, are themselves.
+        // A single member, or equal members, are returned unchanged.
         assert_eq!(LinearPath::blended(&[(1.0, line(2.0))]), line(2.0));
         let twice = LinearPath::blended(&[(0.25, line(2.0)), (0.75, line(2.0))]);
         assert!((twice.deviation - line(2.0).deviation).abs() < 1e-15 && (twice.center - 0.2).abs() < 1e-15);

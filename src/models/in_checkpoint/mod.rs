@@ -1,6 +1,6 @@
-//! Models whose Gaussians are rows of a checkpoint's tensors: what their families share.
+//! Models whose Gaussians are rows of the tensors of a checkpoint: shared by several formats.
 //!
-//! A result is the same checkpoint with fewer rows, and the small files that lay beside it.
+//! The output is the same checkpoint with fewer rows, and copies of the small files beside it.
 
 pub(super) mod linear;
 mod rows;
@@ -28,26 +28,26 @@ use crate::outputs::kind::OutputKind;
 use crate::progress::Events;
 use crate::recipe::MergeParams;
 use crate::source::FrameSource;
-pub(super) use rows::{Reading, RowElement, RowTensors, count_of};
+pub(super) use rows::{CheckpointReader, RowElement, RowTensors, row_count};
 
-/// Most bytes of a file beside the checkpoint that a result has too.
-const SMALL: u64 = 1 << 20;
+/// Maximum bytes of a file beside the checkpoint that is copied to the output.
+const MAX_COPIED_BYTES: u64 = 1 << 20;
 
-/// A law by which several Gaussians become one.
+/// Motion model that can compute the raw parameters of proxies.
 pub(super) trait ProxyRule: MotionModel {
-    /// Raw parameters of the proxies of `clusters`, before they are held to what their members do.
+    /// Returns the raw parameters of the proxies of `clusters`, before they are checked against their members.
     ///
     /// # Errors
-    /// Frames that cannot be evaluated.
-    fn proposed(model: &MotionModelFrames<Self>, clusters: &[Cluster], rule: &MergeParams) -> Result<Raw>
+    /// Fails if frames cannot be evaluated.
+    fn propose(model: &MotionModelFrames<Self>, clusters: &[Cluster], rule: &MergeParams) -> Result<Raw>
     where
         Self: Sized;
 
-    /// Adds to `hash` what states follow from that the file does not say.
-    fn follow(&self, hash: &mut Xxh3);
+    /// Adds to `hash` the settings that determine frame states but are not in the file.
+    fn hash_settings(&self, hash: &mut Xxh3);
 
-    /// The law for frames at `times`, if it depends on them.
-    fn at(&self, times: &[f64]) -> Option<Self>
+    /// Returns the motion model for frames at `times` if it depends on them.
+    fn for_times(&self, times: &[f64]) -> Option<Self>
     where
         Self: Sized,
     {
@@ -55,82 +55,90 @@ pub(super) trait ProxyRule: MotionModel {
         None
     }
 
-    /// Things a person should know of it.
+    /// Returns notes for the user.
     fn notes(&self) -> Vec<String> {
         Vec::new()
     }
 
-    /// How long it lasts in its own time.
+    /// Returns the duration of the model in its own time unit.
     fn span(&self) -> f64 {
         1.0
     }
 }
 
-/// What is known of a model beside its Gaussians.
+/// Description of a model other than its Gaussians.
 #[derive(Debug, Default)]
-pub(super) struct About {
-    /// What it is, for people.
+pub(super) struct ModelDescription {
+    /// Name of the model format, shown to users.
     pub(super) kind: &'static str,
-    /// The folder that was given; none: the file itself was.
+    /// Folder that the user gave; `None` if the user gave the file.
     pub(super) root: Option<PathBuf>,
-    /// The checkpoint.
+    /// Path of the checkpoint.
     pub(super) file: PathBuf,
-    /// Things a person should know.
+    /// Notes for the user.
     pub(super) notes: Vec<String>,
+    /// Folder of the training data.
     pub(super) data_folder: Option<String>,
+    /// Whether the training background is white.
     pub(super) white_background: bool,
-    /// Seconds of one processor that a state takes (`benches/families.rs`).
+    /// CPU seconds on one core to read one state (`benches/families.rs`).
     pub(super) seconds_per_state: f64,
 }
 
-/// A model in a checkpoint.
+/// Open model whose Gaussians are rows of the tensors of a checkpoint.
 #[derive(Debug)]
-pub(super) struct InCheckpoint<L: MotionModel> {
-    table: RowTensors,
+pub(super) struct CheckpointModel<L: MotionModel> {
+    tensors: RowTensors,
     model: MotionModelFrames<L>,
-    about: About,
+    description: ModelDescription,
 }
 
-impl<L: ProxyRule> InCheckpoint<L> {
-    /// What was read, whose states follow by `law`.
-    pub(super) fn new(reading: Reading, law: L, about: About) -> Result<InCheckpoint<L>> {
-        let sh_degree = reading.raw.gaussians.sh_degree();
-        let model = MotionModelFrames::new(law, reading.raw, sh_degree);
-        let is_still = model.law().varying().is_empty();
+impl<L: ProxyRule> CheckpointModel<L> {
+    /// Creates a model from the read parameters. Its states are computed by `motion_model`. A model that does not vary with time
+    /// gets one frame at time 0.
+    pub(super) fn new(
+        reader: CheckpointReader,
+        motion_model: L,
+        description: ModelDescription,
+    ) -> Result<CheckpointModel<L>> {
+        let sh_degree = reader.raw.gaussians.sh_degree();
+        let model = MotionModelFrames::new(motion_model, reader.raw, sh_degree);
+        let is_still = model.motion_model().varying().is_empty();
         let model = if is_still { model.with_times(vec![0.0])? } else { model };
-        Ok(InCheckpoint { table: reading.table, model, about })
+        Ok(CheckpointModel { tensors: reader.tensors, model, description })
     }
 
-    /// Files that a result has too, from the root.
-    fn beside(&self) -> Vec<PathBuf> {
+    /// Returns the files of the model folder that are copied to the output.
+    fn copied_files(&self) -> Vec<PathBuf> {
         const NAMES: [&str; 2] = ["cfg_args", "cameras.json"];
-        let Some(root) = &self.about.root else { return Vec::new() };
+        let Some(root) = &self.description.root else { return Vec::new() };
         let named = NAMES.iter().map(|name| root.join(name)).filter(|path| is_small(path));
-        let mut found: Vec<PathBuf> = named.chain(texts_in(root)).collect();
+        let mut found: Vec<PathBuf> = named.chain(yaml_files_in(root)).collect();
         found.sort();
         found
     }
 
-    /// Where in a result the checkpoint is.
-    fn place(&self) -> PathBuf {
-        let root = self.about.root.as_deref().or(self.about.file.parent()).unwrap_or(Path::new(""));
-        self.about.file.strip_prefix(root).unwrap_or(&self.about.file).to_owned()
+    /// Returns the path of the checkpoint relative to the output folder.
+    fn relative_path(&self) -> PathBuf {
+        let root = self.description.root.as_deref().or(self.description.file.parent()).unwrap_or(Path::new(""));
+        self.description.file.strip_prefix(root).unwrap_or(&self.description.file).to_owned()
     }
 
+    /// Writes the compressed checkpoint and copies the files beside it.
     fn write_model(&self, reduction: &CompressedModel, path: &Path) -> Result<()> {
-        for file in self.beside() {
+        for file in self.copied_files() {
             copy(&file, &path.join(file.file_name().unwrap_or_default()))?;
         }
-        let to = path.join(self.place());
+        let to = path.join(self.relative_path());
         let folder = to.parent().unwrap_or(path);
         fs::create_dir_all(folder).map_err(Error::io("create", folder))?;
-        self.table.write(self.model.raw(), &motion_model::left(self.model.raw(), reduction), reduction, &to)
+        self.tensors.write(self.model.raw(), &motion_model::compressed_raw(self.model.raw(), reduction), reduction, &to)
     }
 }
 
-impl<L: ProxyRule + 'static> InputModel for InCheckpoint<L> {
+impl<L: ProxyRule + 'static> InputModel for CheckpointModel<L> {
     fn kind(&self) -> &'static str {
-        self.about.kind
+        self.description.kind
     }
 
     fn source(&self) -> &dyn FrameSource {
@@ -139,8 +147,8 @@ impl<L: ProxyRule + 'static> InputModel for InCheckpoint<L> {
 
     fn digest(&self) -> Result<String> {
         let mut hash = Xxh3::new();
-        hash_file(&self.about.file, &mut hash)?;
-        self.model.law().follow(&mut hash);
+        hash_file(&self.description.file, &mut hash)?;
+        self.model.motion_model().hash_settings(&mut hash);
         Ok(format!("{:032x}", hash.digest128()))
     }
 
@@ -149,14 +157,14 @@ impl<L: ProxyRule + 'static> InputModel for InCheckpoint<L> {
     }
 
     fn size(&self) -> Result<Size> {
-        let rest = bytes_of(self.beside().iter().map(PathBuf::as_path))?;
-        Ok(Size { cloud: bytes_of([&*self.about.file])?, rest, ..Size::default() })
+        let rest = bytes_of(self.copied_files().iter().map(PathBuf::as_path))?;
+        Ok(Size { cloud: bytes_of([&*self.description.file])?, rest, ..Size::default() })
     }
 
     fn size_written(&self, kind: OutputKind, path: &Path) -> Result<Size> {
         match kind {
             OutputKind::Model => {
-                let cloud = bytes_of([&*path.join(self.place())])?;
+                let cloud = bytes_of([&*path.join(self.relative_path())])?;
                 Ok(Size { cloud, rest: bytes_below(path)?.saturating_sub(cloud), ..Size::default() })
             }
             _ => Ok(Size::of_frames(bytes_below(path)?)),
@@ -168,25 +176,25 @@ impl<L: ProxyRule + 'static> InputModel for InCheckpoint<L> {
         let whole = state_bytes(raw.gaussians.sh_degree(), Columns::all()) + 4 * raw.own.width() as u64;
         MemoryProfile {
             per_gaussian: whole,
-            // The widest tensor, as it is stored and as f32.
+            // The widest tensor, as stored and as f32.
             opening: 2 * whole,
-            // The parameters again, and what is prepared of them.
+            // A copy of the parameters with the prepared values.
             reader: whole + 128,
             reduced: 2 * whole,
             jacobian: Jacobian::BYTES_PER_GAUSSIAN as u64,
-            // Training keeps two values more for each.
+            // Training stores two optimizer values per parameter.
             file: 3 * whole,
             fixed: 0,
             frame_block: 0,
             gaussian_block: GAUSSIAN_BLOCK as u64,
             columns: 0,
-            seconds_per_state: self.about.seconds_per_state,
+            seconds_per_state: self.description.seconds_per_state,
             decoded: 0,
         }
     }
 
     fn timing(&self) -> Timing {
-        if self.model.law().varying().is_empty() { Timing::Numbered } else { Timing::Continuous }
+        if self.model.motion_model().varying().is_empty() { Timing::Numbered } else { Timing::Continuous }
     }
 
     fn clock(&self) -> Clock {
@@ -194,32 +202,32 @@ impl<L: ProxyRule + 'static> InputModel for InCheckpoint<L> {
     }
 
     fn span(&self) -> f64 {
-        self.model.law().span()
+        self.model.motion_model().span()
     }
 
     fn with_times(self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn InputModel>> {
-        let InCheckpoint { table, model, about } = *self;
+        let CheckpointModel { tensors, model, description } = *self;
         let found = model.info().times.len();
-        if !model.info().times.is_empty() && model.law().varying().is_empty() && times.len() != found {
+        if !model.info().times.is_empty() && model.motion_model().varying().is_empty() && times.len() != found {
             return Err(Error::usage(format!("{} times were given for {found} frames", times.len())));
         }
-        let model = match model.law().at(&times) {
-            Some(law) => MotionModelFrames::new(law, model.raw().clone(), model.info().sh_degree),
+        let model = match model.motion_model().for_times(&times) {
+            Some(motion_model) => MotionModelFrames::new(motion_model, model.raw().clone(), model.info().sh_degree),
             None => model,
         };
-        Ok(Box::new(InCheckpoint { table, model: model.with_times(times)?, about }))
+        Ok(Box::new(CheckpointModel { tensors, model: model.with_times(times)?, description }))
     }
 
     fn notes(&self) -> Vec<String> {
-        self.about.notes.iter().cloned().chain(self.model.law().notes()).collect()
+        self.description.notes.iter().cloned().chain(self.model.motion_model().notes()).collect()
     }
 
     fn data_folder(&self) -> Option<&str> {
-        self.about.data_folder.as_deref()
+        self.description.data_folder.as_deref()
     }
 
     fn background(&self) -> Option<[f32; 3]> {
-        self.about.white_background.then_some([1.0; 3])
+        self.description.white_background.then_some([1.0; 3])
     }
 
     fn own_output(&self) -> OutputKind {
@@ -234,11 +242,11 @@ impl<L: ProxyRule + 'static> InputModel for InCheckpoint<L> {
     }
 
     fn needs_all_bands(&self) -> Option<&'static str> {
-        Some("the checkpoint's own loaders expect them")
+        Some("loaders of the checkpoint expect coefficients of every degree")
     }
 
     fn solve(&self, clusters: &[Cluster], reference: Reference, rule: &MergeParams) -> Result<Proxies> {
-        motion_model::solve(&self.model, clusters, reference, rule, |clusters| L::proposed(&self.model, clusters, rule))
+        motion_model::solve(&self.model, clusters, reference, rule, |clusters| L::propose(&self.model, clusters, rule))
     }
 
     fn reduced<'a>(&'a self, reduction: &'a CompressedModel) -> Result<Box<dyn FrameSource + 'a>> {
@@ -260,23 +268,24 @@ impl<L: ProxyRule + 'static> InputModel for InCheckpoint<L> {
     }
 }
 
+/// Returns whether `path` is a file of at most [`MAX_COPIED_BYTES`] bytes.
 fn is_small(path: &Path) -> bool {
-    fs::metadata(path).is_ok_and(|found| found.is_file() && found.len() <= SMALL)
+    fs::metadata(path).is_ok_and(|found| found.is_file() && found.len() <= MAX_COPIED_BYTES)
 }
 
-/// Small YAML files of a folder, by name.
-pub(super) fn texts_in(root: &Path) -> Vec<PathBuf> {
-    let is_one = |path: &Path| {
+/// Returns the small YAML files in a folder, sorted by name.
+pub(super) fn yaml_files_in(root: &Path) -> Vec<PathBuf> {
+    let is_small_yaml = |path: &Path| {
         path.extension().is_some_and(|found| ["yaml", "yml"].iter().any(|ending| found == *ending)) && is_small(path)
     };
     let entries = fs::read_dir(root).into_iter().flatten().flatten();
-    let mut found: Vec<PathBuf> = entries.map(|entry| entry.path()).filter(|path| is_one(path)).collect();
+    let mut found: Vec<PathBuf> = entries.map(|entry| entry.path()).filter(|path| is_small_yaml(path)).collect();
     found.sort();
     found
 }
 
-/// The files of a folder called `<prefix><number><suffix>`, by number.
-pub(super) fn numbered(folder: &Path, prefix: &str, suffix: &str) -> Vec<(u32, PathBuf)> {
+/// Returns the files of a folder named `<prefix><number><suffix>`, sorted by number.
+pub(super) fn numbered_files(folder: &Path, prefix: &str, suffix: &str) -> Vec<(u32, PathBuf)> {
     let entries = fs::read_dir(folder).into_iter().flatten().flatten();
     let number = |name: &str| name.strip_prefix(prefix)?.strip_suffix(suffix)?.parse::<u32>().ok();
     let mut found: Vec<(u32, PathBuf)> =

@@ -1,7 +1,7 @@
-//! Gaussians as rows of a checkpoint's tensors.
+//! Gaussians as rows of the tensors of a checkpoint.
 //!
-//! In: an open checkpoint, and which of its tensors hold what. Out: raw parameters; and the checkpoint with fewer rows. Memory:
-//! the raw parameters, and one tensor at a time.
+//! Input: an open checkpoint and the meaning of its tensors. Output: raw parameters, and the checkpoint with fewer
+//! rows. Memory: the raw parameters, and one tensor at a time.
 
 use std::path::Path;
 
@@ -12,28 +12,29 @@ use crate::files::checkpoint::{Checkpoint, NodeId, TensorView};
 use crate::model::{Column, Columns, Gaussians, Raw};
 use crate::models::trajectories::state_bytes;
 
-/// What an element of a tensor's row is.
+/// Meaning of one element of a tensor's row.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(in crate::models) enum RowElement {
-    /// A plane of a column.
+    /// Plane of an attribute column.
     Of(Columns, usize),
-    /// A plane of [`Raw::own`].
+    /// Plane of [`Raw::own`].
     Own(usize),
-    /// Nothing that a state follows from.
+    /// Value that frame states do not depend on.
     Unread,
 }
 
 impl RowElement {
-    /// All planes of a column but the first `skipped`, so many.
+    /// Returns `count` consecutive planes of a column, after the first `skipped`.
     pub(in crate::models) fn all_of(column: Columns, skipped: usize, count: usize) -> Vec<RowElement> {
         (skipped..skipped + count).map(|c| RowElement::Of(column, c)).collect()
     }
 
-    /// So many planes of one's own, from `first` on.
+    /// Returns `count` consecutive planes of [`Raw::own`], from `first` on.
     pub(in crate::models) fn own(first: usize, count: usize) -> Vec<RowElement> {
         (first..first + count).map(RowElement::Own).collect()
     }
 
+    /// Returns the plane of `raw` that holds this element; `None` for values that are not read.
     fn get(self, raw: &Raw) -> Option<&[f32]> {
         match self {
             RowElement::Of(column, c) => Some(raw.gaussians.column(column).plane(c)),
@@ -43,53 +44,60 @@ impl RowElement {
     }
 }
 
-/// A tensor whose rows are read.
+/// Tensor whose rows are parameters of Gaussians.
 #[derive(Debug)]
 struct Param {
     name: String,
     tensor: TensorView,
-    /// What the elements of a row are.
+    /// Meaning of the elements of a row.
     planes: Vec<RowElement>,
 }
 
-/// Which tensors of a checkpoint have a row per Gaussian.
+/// Tensors of a checkpoint that have one row per Gaussian.
 #[derive(Debug)]
 pub(in crate::models) struct RowTensors {
     checkpoint: Checkpoint,
+    /// Number of Gaussians.
     count: usize,
     params: Vec<Param>,
-    /// Those that only training reads.
-    beside: Vec<TensorView>,
+    /// Tensors that only training reads.
+    training_only: Vec<TensorView>,
 }
 
-/// A checkpoint that is being read.
+/// Checkpoint that is being read.
 #[derive(Debug)]
-pub(in crate::models) struct Reading {
-    pub(in crate::models) table: RowTensors,
+pub(in crate::models) struct CheckpointReader {
+    /// Tensors read so far.
+    pub(in crate::models) tensors: RowTensors,
+    /// Parameters read so far.
     pub(in crate::models) raw: Raw,
 }
 
-impl Reading {
-    /// Makes room for `count` Gaussians with `own` planes beside the usual columns; all values are zero.
+impl CheckpointReader {
+    /// Allocates `count` Gaussians with `own` format-specific planes, all values zero.
     ///
     /// # Errors
-    /// More memory than allowed.
+    /// Fails if this needs more memory than allowed.
     pub(in crate::models) fn new(
         checkpoint: Checkpoint,
         count: usize,
         sh_degree: usize,
         own: usize,
-    ) -> Result<Reading> {
+    ) -> Result<CheckpointReader> {
         let row = state_bytes(sh_degree, Columns::all()) + 4 * own as u64;
         checkpoint.allow("", &format!("its {count} Gaussians"), row.saturating_mul(count as u64))?;
         let raw = Raw { gaussians: Gaussians::zeros(count, sh_degree), own: Column::zeros(own, count) };
-        Ok(Reading { table: RowTensors { checkpoint, count, params: Vec::new(), beside: Vec::new() }, raw })
+        Ok(CheckpointReader {
+            tensors: RowTensors { checkpoint, count, params: Vec::new(), training_only: Vec::new() },
+            raw,
+        })
     }
 
-    /// Reads the tensor at `id`, called `name`, whose rows have the shape `row` and are `planes`.
+    /// Reads the tensor at `id`. `name` is its name in messages, `row` the expected shape of a row, `planes` the
+    /// meaning of its elements.
     ///
     /// # Errors
-    /// No tensor of floating-point numbers of that shape; values that are not there or not finite.
+    /// Fails if there is no floating-point tensor of that shape, or if values are missing or not finite.
     pub(in crate::models) fn read(
         &mut self,
         id: NodeId,
@@ -97,9 +105,9 @@ impl Reading {
         row: &[usize],
         planes: Vec<RowElement>,
     ) -> Result<()> {
-        let checkpoint = &self.table.checkpoint;
+        let checkpoint = &self.tensors.checkpoint;
         let tensor = checkpoint.float_tensor(id, name)?;
-        let shape = [&[self.table.count], row].concat();
+        let shape = [&[self.tensors.count], row].concat();
         if tensor.shape != shape {
             return Err(checkpoint.wrong(name, format!("shape {shape:?}"), format!("shape {:?}", tensor.shape)));
         }
@@ -113,45 +121,50 @@ impl Reading {
             };
             to.iter_mut().zip(values.iter().skip(c).step_by(width)).for_each(|(to, from)| *to = *from);
         }
-        self.table.params.push(Param { name: name.to_owned(), tensor, planes });
+        self.tensors.params.push(Param { name: name.to_owned(), tensor, planes });
         Ok(())
     }
 
-    /// Counts the tensor at `id`, if it is one with a row per Gaussian, among those that only training reads.
-    pub(in crate::models) fn beside(&mut self, id: NodeId) {
-        let tensor = self.table.checkpoint.tensor(id).filter(|tensor| tensor.shape.first() == Some(&self.table.count));
-        self.table.beside.extend(tensor);
+    /// Adds the tensor at `id` to those that only training reads, if it has a row per Gaussian.
+    pub(in crate::models) fn add_training_tensor(&mut self, id: NodeId) {
+        let tensor =
+            self.tensors.checkpoint.tensor(id).filter(|tensor| tensor.shape.first() == Some(&self.tensors.count));
+        self.tensors.training_only.extend(tensor);
     }
 }
 
-/// How many rows the tensor at `id`, called `name`, has.
+/// Returns the number of rows of the tensor at `id`, called `name` in messages.
 ///
 /// # Errors
-/// No tensor with rows.
-pub(in crate::models) fn count_of(checkpoint: &Checkpoint, id: NodeId, name: &str) -> Result<usize> {
+/// Fails if there is no tensor with rows.
+pub(in crate::models) fn row_count(checkpoint: &Checkpoint, id: NodeId, name: &str) -> Result<usize> {
     let tensor = checkpoint.float_tensor(id, name)?;
     let rows = tensor.shape.first().copied();
     rows.ok_or_else(|| checkpoint.wrong(name, "a row per Gaussian", tensor.describe()))
 }
 
 impl RowTensors {
-    /// Writes the rows that `reduction` leaves of the tensors to `path`: those of `left` where they differ from `before`; what
-    /// training keeps of merged ones is zero.
+    /// Writes the checkpoint of the compressed model to `path`. Rows of parameters are copied byte for byte unless
+    /// `raw_left` (the compressed parameters) differs from `before`. Rows of merged Gaussians in tensors that only training
+    /// reads become zero.
     ///
     /// # Errors
-    /// Those of the writer.
+    /// Fails if a tensor cannot be read or a write fails.
     pub(in crate::models) fn write(
         &self,
         before: &Raw,
-        left: &Raw,
+        raw_left: &Raw,
         reduction: &CompressedModel,
         path: &Path,
     ) -> Result<()> {
         let mut rows = Vec::new();
         for Param { name, tensor, planes } in &self.params {
-            let pairs: Vec<_> = planes.iter().map(|plane| plane.get(left).zip(plane.get(before))).collect();
+            let pairs: Vec<_> = planes.iter().map(|plane| plane.get(raw_left).zip(plane.get(before))).collect();
             let differs = |place: usize, row: u32| {
-                pairs.iter().flatten().any(|(left, before)| left[place].to_bits() != before[row as usize].to_bits())
+                pairs
+                    .iter()
+                    .flatten()
+                    .any(|(raw_left, before)| raw_left[place].to_bits() != before[row as usize].to_bits())
             };
             let changed: Vec<u32> = (0u32..)
                 .zip(&reduction.kept)
@@ -164,7 +177,7 @@ impl RowTensors {
             for &place in &changed {
                 let row = reduction.kept[place as usize] as usize * planes.len();
                 values.extend(pairs.iter().enumerate().map(|(c, pair)| match pair {
-                    Some((left, _)) => left[place as usize],
+                    Some((raw_left, _)) => raw_left[place as usize],
                     None => stored[row + c],
                 }));
             }
@@ -172,8 +185,8 @@ impl RowTensors {
         }
         let mut merged: Vec<u32> = reduction.clusters.iter().map(|cluster| cluster.output).collect();
         merged.sort_unstable();
-        let beside = self.beside.iter();
-        rows.extend(beside.map(|tensor| GaussianRows {
+        let training_only = self.training_only.iter();
+        rows.extend(training_only.map(|tensor| GaussianRows {
             tensor: tensor.clone(),
             changed: merged.clone(),
             values: Vec::new(),

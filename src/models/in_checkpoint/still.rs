@@ -1,4 +1,4 @@
-//! Gaussians that do not change.
+//! Static Gaussians of a checkpoint.
 
 use xxhash_rust::xxh3::Xxh3;
 
@@ -11,7 +11,7 @@ use crate::models::motion_model::{MotionModel, MotionModelFrames, copy_stored};
 use crate::passes::gather_all;
 use crate::recipe::MergeParams;
 
-/// States are what is stored.
+/// Motion model of static Gaussians: states are the stored values.
 #[derive(Debug)]
 pub(in crate::models) struct Still;
 
@@ -35,7 +35,7 @@ impl MotionModel for Still {
 }
 
 impl ProxyRule for Still {
-    fn proposed(model: &MotionModelFrames<Still>, clusters: &[Cluster], rule: &MergeParams) -> Result<Raw> {
+    fn propose(model: &MotionModelFrames<Still>, clusters: &[Cluster], rule: &MergeParams) -> Result<Raw> {
         let leaders: Vec<u32> = clusters.iter().map(|cluster| cluster.leader).collect();
         let members = clusters.iter().zip(0..).map(|(cluster, place)| (place, &cluster.members[..]));
         let merged = MergedSequence::new(model, &leaders, members, rule);
@@ -44,5 +44,5 @@ impl ProxyRule for Still {
         Ok(raw)
     }
 
-    fn follow(&self, _: &mut Xxh3) {}
+    fn hash_settings(&self, _: &mut Xxh3) {}
 }

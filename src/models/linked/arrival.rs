@@ -1,8 +1,8 @@
-//! Frames that came another way than as files, kept as files and then linked like files: a stream of frames that do not know
-//! one another (format/STREAM.md, version 2), or what says which Gaussian is which and is linked all the same.
+//! Frames that did not come from PLY files of the user, saved as PLY and then linked: a frame stream without ids
+//! (format/STREAM.md, version 2), or an input that identifies Gaussians and is linked anew at the user's request.
 //!
-//! Memory while they arrive: a frame; of a container up to 128 MiB of what is seen, and a tile of every column and thread.
-//! On the disk, in a folder without a name, every frame as PLY.
+//! Memory while frames arrive: one frame; for a container up to 128 MiB of visible Gaussians, and a tile of every
+//! column per thread. Disk, in a temporary folder: every frame as PLY.
 
 use std::io::Read;
 use std::ops::Range;
@@ -11,7 +11,7 @@ use std::path::Path;
 use rayon::prelude::*;
 
 use super::memory::TOGETHER_BYTES;
-use super::{Arrived, LinkedFrames};
+use super::{LinkedFrames, Origin};
 use crate::error::{Error, Result};
 use crate::files::atomic::ScratchFolder;
 use crate::files::frame_stream::FrameStream;
@@ -25,28 +25,37 @@ use crate::models::trajectories::state_bytes;
 use crate::outputs::container::{GAUSSIAN_BLOCK, of_block};
 use crate::source::{FrameSource, Ids, ReadPlan};
 
-/// Files of frames that are arriving, and their times.
-struct Arriving {
+/// PLY files of frames that are being received, and their times.
+struct ReceivedFrames {
     folder: ScratchFolder,
     times: Vec<f64>,
-    /// Bytes of what they are read from, and of the largest as it is read.
-    beside: u64,
-    largest: u64,
+    /// Bytes of memory of the reader that provides the frames.
+    reader_bytes: u64,
+    /// Bytes of the largest frame in memory.
+    largest_frame_bytes: u64,
 }
 
-impl Arriving {
-    fn new(scratch: &Path, beside: u64) -> Result<Arriving> {
-        Ok(Arriving { folder: ScratchFolder::new(scratch)?, times: Vec::new(), beside, largest: 0 })
+impl ReceivedFrames {
+    /// Creates an empty folder in `scratch`. `reader_bytes` is the memory of the reader that provides the frames, bytes.
+    fn new(scratch: &Path, reader_bytes: u64) -> Result<ReceivedFrames> {
+        Ok(ReceivedFrames {
+            folder: ScratchFolder::new(scratch)?,
+            times: Vec::new(),
+            reader_bytes,
+            largest_frame_bytes: 0,
+        })
     }
 
+    /// Writes the next frame as PLY.
     fn push(&mut self, time: f64, state: &Gaussians) -> Result<()> {
         write_inria(state, &[], &self.folder.path().join(format!("frame_{:05}.ply", self.times.len())))?;
         self.times.push(time);
-        self.largest = self.largest.max(state.len() as u64 * state_bytes(state.sh_degree(), Columns::all()));
+        self.largest_frame_bytes =
+            self.largest_frame_bytes.max(state.len() as u64 * state_bytes(state.sh_degree(), Columns::all()));
         Ok(())
     }
 
-    /// Links them: a `kind` of input of `bytes`, called `name` in messages.
+    /// Links the received frames. `kind` names the original input of `bytes` bytes; messages call it `name`.
     fn link(
         self,
         kind: &'static str,
@@ -57,43 +66,44 @@ impl Arriving {
         options: &PlyOptions,
     ) -> Result<LinkedFrames> {
         let linked = LinkedFrames::open(PlyFrames::open(self.folder.path(), options)?, name, why, joins, options)?;
-        let memory = self.beside + 2 * self.largest;
-        let arrived = Some(Arrived { _folder: self.folder, kind, bytes, memory });
-        Ok(LinkedFrames { info: linked.info.with_times(self.times)?, arrived, ..linked })
+        let memory = self.reader_bytes + 2 * self.largest_frame_bytes;
+        let origin = Some(Origin { _folder: self.folder, kind, bytes, memory });
+        Ok(LinkedFrames { info: linked.info.with_times(self.times)?, origin, ..linked })
     }
 }
 
 impl LinkedFrames {
-    /// Receives all of a stream, called `name`, and links it, and lives that are one if `joins`.
+    /// Receives a whole stream, called `name` in messages, and links it. If `joins`, also joins tracks of the same
+    /// Gaussian.
     ///
     /// # Errors
-    /// What is wrong with the stream; none but the end of it; a failed write.
+    /// Fails if the stream is damaged or has no frames, or if a write fails.
     pub fn receive(
         mut stream: FrameStream<impl Read>,
         name: &Path,
         joins: bool,
         options: &PlyOptions,
     ) -> Result<LinkedFrames> {
-        let mut arriving = Arriving::new(&options.scratch, 0)?;
+        let mut received = ReceivedFrames::new(&options.scratch, 0)?;
         let mut state = Gaussians::zeros(0, stream.header().sh_degree);
         let progress = options.events.counting_task("receive", "frames");
         while let Some(time) = stream.next_frame(&mut state)? {
-            arriving.push(time, &state)?;
+            received.push(time, &state)?;
             progress.advance(1);
         }
         drop(progress);
-        if arriving.times.is_empty() {
+        if received.times.is_empty() {
             return Err(Error::input(name, "", "at least one frame", "the end of the stream"));
         }
         let why = "the stream does not say which Gaussian is which";
-        arriving.link("linked frame stream", name, stream.received(), why, joins, options)
+        received.link("linked frame stream", name, stream.received(), why, joins, options)
     }
 
-    /// Links what `input` shows, which says itself which Gaussian is which, and lives that are one if `joins`: in each frame
-    /// those that any picture may show. `kind` says what that is.
+    /// Links the frames of `input` again, ignoring which Gaussian is which. Each frame consists of the Gaussians that
+    /// may be visible in it. If `joins`, tracks of the same Gaussian are joined. `kind` names the input.
     ///
     /// # Errors
-    /// A frame that cannot be read; a failed write.
+    /// Fails if a frame cannot be read or a write fails.
     pub fn relink(
         input: &dyn InputModel,
         kind: &'static str,
@@ -101,61 +111,62 @@ impl LinkedFrames {
         options: &PlyOptions,
     ) -> Result<LinkedFrames> {
         let (source, info) = (input.source(), input.source().info());
-        let seen = count_seen(source)?;
+        let visible_rows = count_visible_rows(source)?;
         let state = state_bytes(info.sh_degree, Columns::all());
         let residence = input.residence();
         let tile = residence.gaussian_block.min(info.count as u64) * residence.frame_block;
         let decoding = tile * (state + 3 * state_bytes(info.sh_degree, Columns::SH));
-        let unpacked = TOGETHER_BYTES.min(state * seen.iter().sum::<u64>());
-        let mut arriving = Arriving::new(&options.scratch, unpacked + rayon::current_num_threads() as u64 * decoding)?;
+        let unpacked = TOGETHER_BYTES.min(state * visible_rows.iter().sum::<u64>());
+        let mut received =
+            ReceivedFrames::new(&options.scratch, unpacked + rayon::current_num_threads() as u64 * decoding)?;
         let progress = options.events.task("unpack", "frames", info.times.len() as u64);
         let mut start = 0;
-        while start < seen.len() {
+        while start < visible_rows.len() {
             let mut bytes = 0;
-            let more = seen[start..].iter().take_while(|&&seen| {
-                bytes += state * seen;
+            let more = visible_rows[start..].iter().take_while(|&&visible_rows| {
+                bytes += state * visible_rows;
                 bytes <= TOGETHER_BYTES
             });
             let together = start..start + more.count().max(1);
             start = together.end;
             let blocks = unpack(source, together.clone())?;
             for (at, frame) in together.enumerate() {
-                let mut whole = Gaussians::zeros(seen[frame] as usize, info.sh_degree);
+                let mut whole = Gaussians::zeros(visible_rows[frame] as usize, info.sh_degree);
                 let mut first = 0;
                 for block in &blocks {
                     whole.write_rows(first, &block[at]);
                     first += block[at].len();
                 }
-                arriving.push(info.times[frame], &whole)?;
+                received.push(info.times[frame], &whole)?;
                 progress.advance(1);
             }
         }
         drop(progress);
-        arriving.link(kind, Path::new(kind), input.bytes()?, "as asked", joins, options)
+        received.link(kind, Path::new(kind), input.bytes()?, "as requested", joins, options)
     }
 }
 
-/// Blocks of Gaussians of `source`, as they are read.
+/// Returns the ranges of Gaussians of the blocks of `source`, for parallel reading.
 fn blocks(source: &dyn FrameSource) -> impl IndexedParallelIterator<Item = Range<usize>> {
     let count = source.info().count;
     (0..count.div_ceil(GAUSSIAN_BLOCK)).into_par_iter().map(move |block| of_block(count, block))
 }
 
-/// Rows of `state` that any picture may show.
-fn seen(state: &Gaussians) -> Vec<u32> {
+/// Returns the rows of `state` that may be visible: with an opacity of at least [`SEEN`].
+fn visible_rows(state: &Gaussians) -> Vec<u32> {
     let opacities = (0u32..).zip(state.opacity_logit.plane(0));
     opacities.filter(|&(_, &logit)| opacity(logit) >= SEEN).map(|(row, _)| row).collect()
 }
 
-/// How many are [seen] in each frame of `source`.
-fn count_seen(source: &dyn FrameSource) -> Result<Vec<u64>> {
+/// Returns the number of visible Gaussians ([`visible_rows`]) in each frame of `source`.
+fn count_visible_rows(source: &dyn FrameSource) -> Result<Vec<u64>> {
     let frames = source.info().times.len();
     let count = |range: Range<usize>| -> Result<Vec<u64>> {
         let (mut reader, mut state) = (source.open(Ids::Range(range))?, Gaussians::zeros(0, 0));
         (0..frames)
             .map(|frame| {
                 reader.read(frame, Columns::OPACITY, &mut state)?;
-                Ok(seen(&state).len() as u64)
+                Ok(visible_rows(&state).len() as u64)
             })
             .collect()
     };
@@ -166,7 +177,7 @@ fn count_seen(source: &dyn FrameSource) -> Result<Vec<u64>> {
     blocks(source).map(count).try_reduce(|| vec![0; frames], add)
 }
 
-/// Those of every block that are [seen] in each of `frames`.
+/// Returns, for each block of Gaussians, the visible ones ([`visible_rows`]) in each of `frames`.
 fn unpack(source: &dyn FrameSource, frames: Range<usize>) -> Result<Vec<Vec<Gaussians>>> {
     let wanted = ReadPlan::new(frames.clone());
     let unpack = |range: Range<usize>| {
@@ -176,7 +187,7 @@ fn unpack(source: &dyn FrameSource, frames: Range<usize>) -> Result<Vec<Vec<Gaus
             .clone()
             .map(|frame| {
                 reader.read(frame, Columns::all(), &mut state)?;
-                Ok(state.pick(&seen(&state)))
+                Ok(state.pick(&visible_rows(&state)))
             })
             .collect()
     };

@@ -1,18 +1,20 @@
-//! PLY frames that do not know one another: linked, packed into a container, and read from that.
+//! PLY frames that do not identify Gaussians across frames: linked into tracks, packed into a container, and read from
+//! it.
 //!
-//! Every frame is read twice: to link it, then to pack its tracks. Lives that are one become one track, where pictures with
-//! them stay within 40 dB of those without: of the close ones alone where that is not so of all that are alike. A track
-//! that is not there in a frame is held as it was, or as it will be first, with an opacity of nothing, so that it is seen
-//! nowhere and costs next to nothing. Then colors, scales, rotations and opacities that hardly change along a track are at
-//! every frame what they are in the mean ([`steady`]), where pictures with them stay within 40 dB of those without.
+//! Every frame is read twice: once to link it, once to pack its tracks. Tracks that seem to be the same Gaussian are
+//! joined if renders with joined tracks stay within 40 dB PSNR of renders without. If joining all similar tracks costs
+//! more, only the close ones are joined. In frames where a track is absent, it keeps its previous state (or its first
+//! one before it begins) with an opacity of nearly zero, so that it is invisible and costs almost no bytes. Then
+//! colors, scales, rotations and opacities that hardly change along a track are replaced by their mean ([`steady`]), if
+//! renders again stay within 40 dB PSNR.
 //!
-//! Memory: [`Sizes`](memory::Sizes); of frames two while they are linked, one for every thread and a few to look at while
-//! lives are joined and held, and up to 128 MiB while they are packed. On the disk, in files without a name, 4 bytes per
-//! Gaussian and frame and 4 per track and value that may be steady, beside the container.
+//! Memory: [`Sizes`](memory::Sizes). Two frames while linking; one per thread and a few rendered ones while joining
+//! tracks and computing means; up to 128 MiB while packing. Disk, in unnamed files beside the container: 4 bytes per
+//! Gaussian and frame, and 4 per track and value that may be constant.
 
 mod arrival;
-mod lives;
 mod memory;
+mod simplify;
 mod steady;
 mod tracks;
 mod write;
@@ -38,38 +40,39 @@ use crate::progress::Events;
 use crate::source::{BlockReader, FrameSource, Ids, Prefetch, ReadPlan, Reads};
 use crate::tracking::Joiner;
 
-/// Linked frames.
+/// Open input of linked frames.
 pub struct LinkedFrames {
     tracks: LinkedTracks,
-    /// The tracks at every frame.
+    /// Container with every track at every frame.
     container: Container,
-    /// Of the container, at times that may be others.
+    /// Sequence info of the container, possibly with other times.
     info: SequenceInfo,
     notes: Vec<String>,
-    /// Keeps the container's file until nobody reads it any more.
+    /// Owner of the container's file, which is deleted when the input is dropped.
     _scratch: ScratchFile,
-    /// What the frames came as, if not as files.
-    arrived: Option<Arrived>,
+    /// Origin of the frames if they were not read from PLY files of the user.
+    origin: Option<Origin>,
 }
 
-/// Frames that came another way than as files.
-struct Arrived {
-    /// Keeps their files until nobody reads them any more.
+/// Origin of frames that did not come from PLY files of the user.
+struct Origin {
+    /// Owner of their temporary PLY files, which are deleted when the input is dropped.
     _folder: ScratchFolder,
-    /// What they are, for people.
+    /// Name of the input, shown to users.
     kind: &'static str,
-    /// Bytes that they came as.
+    /// Bytes of the original input.
     bytes: u64,
-    /// Bytes of memory that this took.
+    /// Peak bytes of memory while the frames were received or unpacked.
     memory: u64,
 }
 
 impl LinkedFrames {
-    /// Links `frames`, which the notes say `why` of, and if `joins` lives that are one, along which what hardly changes is held.
-    /// Messages call the frames `name`.
+    /// Links `frames`. If `joins`, also joins tracks of the same Gaussian and makes nearly constant attributes
+    /// constant. The notes give the reason `why` frames were linked. Messages call the frames `name`.
     ///
     /// # Errors
-    /// A frame that cannot be read or has changed meanwhile; more memory than `options` allow; a failed write.
+    /// Fails if a frame cannot be read or has changed meanwhile, if linking needs more memory than `options` allow, or
+    /// if a write fails.
     pub(super) fn open(
         frames: PlyFrames,
         name: &Path,
@@ -80,9 +83,9 @@ impl LinkedFrames {
         let scratch = &*options.scratch;
         let mut joiner = joins.then(Joiner::default);
         let (mut tracks, found, linker) = LinkedTracks::link(frames, name, joiner.as_mut(), options)?;
-        let joined = joiner.map(|joiner| lives::join(joiner, &linker, &mut tracks)).transpose()?.flatten();
+        let joined = joiner.map(|joiner| simplify::join(joiner, &linker, &mut tracks)).transpose()?.flatten();
         drop(linker);
-        let held = if joins { lives::hold(&mut tracks, scratch)? } else { None };
+        let held = if joins { simplify::hold_steady(&mut tracks, scratch)? } else { None };
         let packed = ScratchFile::new(scratch)?;
         tracks.pack(packed.path(), &options.events)?;
         let container = Container::open(packed.path())?;
@@ -90,7 +93,7 @@ impl LinkedFrames {
         let mut notes = vec![format!("frames were linked: {why}")];
         notes.extend(found.notes(&tracks)?);
         notes.extend(joined.into_iter().chain(held));
-        Ok(LinkedFrames { tracks, container, info, notes, _scratch: packed, arrived: None })
+        Ok(LinkedFrames { tracks, container, info, notes, _scratch: packed, origin: None })
     }
 }
 
@@ -118,7 +121,7 @@ impl FrameSource for LinkedFrames {
 
 impl InputModel for LinkedFrames {
     fn kind(&self) -> &'static str {
-        self.arrived.as_ref().map_or("linked PLY frames", |arrived| arrived.kind)
+        self.origin.as_ref().map_or("linked PLY frames", |origin| origin.kind)
     }
 
     fn source(&self) -> &dyn FrameSource {
@@ -126,15 +129,15 @@ impl InputModel for LinkedFrames {
     }
 
     fn digest(&self) -> Result<String> {
-        // Another linking of the same files is another input.
+        // A different linking of the same files is a different input.
         let both = format!("{:032x} {}", self.tracks.frames().digest()?, self.container.digest());
         Ok(format!("{:032x}", xxh3_128(both.as_bytes())))
     }
 
     fn bytes(&self) -> Result<u64> {
-        match &self.arrived {
+        match &self.origin {
             None => bytes_of(self.tracks.frames().paths().iter().map(PathBuf::as_path)),
-            Some(arrived) => Ok(arrived.bytes),
+            Some(origin) => Ok(origin.bytes),
         }
     }
 
@@ -148,10 +151,10 @@ impl InputModel for LinkedFrames {
 
     fn residence(&self) -> MemoryProfile {
         let (sizes, count) = (self.tracks.sizes(), self.info.count.max(1) as u64);
-        let arriving = self.arrived.as_ref().map_or(0, |arrived| arrived.memory);
+        let receiving = self.origin.as_ref().map_or(0, |origin| origin.memory);
         MemoryProfile {
             per_gaussian: sizes.open().div_ceil(count),
-            opening: sizes.opening().max(arriving).div_ceil(count),
+            opening: sizes.opening().max(receiving).div_ceil(count),
             file: sizes.frame_file().div_ceil(count),
             ..self.container.residence()
         }
@@ -162,7 +165,7 @@ impl InputModel for LinkedFrames {
     }
 
     fn timing(&self) -> Timing {
-        match self.arrived {
+        match self.origin {
             None => Timing::Numbered,
             Some(_) => Timing::Stamped,
         }

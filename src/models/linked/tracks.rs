@@ -1,4 +1,4 @@
-//! Which row of which file is which track, and what follows: every track at every frame.
+//! Assignment of the rows of all PLY files to tracks, and the state of every track at every frame.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -18,89 +18,91 @@ use crate::progress::Events;
 use crate::source::{BlockReader, FrameSource, Ids};
 use crate::tracking::{Joiner, Linker, blend};
 
-/// Opacity logit of a track where it is not: an opacity of 4·10⁻¹⁸.
-const NOT_THERE: f32 = -40.0;
+/// Opacity logit of a track in frames where it is absent: an opacity of 4·10⁻¹⁸.
+const ABSENT_LOGIT: f32 = -40.0;
 
-/// A row of a frame's file, and its track.
+/// Row of the file of a frame, and its track.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) struct TrackedRow {
     pub(super) track: u32,
     pub(super) row: u32,
 }
 
-/// A frame in which a track is, and the row there.
+/// Frame and row where a track is present.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct TrackPosition {
     pub(super) frame: u32,
     row: u32,
 }
 
-/// Frames, and the track of every row of them. Where lives are joined, several rows of a frame may be of one track.
+/// Frames, and the track of each of their rows. If tracks are joined, several rows of a frame may belong to one track.
 pub(super) struct LinkedTracks {
     frames: PlyFrames,
     count: usize,
-    /// Most tracks of `of_rows` that might go on at a frame.
-    living: usize,
-    /// Of every track of `of_rows` the one it is part of, if lives are joined.
-    lives: Option<Vec<u32>>,
-    /// What is held along tracks, if anything is.
+    /// Peak number of linked tracks that may continue in the next frame.
+    live_tracks: usize,
+    /// Joined track of every linked track, if tracks are joined.
+    joined: Option<Vec<u32>>,
+    /// Attributes that are constant along tracks, if any.
     steady: Option<Steady>,
-    /// Where each track is first.
+    /// First position of each linked track.
     births: Vec<TrackPosition>,
-    /// Tracks of the rows of all frames, one after the other, and where those of each frame begin.
-    of_rows: Spill,
+    /// Linked track of every row of all frames, frame by frame.
+    track_of_rows: Spill,
+    /// Index in `track_of_rows` where each frame begins, and the total number of rows.
     starts: Vec<u64>,
 }
 
-/// For how long tracks are there.
+/// Number of frames in which tracks are present.
 pub(super) struct TrackLengths {
-    /// Frames of each.
-    of_tracks: Vec<u32>,
-    /// Frames in which several rows are of one.
+    /// Number of frames of each track.
+    frames_per_track: Vec<u32>,
+    /// Frames in which several rows belong to one track.
     pub(super) blended: Vec<u32>,
 }
 
 impl TrackLengths {
-    /// Frames that tracks are there, in the median.
+    /// Returns the median number of frames per track.
     pub(super) fn median(mut self) -> u32 {
-        let middle = self.of_tracks.len() / 2;
-        if self.of_tracks.is_empty() { 0 } else { *self.of_tracks.select_nth_unstable(middle).1 }
+        let middle = self.frames_per_track.len() / 2;
+        if self.frames_per_track.is_empty() { 0 } else { *self.frames_per_track.select_nth_unstable(middle).1 }
     }
 }
 
-/// What linking found.
+/// Counts that linking found, reported in notes.
 pub(super) struct LinkingResult {
+    /// Number of rows of all frames.
     states: u64,
-    /// Frames that begin something new.
+    /// Frames that begin a new scene: no track continues into them.
     cuts: Vec<usize>,
-    /// Links that nobody can tell.
+    /// Number of ambiguous links that were not made.
     doubtful: usize,
 }
 
 impl LinkingResult {
-    /// Things a person should know, of the `tracks` that were made of it.
+    /// Returns notes for the user about the linking and the resulting `tracks`.
     ///
     /// # Errors
-    /// A failed read.
+    /// Fails if a read fails.
     pub(super) fn notes(&self, tracks: &LinkedTracks) -> Result<Vec<String>> {
         let mut notes = vec![format!(
-            "{} Gaussians of {} frames are {} tracks, of {} frames in the median",
+            "{} Gaussians in {} frames are {} tracks with a median length of {} frames",
             self.states,
             tracks.frames.paths().len(),
             tracks.count,
             tracks.lengths()?.median()
         )];
         if self.doubtful > 0 {
-            notes.push(format!(
-                "{} links could not be told from others: what they would have led to begins a new track",
-                self.doubtful
-            ));
+            notes.push(format!("{} links were ambiguous and not made: each begins a new track instead", self.doubtful));
         }
         if let Some(&first) = self.cuts.first() {
             let name = tracks.frames.paths()[first].file_name().unwrap_or_default().shown();
             notes.push(match self.cuts.len() {
-                1 => format!("a cut: {name} shows nothing of the frame before, all tracks end there"),
-                cuts => format!("{cuts} cuts, the first at {name}: such a frame shows nothing of the one before, all tracks end there"),
+                1 => format!("a cut at {name}: it shows nothing of the frame before, so all tracks end there"),
+                cuts => format!(
+                    "{cuts} cuts, the first at {name}: these frames show nothing of the frame before, so \
+                                 all tracks end there"
+                ),
             });
         }
         Ok(notes)
@@ -108,10 +110,10 @@ impl LinkingResult {
 }
 
 impl LinkedTracks {
-    /// Links `frames`, called `name` in messages, which `joiner` looks at too.
+    /// Links `frames`, called `name` in messages, and shows each frame to `joiner`.
     ///
     /// # Errors
-    /// A frame that cannot be read; more memory than `options` allow; a failed write.
+    /// Fails if a frame cannot be read, if linking needs more memory than `options` allow, or if a write fails.
     pub(super) fn link(
         frames: PlyFrames,
         name: &Path,
@@ -120,21 +122,25 @@ impl LinkedTracks {
     ) -> Result<(LinkedTracks, LinkingResult, Linker)> {
         let scratch = &*options.scratch;
         let of_frame = frames.counts().iter().copied().max().unwrap_or(0);
-        let (mut linker, mut living) = (Linker::default(), 0);
+        let (mut linker, mut live_tracks) = (Linker::default(), 0);
         let (mut births, mut cuts, mut doubtful) = (Vec::new(), Vec::new(), 0);
-        let (mut spilling, mut starts, mut end) = (SpillWriter::new(scratch)?, vec![0], 0);
+        let (mut track_writer, mut starts, mut end) = (SpillWriter::new(scratch)?, vec![0], 0);
         let mut state = Gaussians::zeros(0, frames.sh_degree());
         let progress = options.events.task("link", "frames", frames.paths().len() as u64);
         for frame in 0..frames.paths().len() {
-            // Before a frame is read at least its own Gaussians are counted as tracks.
+            // Before a frame is read, assume at least as many tracks as its own Gaussians.
             let linked = births.len().max(of_frame as usize) as u64;
-            let sizes =
-                Sizes { of_frame: of_frame.into(), sh_degree: frames.sh_degree(), linked, living: living as u64 };
+            let sizes = Sizes {
+                frame_gaussians: of_frame.into(),
+                sh_degree: frames.sh_degree(),
+                linked,
+                live_tracks: live_tracks as u64,
+            };
             options.memory.check(name, &format!("frame {frame}"), "linking the frames", sizes.opening())?;
             let ply = frames.frame(frame)?;
             ply.gaussians(0..ply.count(), Columns::all(), &mut state)?;
             let linked = linker.link(&state);
-            living = living.max(linker.may_go_on());
+            live_tracks = live_tracks.max(linker.may_go_on());
             if let Some(joiner) = &mut joiner {
                 joiner.see(&linker);
             }
@@ -143,62 +149,62 @@ impl LinkedTracks {
             }
             doubtful += linked.doubtful;
             for (row, &track) in linked.tracks.iter().enumerate() {
-                // Those that begin here are numbered in the order of their rows.
+                // New tracks are numbered in the order of their rows.
                 if track as usize == births.len() {
                     births.push(TrackPosition { frame: frame as u32, row: row as u32 });
                 }
             }
-            spilling.write(bytemuck::cast_slice(&linked.tracks))?;
+            track_writer.write(bytemuck::cast_slice(&linked.tracks))?;
             end += linked.tracks.len() as u64;
             starts.push(end);
             progress.advance(1);
         }
         let tracks = LinkedTracks {
             count: births.len(),
-            living,
+            live_tracks,
             frames,
-            lives: None,
+            joined: None,
             steady: None,
             births,
-            of_rows: spilling.finish()?,
+            track_of_rows: track_writer.finish()?,
             starts,
         };
         Ok((tracks, LinkingResult { states: end, cuts, doubtful }, linker))
     }
 
-    /// Makes `count` tracks of what is there, of each the one that `of_tracks` says.
-    pub(super) fn join(&mut self, of_tracks: Vec<u32>, count: usize) {
-        (self.lives, self.count) = (Some(of_tracks), count);
+    /// Joins the linked tracks to `count` tracks. `of_tracks` holds the joined track of each linked one.
+    pub(super) fn join(&mut self, joined_tracks: Vec<u32>, count: usize) {
+        (self.joined, self.count) = (Some(joined_tracks), count);
     }
 
-    /// Holds along tracks what `steady` says, or nothing.
-    pub(super) fn hold(&mut self, steady: Option<Steady>) {
+    /// Sets the attributes that are constant along tracks; `None` makes none constant.
+    pub(super) fn set_steady(&mut self, steady: Option<Steady>) {
         self.steady = steady;
     }
 
-    /// What is held along tracks, if anything is.
+    /// Returns the attributes that are constant along tracks, if any.
     pub(super) fn steady(&self) -> Option<&Steady> {
         self.steady.as_ref()
     }
 
-    /// Takes back what was joined.
-    pub(super) fn part(&mut self) {
-        (self.lives, self.count) = (None, self.births.len());
+    /// Undoes [`LinkedTracks::join`].
+    pub(super) fn undo_join(&mut self) {
+        (self.joined, self.count) = (None, self.births.len());
     }
 
-    /// For how long tracks are there.
+    /// Counts the frames in which each track is present.
     ///
     /// # Errors
-    /// A failed read.
+    /// Fails if a read fails.
     pub(super) fn lengths(&self) -> Result<TrackLengths> {
-        let mut lengths = TrackLengths { of_tracks: vec![0; self.count], blended: Vec::new() };
+        let mut lengths = TrackLengths { frames_per_track: vec![0; self.count], blended: Vec::new() };
         let mut last = vec![u32::MAX; self.count];
         for frame in 0..self.frames.paths().len() {
             let mut is_blended = false;
-            for track in self.of_frame(frame)? {
+            for track in self.tracks_in_frame(frame)? {
                 let before = std::mem::replace(&mut last[track as usize], frame as u32);
                 is_blended |= before == frame as u32;
-                lengths.of_tracks[track as usize] += u32::from(before != frame as u32);
+                lengths.frames_per_track[track as usize] += u32::from(before != frame as u32);
             }
             if is_blended {
                 lengths.blended.push(frame as u32);
@@ -207,25 +213,25 @@ impl LinkedTracks {
         Ok(lengths)
     }
 
-    /// The tracks of the rows of a frame.
-    fn of_frame(&self, frame: usize) -> Result<Vec<u32>> {
+    /// Returns the track of each row of a frame.
+    fn tracks_in_frame(&self, frame: usize) -> Result<Vec<u32>> {
         let mut tracks = vec![0u32; (self.starts[frame + 1] - self.starts[frame]) as usize];
-        self.of_rows.read(4 * self.starts[frame], bytemuck::cast_slice_mut(&mut tracks))?;
-        if let Some(lives) = &self.lives {
-            tracks.iter_mut().for_each(|track| *track = lives[*track as usize]);
+        self.track_of_rows.read(4 * self.starts[frame], bytemuck::cast_slice_mut(&mut tracks))?;
+        if let Some(joined) = &self.joined {
+            tracks.iter_mut().for_each(|track| *track = joined[*track as usize]);
         }
         Ok(tracks)
     }
 
-    /// Where each track is first, in the order of frames.
+    /// Returns the first frame and row of each track, in the order of frames.
     pub(super) fn first(&self) -> Vec<TrackPosition> {
-        match &self.lives {
+        match &self.joined {
             None => self.births.clone(),
-            // Lives are numbered by their beginnings.
-            Some(lives) => {
+            // Joined tracks are numbered in the order of their first frames.
+            Some(joined) => {
                 let mut first = Vec::with_capacity(self.count);
-                for (&life, &birth) in lives.iter().zip(&self.births) {
-                    if life as usize == first.len() {
+                for (&track, &birth) in joined.iter().zip(&self.births) {
+                    if track as usize == first.len() {
                         first.push(birth);
                     }
                 }
@@ -234,40 +240,40 @@ impl LinkedTracks {
         }
     }
 
-    /// What memory depends on.
+    /// Returns the counts from which memory is estimated.
     pub(super) fn sizes(&self) -> Sizes {
         Sizes {
-            of_frame: self.frames.counts().iter().copied().max().unwrap_or(0).into(),
+            frame_gaussians: self.frames.counts().iter().copied().max().unwrap_or(0).into(),
             sh_degree: self.frames.sh_degree(),
             linked: self.births.len() as u64,
-            living: self.living as u64,
+            live_tracks: self.live_tracks as u64,
         }
     }
 
-    /// The files.
+    /// Returns the PLY files of the frames.
     pub(super) fn frames(&self) -> &PlyFrames {
         &self.frames
     }
 
-    /// Number of tracks.
+    /// Returns the number of tracks.
     pub(super) fn count(&self) -> usize {
         self.count
     }
 
-    /// The rows of a frame that are of `tracks`, by their tracks.
+    /// Returns the rows of a frame that belong to `tracks`, sorted by track.
     pub(super) fn rows(&self, frame: usize, tracks: Range<usize>) -> Result<Vec<TrackedRow>> {
-        let rows = self.of_frame(frame)?.into_iter().enumerate();
+        let rows = self.tracks_in_frame(frame)?.into_iter().enumerate();
         let rows = rows.map(|(row, track)| TrackedRow { track, row: row as u32 });
         let mut rows: Vec<TrackedRow> = rows.filter(|row| tracks.contains(&(row.track as usize))).collect();
         rows.sort_unstable();
         Ok(rows)
     }
 
-    /// Reads `rows`, which are by track, of a frame's `file` into `state`, those of one track blended in the place of the
-    /// first; gives the first of each.
+    /// Reads `rows`, sorted by track, of a frame's `file` into `state`. Rows of one track are blended into the first of
+    /// them. Returns the index of the first row of each track.
     ///
     /// # Errors
-    /// A failed read.
+    /// Fails if a read fails.
     pub(super) fn blended(&self, file: &Ply, rows: &[TrackedRow], state: &mut Gaussians) -> Result<Vec<usize>> {
         let of_file: Vec<u32> = rows.iter().map(|row| row.row).collect();
         file.gather(&Ids::List(&of_file), Columns::all(), state)?;
@@ -283,24 +289,24 @@ impl LinkedTracks {
         Ok(firsts)
     }
 
-    /// The tracks of `rows`, which are by track, in the states they have in the frame of `file`: blended, and held where they
-    /// are steady.
+    /// Returns the state of each track of `rows`, sorted by track, in the frame of `file`: rows of one track blended,
+    /// steady columns set to their means.
     ///
     /// # Errors
-    /// A failed read.
+    /// Fails if a read fails.
     pub(super) fn states(&self, file: &Ply, rows: &[TrackedRow]) -> Result<Gaussians> {
         let mut state = Gaussians::zeros(0, self.frames.sh_degree());
         let firsts = self.blended(file, rows, &mut state)?;
         let mut states = state.pick(&firsts.iter().map(|&first| first as u32).collect::<Vec<u32>>());
         if let Some(steady) = &self.steady {
             let tracks: Vec<u32> = firsts.iter().map(|&first| rows[first].track).collect();
-            steady.means(&tracks)?.hold((0..tracks.len()).map(|at| (at, at)), &mut states);
+            steady.means(&tracks)?.write_to((0..tracks.len()).map(|at| (at, at)), &mut states);
         }
         Ok(states)
     }
 
-    /// Writes all tracks at all frames to the container `path`. Tracks that begin together are neighbors, so that where a
-    /// block of them is not there yet, or no longer, nothing is written.
+    /// Writes all tracks at all frames to the container `path`. Tracks that begin together are neighbors, so that no
+    /// bytes are written for a block of tracks that has not begun yet or has ended.
     pub(super) fn pack(&self, path: &Path, events: &Events) -> Result<()> {
         let mut held = self.first();
         let (times, degree) = (self.frames.times(), self.frames.sh_degree());
@@ -314,12 +320,12 @@ impl LinkedTracks {
             let files: Vec<Ply> = of_block.clone().map(|frame| self.frames.frame(frame)).collect::<Result<_>>()?;
             let rows: Vec<Vec<TrackedRow>> =
                 of_block.clone().map(|frame| self.rows(frame, 0..self.count)).collect::<Result<_>>()?;
-            let mut lives: Vec<BlockPresence> = was_still
+            let mut presence: Vec<BlockPresence> = was_still
                 .iter()
                 .map(|&still| if still { BlockPresence::Repeating } else { BlockPresence::Still })
                 .collect();
             for row in rows.iter().flatten() {
-                lives[row.track as usize / GAUSSIAN_BLOCK] = BlockPresence::New;
+                presence[row.track as usize / GAUSSIAN_BLOCK] = BlockPresence::New;
             }
             let info = SequenceInfo {
                 count: self.count,
@@ -328,29 +334,29 @@ impl LinkedTracks {
                 varying: Columns::all(),
             };
             let block = FrameBlock { info, tracks: self, start, files: &files, rows: &rows, held: &held };
-            writer.append_lives(&block, 0..of_block.len(), &times[of_block.clone()], &lives)?;
+            writer.append_lives(&block, 0..of_block.len(), &times[of_block.clone()], &presence)?;
             for (frame, rows) in of_block.clone().zip(&rows) {
                 for row in rows {
                     held[row.track as usize] = TrackPosition { frame: frame as u32, row: row.row };
                 }
             }
-            was_still = lives.iter().map(|lives| *lives != BlockPresence::New).collect();
+            was_still = presence.iter().map(|presence| *presence != BlockPresence::New).collect();
             progress.advance(of_block.len() as u64);
         }
         writer.finish()
     }
 }
 
-/// All tracks at the frames of a block.
+/// Source for the container writer: every track at the frames of one block.
 struct FrameBlock<'a> {
     info: SequenceInfo,
     tracks: &'a LinkedTracks,
-    /// The first of the frames.
+    /// Number of the first frame.
     start: usize,
     files: &'a [Ply],
-    /// By track, of each of them.
+    /// Rows of each frame, sorted by track.
     rows: &'a [Vec<TrackedRow>],
-    /// Where each track was last before them, or will be first.
+    /// Last position of each track before these frames, or its first one.
     held: &'a [TrackPosition],
 }
 
@@ -372,7 +378,7 @@ impl FrameSource for FrameBlock<'_> {
 }
 
 impl FrameBlock<'_> {
-    /// Writes the tracks of `range` as they are held before the first of the frames.
+    /// Writes the states of the tracks of `range` before the first of the frames.
     fn hold(&self, range: Range<usize>, state: &mut Gaussians) -> Result<()> {
         let mut by_frame: Vec<(TrackPosition, usize)> =
             self.held[range].iter().enumerate().map(|(i, &at)| (at, i)).collect();
@@ -396,24 +402,24 @@ impl FrameBlock<'_> {
     }
 }
 
-/// Tracks that follow one another, frame by frame.
+/// Reader of consecutive tracks, frame by frame.
 struct TrackReader<'a> {
     block: &'a FrameBlock<'a>,
     range: Range<usize>,
-    /// The frame that `state` is to become.
+    /// Next frame to apply to `state`.
     next: usize,
-    /// What is held of `range`.
+    /// Constant columns of `range`.
     means: Option<HeldMeans>,
     state: Gaussians,
     part: Gaussians,
 }
 
 impl TrackReader<'_> {
-    /// Goes to what is before the first of the frames.
+    /// Resets to the state before the first of the frames.
     fn begin(&mut self) -> Result<()> {
         self.block.hold(self.range.clone(), &mut self.state)?;
         if let Some(means) = &self.means {
-            means.hold((0..self.range.len()).map(|at| (at, at)), &mut self.state);
+            means.write_to((0..self.range.len()).map(|at| (at, at)), &mut self.state);
         }
         self.next = 0;
         Ok(())
@@ -430,12 +436,12 @@ impl BlockReader for TrackReader<'_> {
             let first = rows.partition_point(|row| (row.track as usize) < self.range.start);
             let rows = &rows[first..];
             let rows = &rows[..rows.partition_point(|row| (row.track as usize) < self.range.end)];
-            self.state.opacity_logit.planes_mut().fill(NOT_THERE);
+            self.state.opacity_logit.planes_mut().fill(ABSENT_LOGIT);
             let firsts = self.block.tracks.blended(&self.block.files[self.next], rows, &mut self.part)?;
             let place = |first: usize| rows[first].track as usize - self.range.start;
             scatter(&self.part, firsts.iter().map(|&first| (first, place(first))), &mut self.state);
             if let Some(means) = &self.means {
-                means.hold(firsts.iter().map(|&first| (place(first), place(first))), &mut self.state);
+                means.write_to(firsts.iter().map(|&first| (place(first), place(first))), &mut self.state);
             }
             self.next += 1;
         }
@@ -446,7 +452,7 @@ impl BlockReader for TrackReader<'_> {
     }
 }
 
-/// Writes rows of `part` to `state`, of each pair of `places` the first to the second.
+/// Copies rows of `part` to `state`. Each pair of `places` is a source row and a target row.
 fn scatter(part: &Gaussians, places: impl Iterator<Item = (usize, usize)> + Clone, state: &mut Gaussians) {
     for column in Columns::all().iter() {
         let (from, to) = (part.column(column), state.column_mut(column));

@@ -1,5 +1,5 @@
-//! What is left of linked frames, as files like those that came: in each the Gaussians that are there, with the properties,
-//! comments and name it had.
+//! Compressed linked frames, written as PLY files like those of the input. Each file holds the Gaussians that are
+//! present in the frame, with its original properties, comments and name.
 
 use std::path::Path;
 
@@ -15,38 +15,38 @@ use crate::models::trajectories::merged;
 use crate::progress::Events;
 use crate::source::{FrameSource, Ids};
 
-/// What no row of a frame is of.
-const NONE: u32 = u32::MAX;
+/// Marks a track without a row in a frame.
+const NO_ROW: u32 = u32::MAX;
 
 impl LinkedFrames {
-    /// Writes every frame's file into `folder`. A merged Gaussian is there where one of its members is, in the row of the
-    /// first of them; of several rows of a track there is one, in the place of the first. What is held along a track is
-    /// held.
+    /// Writes the file of every frame into `folder`. A proxy is present if one of its members is, in the row of the
+    /// first of them. Several rows of a track become one, in the place of the first. Steady columns have their means.
     ///
     /// # Errors
-    /// Frames that cannot be read, a failed write.
+    /// Fails if frames cannot be read or a write fails.
     pub(super) fn write_files(&self, reduction: &CompressedModel, folder: &Path, events: &Events) -> Result<()> {
         let (frames, result) = (self.tracks.frames(), merged(self, reduction));
         let all = out_rows(reduction);
         let progress = events.task("emit", "frames", frames.paths().len() as u64);
         let write = |&frame: &usize| {
             let mut of_frame = self.tracks.rows(frame, 0..self.tracks.count())?;
-            let mut row_of = vec![NONE; self.tracks.count()];
-            // Of several rows of a track the first.
+            let mut row_of = vec![NO_ROW; self.tracks.count()];
+            // If a track has several rows, use the first.
             of_frame.iter().rev().for_each(|row| row_of[row.track as usize] = row.row);
             let several = of_frame.chunk_by(|a, b| a.track == b.track).filter(|of_track| of_track.len() > 1);
             let blended: HashSet<u32> = several.map(|of_track| of_track[0].track).collect();
-            let is_made =
-                |track: u32| blended.contains(&track) || self.tracks.steady().is_some_and(|steady| steady.holds(track));
-            let (mut rows, mut written, mut merged, mut made) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+            let is_computed = |track: u32| {
+                blended.contains(&track) || self.tracks.steady().is_some_and(|steady| steady.has_steady(track))
+            };
+            let (mut rows, mut written, mut merged, mut computed) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
             for (place, row) in all.iter().enumerate() {
                 let members = row.proxy.map_or(&[][..], |proxy| &reduction.clusters[proxy as usize].members[..]);
                 let tracks = [row.source].into_iter().chain(members.iter().map(|member| member.0));
-                if let Some(source) = tracks.map(|track| row_of[track as usize]).find(|&row| row != NONE) {
+                if let Some(source) = tracks.map(|track| row_of[track as usize]).find(|&row| row != NO_ROW) {
                     if row.proxy.is_some() {
                         merged.push(rows.len());
-                    } else if is_made(row.source) {
-                        made.push(rows.len());
+                    } else if is_computed(row.source) {
+                        computed.push(rows.len());
                     }
                     rows.push(OutRow { source, proxy: None });
                     written.push(place as u32);
@@ -56,12 +56,13 @@ impl LinkedFrames {
             let places: Vec<u32> = merged.iter().map(|&at| written[at]).collect();
             let mut first = Gaussians::zeros(0, self.info.sh_degree);
             result.open(Ids::List(&places))?.read(frame, Columns::all(), &mut first)?;
-            of_frame
-                .retain(|row| made.binary_search_by_key(&row.track, |&at| all[written[at] as usize].source).is_ok());
-            let mut proxies = Gaussians::zeros(merged.len() + made.len(), self.info.sh_degree);
+            of_frame.retain(|row| {
+                computed.binary_search_by_key(&row.track, |&at| all[written[at] as usize].source).is_ok()
+            });
+            let mut proxies = Gaussians::zeros(merged.len() + computed.len(), self.info.sh_degree);
             proxies.write_rows(0, &first);
             proxies.write_rows(merged.len(), &self.tracks.states(&template, &of_frame)?);
-            for (proxy, at) in merged.into_iter().chain(made).enumerate() {
+            for (proxy, at) in merged.into_iter().chain(computed).enumerate() {
                 rows[at].proxy = Some(proxy as u32);
             }
             let change = reduction.change_at(frame, frames.paths().len()).pick(&written);
@@ -70,7 +71,7 @@ impl LinkedFrames {
             progress.advance(1);
             Ok(())
         };
-        // A batch at a time: a thread that waits for proxies would begin another frame.
+        // Work in batches: while a thread waits for proxies, it would otherwise begin another frame.
         let numbers: Vec<usize> = (0..frames.paths().len()).collect();
         numbers.chunks(rayon::current_num_threads()).try_for_each(|batch| batch.par_iter().try_for_each(write))
     }

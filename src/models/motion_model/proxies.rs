@@ -1,4 +1,4 @@
-//! Proxies in a family's own parameters, held to what their members do.
+//! Proxies with raw parameters of a model format, checked against the moment match of their members.
 
 use super::{MotionModel, MotionModelFrames};
 use crate::compressed_model::{Cluster, Proxies, Reference};
@@ -10,14 +10,15 @@ use crate::passes::gather_all;
 use crate::recipe::MergeParams;
 use crate::source::FrameSource;
 
-/// Furthest that a proxy's opacity may be from that of its members' moment match, at any frame.
-const MOST_OPACITY: f64 = 0.1;
+/// Maximum difference in opacity between a proxy and the moment match of its members, at any frame.
+const MAX_OPACITY_DIFFERENCE: f64 = 0.1;
 
-/// The proxies `propose`d for `clusters`, a row for each; those whose state strays at any frame from the moment match
-/// of their members, in position by more than `max_drift` or in opacity by more than .1, are refused.
+/// Returns the proxies that `propose` computes for `clusters`, one row each. Refuses a proxy if at any frame its state
+/// differs from the moment match of its members by more than `max_drift` in position or 0.1 in opacity. Frames in which
+/// neither is visible are not compared.
 ///
 /// # Errors
-/// Frames that cannot be evaluated.
+/// Fails if `propose` fails or frames cannot be evaluated.
 pub(in crate::models) fn solve<L: MotionModel>(
     model: &MotionModelFrames<L>,
     clusters: &[Cluster],
@@ -34,7 +35,7 @@ pub(in crate::models) fn solve<L: MotionModel>(
     let made = model.with_raw(propose(clusters)?);
     let drift = rule.max_drift * rule.length_unit.in_scene_units(reference.extent);
     let mut furthest = vec![0.0f64; clusters.len()];
-    let mut strays = vec![false; clusters.len()];
+    let mut drifts = vec![false; clusters.len()];
     let compared = Columns::POSITION | Columns::OPACITY;
     for frame in 0..model.info().times.len() {
         let (wanted, made) = (gather_all(&wanted, frame, compared)?, gather_all(&made, frame, compared)?);
@@ -45,20 +46,20 @@ pub(in crate::models) fn solve<L: MotionModel>(
             }
             let [to, from] = [&wanted, &made].map(|state| state.position.row::<3>(proxy).map(f64::from));
             let distance = to.iter().zip(from).map(|(to, from)| (to - from).powi(2)).sum::<f64>().sqrt();
-            // False of what is not finite.
-            strays[proxy] |= !(distance <= drift && (a - b).abs() <= MOST_OPACITY);
+            // The comparison is false for values that are not finite.
+            drifts[proxy] |= !(distance <= drift && (a - b).abs() <= MAX_OPACITY_DIFFERENCE);
             furthest[proxy] = furthest[proxy].max(distance);
         }
     }
-    let refused: Vec<usize> = (0..clusters.len()).filter(|&proxy| strays[proxy]).collect();
-    let stays = furthest.iter().zip(&strays).filter(|(_, strays)| !**strays).map(|(furthest, _)| *furthest);
+    let refused: Vec<usize> = (0..clusters.len()).filter(|&proxy| drifts[proxy]).collect();
+    let accepted = furthest.iter().zip(&drifts).filter(|(_, drifts)| !**drifts).map(|(furthest, _)| *furthest);
     let mut notes = Vec::new();
     if !refused.is_empty() {
         notes.push(format!(
-            "{} of {} groups that would merge were left to their leaders: no Gaussian of this model moves as they do",
+            "{} of {} clusters were reduced to their leaders: no Gaussian of this model moves like the whole cluster",
             refused.len(),
             clusters.len()
         ));
     }
-    Ok(Proxies { raw: Some(made.raw().clone()), refused, deviation: stays.reduce(f64::max), notes })
+    Ok(Proxies { raw: Some(made.raw().clone()), refused, deviation: accepted.reduce(f64::max), notes })
 }

@@ -4,7 +4,7 @@ use crate::model::Gaussians;
 use crate::passes::{gather, gather_all};
 use crate::recipe::Recipe;
 
-/// x(t) = x + v·t with velocities of a family's own, and opacities that fade by a rate of its own.
+/// Motion model x(t) = x + v·t with velocities in format-specific parameters 0–2 and a fading rate in parameter 3.
 #[derive(Debug)]
 struct Straight;
 
@@ -40,7 +40,7 @@ impl MotionModel for Straight {
     }
 }
 
-/// More than two blocks of Gaussians, each with values of its own.
+/// Builds a model of more than two blocks of Gaussians, each with different values.
 fn model() -> MotionModelFrames<Straight> {
     let count = 2 * BLOCK + 77;
     let mut raw = Raw { gaussians: Gaussians::zeros(count, 0), own: Column::zeros(4, count) };
@@ -53,7 +53,7 @@ fn model() -> MotionModelFrames<Straight> {
 }
 
 #[test]
-fn the_same_gaussian_at_the_same_frame_has_the_same_bits_however_it_is_read() {
+fn every_reader_returns_the_same_bits() {
     let model = model();
     let all = gather_all(&model, 2, Columns::all()).unwrap();
     let ids: Vec<u32> = (0..model.info().count as u32).rev().step_by(2).collect();
@@ -71,7 +71,7 @@ fn the_same_gaussian_at_the_same_frame_has_the_same_bits_however_it_is_read() {
 }
 
 #[test]
-fn what_is_left_has_its_own_values_proxies_in_their_places_and_its_changes() {
+fn compressed_model_has_survivors_proxies_and_deltas() {
     let (model, rule) = (model(), Recipe::preset("default").unwrap().merge);
     let mut reduction = CompressedModel::pruned(vec![3, 8, 11], &rule);
     reduction.clusters.push(Cluster { output: 1, leader: 8, members: vec![(8, 0.5), (9, 0.5)] });
@@ -87,12 +87,12 @@ fn what_is_left_has_its_own_values_proxies_in_their_places_and_its_changes() {
 }
 
 #[test]
-fn proxies_that_stray_at_any_frame_are_refused() {
+fn proxies_that_drift_at_any_frame_are_refused() {
     let (model, mut rule) = (model(), Recipe::preset("default").unwrap().merge);
     rule.max_drift = 0.1;
     let reference = Reference { frame: 0, extent: 1.0 };
     let drift = 0.1 * rule.length_unit.in_scene_units(1.0);
-    // Each of a single Gaussian: what it is is known.
+    // Each cluster has a single member, so the expected result is known.
     let cluster = |output: u32, id: u32| Cluster { output, leader: id, members: vec![(id, 1.0)] };
     let clusters: Vec<Cluster> = (0..4).map(|k| cluster(k, 10 * k + 1)).collect();
     let ids: Vec<u32> = clusters.iter().map(|cluster| cluster.leader).collect();
@@ -103,7 +103,8 @@ fn proxies_that_stray_at_any_frame_are_refused() {
     };
     let as_is = proposed(|_, _| ());
     assert!(as_is.refused.is_empty() && as_is.notes.is_empty() && as_is.deviation.unwrap() < 1e-5);
-    // Too fast for the last frame, at twice the time, only; far off at once; nowhere; fading too slowly.
+    // Proxy 0 is too fast and drifts too far at the last frame only; 1 drifts within the limit; 2 has no finite
+    // position; 3 fades too fast.
     let off = proposed(|raw, drift| {
         raw.own.plane_mut(0)[0] += 0.6 * drift as f32;
         raw.own.plane_mut(0)[1] += 0.4 * drift as f32;

@@ -1,32 +1,33 @@
 //! Opacities that fade with the distance in time.
 //!
-//! α = σ(o)·m with m = exp(e), e ≤ 0: as a logit ln α − ln(1 − α) = e − ln(exp(−o) + 1 − m), in f64 without loss where α is
-//! near 0 or near 1.
+//! α = σ(o)·m with m = exp(e), e ≤ 0. As a logit: ln α − ln(1 − α) = e − ln(exp(−o) + 1 − m), computed in f64 without
+//! loss of precision for α near 0 or 1.
 
 use crate::model::functions::{exp_m1, ln};
 
-/// Logits beyond it say no more.
-pub(in crate::models) const MOST: f64 = 40.0;
+/// Maximum absolute value of a logit. Larger ones do not change the opacity noticeably.
+pub(in crate::models) const MAX_LOGIT: f64 = 40.0;
 
-/// exp(−o) of a stored logit.
-pub(in crate::models) fn odds(logit: f32) -> f64 {
+/// Returns exp(−o) of a stored logit o.
+pub(in crate::models) fn inverse_odds(logit: f32) -> f64 {
     (-f64::from(logit)).exp()
 }
 
-/// The logit of σ(o)·exp(`exponent`), from [`odds`] of o, within ±[`MOST`]. Without a branch, so that loops run in vectors.
+/// Returns the logit of σ(o)·exp(`exponent`), clamped to ±[`MAX_LOGIT`]. `inverse_odds` is exp(−o). Written without branches, so
+/// that loops are vectorized.
 #[inline(always)]
-pub(in crate::models) fn faded(odds: f64, exponent: f64) -> f64 {
-    // The opacity is no larger than m.
-    let exponent = if exponent < -MOST { -MOST } else { exponent };
-    let logit = exponent - ln(odds - exp_m1(exponent));
-    let logit = if logit > MOST { MOST } else { logit };
-    if logit < -MOST { -MOST } else { logit }
+pub(in crate::models) fn faded_logit(inverse_odds: f64, exponent: f64) -> f64 {
+    // The resulting opacity is at most m = exp(exponent).
+    let exponent = if exponent < -MAX_LOGIT { -MAX_LOGIT } else { exponent };
+    let logit = exponent - ln(inverse_odds - exp_m1(exponent));
+    let logit = if logit > MAX_LOGIT { MAX_LOGIT } else { logit };
+    if logit < -MAX_LOGIT { -MAX_LOGIT } else { logit }
 }
 
-/// ∂ [`faded`] / ∂ o; 0 where it does not change.
-pub(in crate::models) fn slope(odds: f64, exponent: f64) -> f64 {
-    let logit = faded(odds, exponent);
-    if logit.abs() < MOST { odds / (odds - exponent.exp_m1()) } else { 0.0 }
+/// Returns ∂ [`faded_logit`] / ∂ o; 0 where the logit is clamped.
+pub(in crate::models) fn slope(inverse_odds: f64, exponent: f64) -> f64 {
+    let logit = faded_logit(inverse_odds, exponent);
+    if logit.abs() < MAX_LOGIT { inverse_odds / (inverse_odds - exponent.exp_m1()) } else { 0.0 }
 }
 
 #[cfg(test)]
@@ -34,22 +35,25 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_faded_logit_is_that_of_the_product() {
+    fn faded_logit_equals_the_logit_of_the_product() {
         for logit in [-9.0f32, -3.0, 0.0, 2.0, 12.0] {
             for exponent in [0.0, -1e-9, -0.1, -1.0, -3.0, -20.0] {
                 let alpha = (1.0 / (1.0 + (-f64::from(logit)).exp())) * f64::exp(exponent);
-                let got = faded(odds(logit), exponent);
+                let got = faded_logit(inverse_odds(logit), exponent);
                 let again = 1.0 / (1.0 + (-got).exp());
                 assert!((again / alpha - 1.0).abs() < 1e-12, "{logit} {exponent}: {again} {alpha}");
-                let [above, below] = [1e-3f32, -1e-3].map(|by| faded(odds(logit + by), exponent));
+                let [above, below] = [1e-3f32, -1e-3].map(|by| faded_logit(inverse_odds(logit + by), exponent));
                 let by = f64::from(logit + 1e-3) - f64::from(logit - 1e-3);
                 let expected = (above - below) / by;
-                let slope = slope(odds(logit), exponent);
+                let slope = slope(inverse_odds(logit), exponent);
                 assert!((slope - expected).abs() < 1e-6, "{logit} {exponent}: {slope} {expected}");
             }
         }
-        // Ends, and what lies beyond them.
-        assert_eq!([faded(odds(800.0), 0.0), faded(odds(-800.0), 0.0), faded(1.0, -1e300)], [MOST, -MOST, -MOST]);
-        assert_eq!([slope(odds(800.0), 0.0), slope(odds(-800.0), 0.0), slope(1.0, -1e300)], [0.0; 3]);
+        // Clamped values.
+        assert_eq!(
+            [faded_logit(inverse_odds(800.0), 0.0), faded_logit(inverse_odds(-800.0), 0.0), faded_logit(1.0, -1e300)],
+            [MAX_LOGIT, -MAX_LOGIT, -MAX_LOGIT]
+        );
+        assert_eq!([slope(inverse_odds(800.0), 0.0), slope(inverse_odds(-800.0), 0.0), slope(1.0, -1e300)], [0.0; 3]);
     }
 }

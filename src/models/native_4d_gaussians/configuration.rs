@@ -1,5 +1,5 @@
-//! What files beside a checkpoint say of how it was trained: `cfg_args`, and the YAML that training was given, where somebody put
-//! it there: it is not saved with the model.
+//! Files beside a checkpoint that record how it was trained: `cfg_args`, and the YAML configuration of the training.
+//! The YAML is not saved with the model, so it is there only if somebody copied it.
 
 use std::path::Path;
 
@@ -7,23 +7,25 @@ use crate::error::{Error, Result, quoted};
 use crate::files::python_literal::{Literal, parse_call};
 use crate::files::text::read_text;
 use crate::models::four_d_gaussians::cfg_args;
-use crate::models::in_checkpoint::texts_in;
+use crate::models::in_checkpoint::yaml_files_in;
 
-/// What matters of it.
+/// Values of the training configuration that are used.
 #[derive(Debug, Default)]
 pub(super) struct TrainingConfig {
     pub(super) source_path: Option<String>,
+    /// Background color: white if true, else black.
     pub(super) white_background: bool,
+    /// Variance added to Σ_tt (`prefilter_var`).
     pub(super) prefilter: f64,
-    /// L, and the file that says so.
+    /// Period L of colors, and the name of the file that gives it.
     pub(super) time_duration: Option<(f64, String)>,
 }
 
 impl TrainingConfig {
-    /// That of the model in `root`.
+    /// Reads the configuration of the model in the folder `root`.
     ///
     /// # Errors
-    /// Files that cannot be read, or not understood; such that do not agree.
+    /// Fails if a file cannot be read or parsed, or if two files contradict each other.
     pub(super) fn read(root: &Path) -> Result<TrainingConfig> {
         let mut found = TrainingConfig { time_duration: time_duration(root)?, ..TrainingConfig::default() };
         let path = root.join("cfg_args");
@@ -44,13 +46,13 @@ impl TrainingConfig {
     }
 }
 
-/// L of the configurations in `root`.
+/// Returns the period L from the YAML files in `root`, and the name of the file.
 fn time_duration(root: &Path) -> Result<Option<(f64, String)>> {
     let mut found: Option<(f64, String)> = None;
-    for path in texts_in(root) {
-        // Others may be of anything.
+    for path in yaml_files_in(root) {
+        // Unrelated text files may be unreadable.
         let Ok(text) = read_text(&path, 1 << 20) else { continue };
-        let Some(span) = span(&text) else { continue };
+        let Some(span) = time_duration_entries(&text) else { continue };
         let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
         let wrong = |expected: String, found: String| Err(Error::input(&path, "key time_duration", expected, found));
         let length = match span[..] {
@@ -70,8 +72,8 @@ fn time_duration(root: &Path) -> Result<Option<(f64, String)>> {
     Ok(found)
 }
 
-/// What stands in the list `time_duration` of a YAML, in one line or below one another.
-fn span(text: &str) -> Option<Vec<&str>> {
+/// Returns the entries of the list `time_duration` of a YAML, written in one line or one per line.
+fn time_duration_entries(text: &str) -> Option<Vec<&str>> {
     let mut lines = text.lines().map(|line| line.split('#').next().unwrap_or_default().trim_end());
     let after = lines.find_map(|line| line.strip_prefix("time_duration:"))?.trim();
     Some(match after.is_empty() {
@@ -87,19 +89,19 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_span_is_found_however_its_list_is_written() {
+    fn time_duration_is_found_in_every_list_notation() {
         for (text, expected) in [
             ("gaussian_dim: 4\ntime_duration: [0.0, 10.0] # seconds\nModelParams:\n", Some(vec!["0.0", "10.0"])),
             ("time_duration:\n- -0.5\n  - 0.5\nrot_4d: True\n", Some(vec!["-0.5", "0.5"])),
             ("time_duration: soon\n", Some(vec!["soon"])),
             ("ModelParams:\n  time_duration: [0, 1]\n", None),
         ] {
-            assert_eq!(span(text), expected, "{text}");
+            assert_eq!(time_duration_entries(text), expected, "{text}");
         }
     }
 
     #[test]
-    fn configurations_beside_a_model_say_its_length_or_what_is_wrong() {
+    fn configuration_files_give_the_duration_or_an_error() {
         let root = tempfile::tempdir().unwrap();
         let write = |name: &str, text: &str| fs::write(root.path().join(name), text).unwrap();
         let read = || time_duration(root.path());

@@ -1,11 +1,12 @@
-//! 4D Gaussian Splatting in its native form (fudan-zvg): Gaussians of four dimensions in a training checkpoint.
+//! 4D Gaussian Splatting in its native form (fudan-zvg): four-dimensional Gaussians in a training checkpoint.
 //!
-//! In: a folder with `chkpnt<K>.pth` or `chkpnt_best.pth`, or such a file: `(capture, iteration)`, the capture a tuple of 19,
-//! or of 12 of a static model. Out: the same checkpoint with fewer rows, optimiser state included, `cfg_args` and the training
-//! configuration if it is there. What they do not say of how it was trained can be said: [`Conventions`].
+//! Input: a folder with `chkpnt<K>.pth` or `chkpnt_best.pth`, or such a file: `(capture, iteration)`, where the capture
+//! is a tuple of 19 (4D) or 12 (static model). Output: the same checkpoint with fewer rows, including optimizer state,
+//! `cfg_args` and the training configuration if it is there. Settings of the training that the files do not record can
+//! be given as [`Conventions`].
 
 mod configuration;
-mod law;
+mod frame_state;
 mod proxies;
 mod rotation;
 
@@ -14,56 +15,61 @@ use std::path::{Path, PathBuf};
 use xxhash_rust::xxh3::Xxh3;
 
 use super::in_checkpoint::still::Still;
-use super::in_checkpoint::{About, InCheckpoint, ProxyRule, Reading, RowElement, count_of, numbered};
+use super::in_checkpoint::{
+    CheckpointModel, CheckpointReader, ModelDescription, ProxyRule, RowElement, numbered_files, row_count,
+};
 use crate::compressed_model::Cluster;
 use crate::error::{Error, Result};
-use crate::files::checkpoint::{Checkpoint, Node, NodeId};
+use crate::files::checkpoint::{Checkpoint, Node, NodeId, Pickle};
 use crate::limits::ReadLimit;
 use crate::model::{Columns, Raw, sh_coefficients};
-use crate::models::input_model::{InputModel, ModelFormat, OpenOptions};
+use crate::models::input_model::{Conventions, InputModel, ModelFormat, OpenOptions};
 use crate::models::motion_model::MotionModelFrames;
 use crate::recipe::MergeParams;
 use configuration::TrainingConfig;
-use law::{Native, ROTATION_R, SCALING_T, TERM, TERMS, TIME};
+use frame_state::{Native, ROTATION_R, SCALING_T, TERM_WIDTH, TERMS, TIME};
 
-/// Lengths of the tuple that a model captures: of four dimensions, and static.
-const MOVING: usize = 19;
-const STATIC: usize = 12;
+/// Length of the capture tuple of a 4D model.
+const CAPTURE_LENGTH_4D: usize = 19;
+/// Length of the capture tuple of a static model.
+const CAPTURE_LENGTH_STATIC: usize = 12;
 
-/// A checkpoint, or the folder of a model.
+/// Checkpoint, or the folder of a model.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
     recognizes: |found| match found.is_folder {
-        // Other families save checkpoints of their own beside their clouds.
+        // Other formats save checkpoints of their own beside a folder `point_cloud`.
         true if found.path.join("point_cloud").is_dir() => {
-            checkpoints(found.path).iter().any(|path| captures(path, &[MOVING], found.memory))
+            checkpoints(found.path).iter().any(|path| has_capture(path, &[CAPTURE_LENGTH_4D], found.memory))
         }
         true => !checkpoints(found.path).is_empty(),
-        false => found.is_checkpoint() && captures(found.path, &[MOVING, STATIC], found.memory),
+        false => {
+            found.is_checkpoint() && has_capture(found.path, &[CAPTURE_LENGTH_4D, CAPTURE_LENGTH_STATIC], found.memory)
+        }
     },
     open: |path, options| {
-        let about = match path.is_dir() {
+        let description = match path.is_dir() {
             true => {
                 let (file, notes) = choose(path, options)?;
-                About { root: Some(path.to_owned()), file, notes, ..About::default() }
+                ModelDescription { root: Some(path.to_owned()), file, notes, ..ModelDescription::default() }
             }
             false => {
                 options.refuse_for(path)?;
-                About { file: path.to_owned(), ..About::default() }
+                ModelDescription { file: path.to_owned(), ..ModelDescription::default() }
             }
         };
-        open(about, options)
+        open(description, options)
     },
 };
 
-/// The best one, then those of iterations.
+/// Returns the best checkpoint, then those of iterations, last one first.
 fn checkpoints(folder: &Path) -> Vec<PathBuf> {
     let best = folder.join("chkpnt_best.pth");
-    let by_number = numbered(folder, "chkpnt", ".pth").into_iter().rev().map(|(_, path)| path);
+    let by_number = numbered_files(folder, "chkpnt", ".pth").into_iter().rev().map(|(_, path)| path);
     best.is_file().then_some(best).into_iter().chain(by_number).collect()
 }
 
-/// Whether the checkpoint at `path` has a tuple of such a length and a number.
-fn captures(path: &Path, lengths: &[usize], memory: ReadLimit) -> bool {
+/// Returns whether the checkpoint at `path` is a pair of a tuple with one of `lengths` and an iteration number.
+fn has_capture(path: &Path, lengths: &[usize], memory: ReadLimit) -> bool {
     let Ok(checkpoint) = Checkpoint::open(path, memory) else { return false };
     let pickle = checkpoint.pickle();
     match pickle.elements(pickle.root()) {
@@ -75,7 +81,8 @@ fn captures(path: &Path, lengths: &[usize], memory: ReadLimit) -> bool {
     }
 }
 
-/// The checkpoint that `options` name, or the best, or the last.
+/// Returns the checkpoint of the requested iteration; without a request the best one, or the last. Adds a note if there
+/// are several.
 fn choose(folder: &Path, options: &OpenOptions) -> Result<(PathBuf, Vec<String>)> {
     let found = checkpoints(folder);
     let name = |path: &Path| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
@@ -90,151 +97,179 @@ fn choose(folder: &Path, options: &OpenOptions) -> Result<(PathBuf, Vec<String>)
             let Some(file) = found.first() else {
                 return Err(Error::input(folder, "", "a file chkpnt<K>.pth", "none"));
             };
-            let note = format!("of {} {} is read (--iteration)", names(), name(file));
+            let note = format!("found {}: {} is read (choose another with --iteration)", names(), name(file));
             Ok((file.clone(), if found.len() > 1 { vec![note] } else { Vec::new() }))
         }
     }
 }
 
-fn open(about: About, options: &OpenOptions) -> Result<Box<dyn InputModel>> {
+/// Returns the SH degree and the number of stored time-dependent SH terms for a number of SH coefficients; `None` if no model
+/// has this number.
+fn sh_layout(coefficients: usize, is_4d: bool) -> Option<(usize, usize)> {
+    match (coefficients, is_4d) {
+        (1 | 4 | 9 | 16, _) => Some((coefficients.isqrt() - 1, 0)),
+        // Coefficients beyond the first 16 belong to a basis that renderers no longer read.
+        (33, true) => Some((3, 0)),
+        (32 | 48, true) => Some((3, coefficients / 16 - 1)),
+        _ => None,
+    }
+}
+
+/// Returns the motion model of a 4D capture with the given `parts`. At most `stored_terms` time-dependent SH terms are active.
+fn motion_model(
+    checkpoint: &Checkpoint,
+    parts: &[NodeId],
+    config: &TrainingConfig,
+    conventions: &Conventions,
+    stored_terms: usize,
+) -> Result<Native> {
+    let pickle = checkpoint.pickle();
+    let wrong = |i: usize, name: &str, expected: &str| {
+        checkpoint.wrong(&place(i, name), expected, checkpoint.describe(parts[i]))
+    };
+    let Node::Bool(has_4d_rotation) = *pickle.node(parts[16]) else {
+        return Err(wrong(16, "rot_4d", "True or False"));
+    };
+    let active = pickle.int(parts[18]).ok_or_else(|| wrong(18, "active_sh_degree_t", "a whole number"))?;
+    let configured = config.time_duration.as_ref().map(|(length, _)| *length);
+    let given_period = conventions.time_duration.or(configured);
+    Ok(Native {
+        has_4d_rotation,
+        flipped: !conventions.rot4d_unflipped,
+        prefilter: config.prefilter,
+        terms: usize::try_from(active).unwrap_or(0).min(stored_terms),
+        given_period,
+        period: given_period.unwrap_or(1.0),
+    })
+}
+
+/// Returns the nodes of a capture that only training reads: its statistics and the tensors of the optimizer.
+fn training_nodes(pickle: &Pickle, parts: &[NodeId], is_4d: bool) -> Vec<NodeId> {
+    let (optimizer, statistics) = if is_4d { (11, 7..11) } else { (10, 7..10) };
+    let mut nodes: Vec<NodeId> = parts[statistics].to_vec();
+    let states = pickle.item(parts[optimizer], "state").and_then(|state| pickle.pairs(state));
+    for (_, state) in states.into_iter().flatten() {
+        nodes.extend(pickle.items(*state).into_iter().flatten().map(|(_, id)| id));
+    }
+    nodes
+}
+
+/// Returns the name of part `i` of a capture for messages.
+fn place(i: usize, name: &str) -> String {
+    format!("capture[{i}] ({name})")
+}
+
+/// Opens a checkpoint as a 4D or a static model.
+fn open(description: ModelDescription, options: &OpenOptions) -> Result<Box<dyn InputModel>> {
     let conventions = options.conventions;
-    let checkpoint = Checkpoint::open(&about.file, options.memory)?;
+    let checkpoint = Checkpoint::open(&description.file, options.memory)?;
     let pickle = checkpoint.pickle();
     let capture = match pickle.elements(pickle.root()) {
         Some(&[capture, _]) => capture,
         _ => return Err(checkpoint.wrong("data.pkl", "(capture, iteration)", checkpoint.describe(pickle.root()))),
     };
     let parts = pickle.elements(capture).unwrap_or_default().to_vec();
-    if ![MOVING, STATIC].contains(&parts.len()) {
+    if ![CAPTURE_LENGTH_4D, CAPTURE_LENGTH_STATIC].contains(&parts.len()) {
         return Err(checkpoint
-            .wrong("capture", "a tuple of 19, or of 12 of a static model", checkpoint.describe(capture))
-            .hint("write its frames as PLY files or as a frame stream with its own renderer, and give those"));
+            .wrong("capture", "a tuple of 19 values, or of 12 for a static model", checkpoint.describe(capture))
+            .hint("export its frames with its own renderer, as PLY files or as a frame stream, and give those"));
     }
-    let moves = parts.len() == MOVING;
-    let root = about.root.as_deref().or(about.file.parent());
+    let is_4d = parts.len() == CAPTURE_LENGTH_4D;
+    let root = description.root.as_deref().or(description.file.parent());
     let config = root.map_or_else(|| Ok(TrainingConfig::default()), TrainingConfig::read)?;
-    let part = |i: usize, name: &str| (parts[i], format!("capture[{i}] ({name})"));
+    let part = |i: usize, name: &str| (parts[i], place(i, name));
     let (xyz, place) = part(1, "xyz");
-    let count = count_of(&checkpoint, xyz, &place)?;
+    let count = row_count(&checkpoint, xyz, &place)?;
     let (rest, place) = part(3, "features_rest");
     let found = checkpoint.float_tensor(rest, &place)?;
     let coefficients = found.shape.get(1).map_or(0, |rest| rest.saturating_add(1));
-    let (degree, stored) = match (coefficients, moves) {
-        (1 | 4 | 9 | 16, _) => (coefficients.isqrt() - 1, 0),
-        // Those beyond the first 16 are of a basis that no renderer reads any more.
-        (33, true) => (3, 0),
-        (32 | 48, true) => (3, coefficients / 16 - 1),
-        _ => {
-            let expected = "shape [N, K − 1, 3], K one of 1, 4, 9, 16, and in four dimensions 32, 33, 48";
-            return Err(checkpoint.wrong(&place, expected, found.describe()));
-        }
+    let Some((degree, stored_terms)) = sh_layout(coefficients, is_4d) else {
+        let expected = "shape [N, K − 1, 3] with K = 1, 4, 9 or 16, or for 4D models also 32, 33 or 48";
+        return Err(checkpoint.wrong(&place, expected, found.describe()));
     };
-    let integer = |i: usize, name: &str| {
-        let (id, place) = part(i, name);
-        pickle.int(id).ok_or_else(|| checkpoint.wrong(&place, "a whole number", checkpoint.describe(id)))
-    };
-    let law = match moves {
-        true => {
-            let (id, place) = part(16, "rot_4d");
-            let Node::Bool(turns) = *pickle.node(id) else {
-                return Err(checkpoint.wrong(&place, "True or False", checkpoint.describe(id)));
-            };
-            let active = usize::try_from(integer(18, "active_sh_degree_t")?).unwrap_or(0);
-            let configured = config.time_duration.as_ref().map(|(length, _)| *length);
-            let given = conventions.time_duration.or(configured);
-            Some(Native {
-                turns,
-                flipped: !conventions.rot4d_unflipped,
-                prefilter: config.prefilter,
-                terms: active.min(stored),
-                given,
-                period: given.unwrap_or(1.0),
-            })
-        }
+    let motion_model = match is_4d {
+        true => Some(motion_model(&checkpoint, &parts, &config, &conventions, stored_terms)?),
         false => None,
     };
-    let mut notes = about.notes.clone();
-    if moves && !matches!(pickle.node(parts[17]), Node::None) {
-        notes.push("its environment map, the sky behind everything, is neither drawn nor compared".to_owned());
+    let mut notes = description.notes.clone();
+    if is_4d && !matches!(pickle.node(parts[17]), Node::None) {
+        notes.push("the environment map of the model (its sky) is neither rendered nor compared".to_owned());
     }
-    if let (Some((length, file)), None, true) = (&config.time_duration, conventions.time_duration, moves) {
-        notes.push(format!("{file} beside it says that its time_duration is {length}"));
+    if let (Some((length, file)), None, true) = (&config.time_duration, conventions.time_duration, is_4d) {
+        notes.push(format!("time_duration = {length} is taken from {file} beside the checkpoint"));
     }
-    let (optimizer, beside) = if moves { (11, 7..11) } else { (10, 7..10) };
-    let mut of_training: Vec<NodeId> = parts[beside].to_vec();
-    let states = pickle.item(parts[optimizer], "state").and_then(|state| pickle.pairs(state));
-    for (_, state) in states.into_iter().flatten() {
-        of_training.extend(pickle.items(*state).into_iter().flatten().map(|(_, id)| id));
-    }
-    let own = law.as_ref().map_or(0, |law| TERMS + TERM * law.terms);
+    let training_nodes = training_nodes(pickle, &parts, is_4d);
+    let terms = motion_model.as_ref().map_or(0, |motion_model| motion_model.terms);
+    let own = if is_4d { TERMS + TERM_WIDTH * terms } else { 0 };
     let bands = sh_coefficients(degree);
-    let mut of_rest = RowElement::all_of(Columns::SH, 3, 3 * (bands - 1));
-    of_rest.extend(RowElement::own(TERMS, TERM * law.as_ref().map_or(0, |law| law.terms)));
-    of_rest.resize(3 * (coefficients - 1), RowElement::Unread);
-    let mut reading = Reading::new(checkpoint, count, degree, own)?;
+    let mut rest_elements = RowElement::all_of(Columns::SH, 3, 3 * (bands - 1));
+    rest_elements.extend(RowElement::own(TERMS, TERM_WIDTH * terms));
+    rest_elements.resize(3 * (coefficients - 1), RowElement::Unread);
+    let mut reader = CheckpointReader::new(checkpoint, count, degree, own)?;
     let mut read = |i: usize, name: &str, row: &[usize], planes| {
         let (id, place) = part(i, name);
-        reading.read(id, &place, row, planes)
+        reader.read(id, &place, row, planes)
     };
     read(1, "xyz", &[3], RowElement::all_of(Columns::POSITION, 0, 3))?;
     read(2, "features_dc", &[1, 3], RowElement::all_of(Columns::SH, 0, 3))?;
-    read(3, "features_rest", &[coefficients - 1, 3], of_rest)?;
+    read(3, "features_rest", &[coefficients - 1, 3], rest_elements)?;
     read(4, "scaling", &[3], RowElement::all_of(Columns::LOG_SCALE, 0, 3))?;
     read(5, "rotation", &[4], RowElement::all_of(Columns::ROTATION, 0, 4))?;
     read(6, "opacity", &[1], RowElement::all_of(Columns::OPACITY, 0, 1))?;
-    if let Some(law) = &law {
+    if let Some(motion_model) = &motion_model {
         read(13, "t", &[1], RowElement::own(TIME, 1))?;
         read(14, "scaling_t", &[1], RowElement::own(SCALING_T, 1))?;
-        if law.turns {
+        if motion_model.has_4d_rotation {
             read(15, "rotation_r", &[4], RowElement::own(ROTATION_R, 4))?;
         }
     }
-    of_training.into_iter().for_each(|id| reading.beside(id));
-    let about = About {
-        kind: if moves { "4D Gaussian Splatting checkpoint" } else { "3D Gaussian Splatting checkpoint" },
+    training_nodes.into_iter().for_each(|id| reader.add_training_tensor(id));
+    let description = ModelDescription {
+        kind: if is_4d { "4D Gaussian Splatting checkpoint" } else { "3D Gaussian Splatting checkpoint" },
         data_folder: config.source_path,
         white_background: config.white_background,
-        seconds_per_state: if moves { 6e-8 } else { 1e-8 },
+        seconds_per_state: if is_4d { 6e-8 } else { 1e-8 },
         notes,
-        ..about
+        ..description
     };
-    Ok(match law {
-        Some(law) => Box::new(InCheckpoint::new(reading, law, about)?),
-        None => Box::new(InCheckpoint::new(reading, Still, about)?),
+    Ok(match motion_model {
+        Some(motion_model) => Box::new(CheckpointModel::new(reader, motion_model, description)?),
+        None => Box::new(CheckpointModel::new(reader, Still, description)?),
     })
 }
 
 impl ProxyRule for Native {
-    fn proposed(model: &MotionModelFrames<Native>, clusters: &[Cluster], rule: &MergeParams) -> Result<Raw> {
-        proxies::proposed(model, clusters, rule)
+    fn propose(model: &MotionModelFrames<Native>, clusters: &[Cluster], rule: &MergeParams) -> Result<Raw> {
+        proxies::propose(model, clusters, rule)
     }
 
-    fn follow(&self, hash: &mut Xxh3) {
+    fn hash_settings(&self, hash: &mut Xxh3) {
         hash.update(&[u8::from(self.flipped)]);
         hash.update(&self.prefilter.to_le_bytes());
-        hash.update(&self.given.unwrap_or(0.0).to_le_bytes());
+        hash.update(&self.given_period.unwrap_or(0.0).to_le_bytes());
     }
 
-    /// L is that of the videos of N3V where frames lie beyond 1, unless it is given.
-    fn at(&self, times: &[f64]) -> Option<Native> {
+    /// Chooses the period L of colors: the given one, else 10 (the length of the N3V videos) if frames lie beyond time
+    /// 1, else 1.
+    fn for_times(&self, times: &[f64]) -> Option<Native> {
         let beyond = times.iter().any(|&time| time > 1.0);
         let guessed = if beyond { 10.0 } else { 1.0 };
-        (self.terms > 0).then(|| Native { period: self.given.unwrap_or(guessed), ..self.clone() })
+        (self.terms > 0).then(|| Native { period: self.given_period.unwrap_or(guessed), ..self.clone() })
     }
 
     fn notes(&self) -> Vec<String> {
-        if self.terms == 0 || self.given.is_some() {
+        if self.terms == 0 || self.given_period.is_some() {
             return Vec::new();
         }
         vec![format!(
-            "the model does not say its time_duration: colours are taken to repeat every {} (--time-duration, as in the \
-             configuration it was trained with)",
+            "the model does not store its time_duration: its colors are assumed to repeat every {} (set \
+             --time-duration to the value of its training configuration)",
             self.period
         )]
     }
 
     fn span(&self) -> f64 {
-        self.given.unwrap_or(1.0)
+        self.given_period.unwrap_or(1.0)
     }
 }
 

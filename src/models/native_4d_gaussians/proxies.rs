@@ -1,29 +1,31 @@
-//! Proxies of Gaussians of four dimensions: a slice for all times and a window make one again.
+//! Proxies of four-dimensional Gaussians: combines the matched slice and temporal window into one 4D Gaussian.
 //!
-//! From the match of the slices (a line, Σ, a window of deviation s): Σ₄ = [[Σ + vvᵀs², vs²], [vᵀs², s²]], whose axes are two
-//! quaternions. Harmonics refer to the proxy's own center: what its members show at frames is fitted by 1, cos and cos of the
-//! double (least squares, with a ridge on the waves).
+//! With the match of the slices (a line with velocity v, Σ, a window of standard deviation s): Σ₄ = [[Σ + vvᵀs², vs²],
+//! [vᵀs², s²]], whose axes give two quaternions. SH coefficients refer to the proxy's own center: the values of the
+//! moment match at the sampled frames are fitted by 1, cos and cos of the double angle (least squares, with a ridge
+//! term on the waves).
 
-use super::law::{Native, ROTATION_R, SCALING_T, TERM, TERMS, TIME};
+use super::frame_state::{Native, ROTATION_R, SCALING_T, TERM_WIDTH, TERMS, TIME};
 use super::rotation::{decomposed, quaternions};
 use crate::compressed_model::Cluster;
 use crate::error::Result;
 use crate::model::{Columns, Raw, scale_rotation};
-use crate::models::in_checkpoint::linear::{LinearPath, match_all};
+use crate::models::in_checkpoint::linear::{LinearPath, match_proxies};
 use crate::models::motion_model::MotionModelFrames;
 use crate::recipe::MergeParams;
 
-/// Part of the frames' weight that holds waves near 0 where frames do not tell them from the constant.
+/// Ridge as a fraction of the total frame weight. Keeps waves near 0 if the frames do not distinguish them from the
+/// constant.
 const RIDGE: f64 = 1e-3;
 
-/// Raw parameters of the proxies of `clusters`.
+/// Returns the raw parameters of the proxies of `clusters`.
 ///
 /// # Errors
-/// Frames that cannot be evaluated.
-pub(super) fn proposed(model: &MotionModelFrames<Native>, clusters: &[Cluster], rule: &MergeParams) -> Result<Raw> {
-    let (raw, law) = (model.raw(), model.law());
+/// Fails if frames cannot be evaluated.
+pub(super) fn propose(model: &MotionModelFrames<Native>, clusters: &[Cluster], rule: &MergeParams) -> Result<Raw> {
+    let (raw, motion_model) = (model.raw(), model.motion_model());
     let line = |id: u32| {
-        let slice = law.slice(raw, id as usize);
+        let slice = motion_model.slice(raw, id as usize);
         LinearPath {
             position: raw.gaussians.position.row::<3>(id as usize).map(f64::from),
             velocity: slice.velocity,
@@ -31,32 +33,32 @@ pub(super) fn proposed(model: &MotionModelFrames<Native>, clusters: &[Cluster], 
             deviation: slice.variance.sqrt(),
         }
     };
-    let fades = |line: &LinearPath, time: f64| law.marginal(time, line.center, line.deviation.powi(2));
+    let window = |line: &LinearPath, time: f64| motion_model.marginal(time, line.center, line.deviation.powi(2));
     let mut fits = vec![ThreeFunctionFit::default(); clusters.len()];
-    let matched = match_all(model, clusters, rule, line, fades, Columns::SH, |seen| {
-        let [first, second] = law.waves(seen.time, seen.line.center);
-        let of = &seen.state.sh;
-        let values = (0..of.width()).map(|c| f64::from(of.plane(c)[seen.row]));
+    let matched = match_proxies(model, clusters, rule, line, window, Columns::SH, |seen| {
+        let [first, second] = motion_model.waves(seen.time, seen.line.center);
+        let sh = &seen.state.sh;
+        let values = (0..sh.width()).map(|c| f64::from(sh.plane(c)[seen.row]));
         fits[seen.proxy].add(seen.weight, [1.0, first, second], values);
     })?;
     let leaders: Vec<u32> = clusters.iter().map(|cluster| cluster.leader).collect();
     let mut proxies = raw.pick(&leaders);
     for (row, (matched, fit)) in matched.iter().zip(&fits).enumerate() {
-        let Some((opacity, covariance)) = matched.seen else { continue };
+        let Some((opacity, covariance)) = matched.shape else { continue };
         let Raw { gaussians, own } = &mut proxies;
         let LinearPath { position, velocity, center, deviation } = matched.line;
         let variance = deviation.powi(2);
         gaussians.position.set_row(row, position.map(|x| x as f32));
         gaussians.opacity_logit.set_row(row, [opacity]);
         own.plane_mut(TIME)[row] = center as f32;
-        if law.turns {
+        if motion_model.has_4d_rotation {
             let [xx, xy, xz, yy, yz, zz] = covariance;
             let space = [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]];
             let velocity = [velocity[0], velocity[1], velocity[2], 1.0];
             let mut whole = [0, 1, 2, 3].map(|i| [0, 1, 2, 3].map(|j| velocity[i] * velocity[j] * variance));
             (0..3).for_each(|i| (0..3).for_each(|j| whole[i][j] += space[i][j]));
             let (scales, rotation) = decomposed(&whole);
-            let [l, r] = quaternions(&rotation, law.flipped);
+            let [l, r] = quaternions(&rotation, motion_model.flipped);
             let [x, y, z, along] = scales.map(|scale| scale.ln() as f32);
             gaussians.log_scale.set_row(row, [x, y, z]);
             gaussians.rotation.set_row(row, l.map(|q| q as f32));
@@ -68,9 +70,10 @@ pub(super) fn proposed(model: &MotionModelFrames<Native>, clusters: &[Cluster], 
             gaussians.rotation.set_row(row, rotation.map(|q| q as f32));
             own.plane_mut(SCALING_T)[row] = variance.ln() as f32;
         }
-        for (c, [constant, waves @ ..]) in fit.solve(law.terms).enumerate() {
+        for (c, [constant, waves @ ..]) in fit.solve(motion_model.terms).enumerate() {
             gaussians.sh.plane_mut(c)[row] = constant as f32;
-            (0..law.terms).for_each(|term| own.plane_mut(TERMS + term * TERM + c)[row] = waves[term] as f32);
+            (0..motion_model.terms)
+                .for_each(|term| own.plane_mut(TERMS + term * TERM_WIDTH + c)[row] = waves[term] as f32);
         }
     }
     Ok(proxies)
@@ -79,11 +82,14 @@ pub(super) fn proposed(model: &MotionModelFrames<Native>, clusters: &[Cluster], 
 /// Sums of a least-squares fit of many values by the same three functions.
 #[derive(Debug, Clone, Default)]
 struct ThreeFunctionFit {
+    /// Weighted products of the functions, summed over samples.
     normal: [[f64; 3]; 3],
+    /// Weighted products of the functions with each value.
     by_value: Vec<[f64; 3]>,
 }
 
 impl ThreeFunctionFit {
+    /// Adds a sample: the functions `basis` and all values at one time.
     fn add(&mut self, weight: f64, basis: [f64; 3], values: impl ExactSizeIterator<Item = f64>) {
         self.by_value.resize(values.len(), [0.0; 3]);
         for (i, row) in self.normal.iter_mut().enumerate() {
@@ -94,7 +100,7 @@ impl ThreeFunctionFit {
         }
     }
 
-    /// Coefficients of each value, of the constant and of the first `terms` waves.
+    /// Returns the coefficients of each value: of the constant and of the first `terms` waves; the others are 0.
     fn solve(&self, terms: usize) -> impl Iterator<Item = [f64; 3]> {
         let mut normal = self.normal;
         let ridge = RIDGE * normal[0][0];
@@ -107,8 +113,8 @@ impl ThreeFunctionFit {
         }
         let inverse = glam::DMat3::from_cols_array_2d(&normal).transpose().inverse();
         self.by_value.iter().map(move |&[a, b, c]| {
-            let of = [a, if terms > 0 { b } else { 0.0 }, if terms > 1 { c } else { 0.0 }];
-            (inverse * glam::DVec3::from(of)).to_array()
+            let sums = [a, if terms > 0 { b } else { 0.0 }, if terms > 1 { c } else { 0.0 }];
+            (inverse * glam::DVec3::from(sums)).to_array()
         })
     }
 }
@@ -118,7 +124,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn waves_are_found_where_frames_show_them_and_small_where_they_do_not() {
+    fn waves_are_fitted_only_if_frames_show_them() {
         let wave = |k: i32, center: f64| {
             let turn = std::f64::consts::TAU * (center - 0.05 * f64::from(k));
             [1.0, turn.cos(), (2.0 * turn).cos()]
@@ -133,11 +139,11 @@ mod tests {
         for (got, expected) in found[0].iter().zip([0.7, -0.4, 0.2]) {
             assert!((got - expected).abs() < 2e-3, "{found:?}");
         }
-        // A single frame: the constant is all that it says.
+        // A single frame determines the constant only.
         short.add(0.5, wave(6, 0.3), [0.7].into_iter());
         let [[constant, first, second]] = short.solve(2).collect::<Vec<_>>()[..] else { panic!("one value") };
         assert!((constant + first + second - 0.7).abs() < 1e-9 && first.abs() < 1e-2 && second.abs() < 1e-2);
-        // Terms that the model has not are not made.
+        // Terms beyond those of the model stay 0.
         let [got, _] = whole.solve(0).collect::<Vec<_>>()[..] else { panic!("two values") };
         assert_eq!(got[1..], [0.0, 0.0]);
     }

@@ -1,41 +1,46 @@
-//! Rotations of four dimensions as pairs of quaternions.
+//! Four-dimensional rotations as pairs of quaternions.
 //!
-//! R = L(l)·R̄(r): L multiplies from the left by the unit quaternion l, R̄ from the right by the conjugate of r, on (w, x, y, z).
-//! Rows and columns are then x, y, z, t once both axes are reversed. Source: `build_rotation_4d` of the repository.
+//! R = L(l)·R̄(r): L multiplies from the left by the unit quaternion l, and R̄ from the right by the conjugate of r, on
+//! (w, x, y, z). After reversing both axes, rows and columns are x, y, z, t. Source: `build_rotation_4d` of the
+//! repository.
 
-/// Rows of a matrix.
+/// 4×4 matrix, row by row.
 pub(super) type Matrix = [[f64; 4]; 4];
 
+/// Returns the matrix of multiplication from the left by a quaternion.
 fn left([a, b, c, d]: [f64; 4]) -> Matrix {
     [[a, -b, -c, -d], [b, a, -d, c], [c, d, a, -b], [d, -c, b, a]]
 }
 
+/// Returns the matrix of multiplication from the right by the conjugate of a quaternion.
 fn right([p, q, r, s]: [f64; 4]) -> Matrix {
     [[p, q, r, s], [-q, p, -s, r], [-r, s, p, -q], [-s, -r, q, p]]
 }
 
+/// Returns the matrix product.
 fn product(a: &Matrix, b: &Matrix) -> Matrix {
     [0, 1, 2, 3].map(|i| [0, 1, 2, 3].map(|j| (0..4).map(|k| a[i][k] * b[k][j]).sum()))
 }
 
-/// Both axes reversed; its own inverse.
+/// Reverses the order of rows and columns. Applied twice, it returns the original matrix.
 fn reversed(a: &Matrix) -> Matrix {
     [3, 2, 1, 0].map(|i| [3, 2, 1, 0].map(|j| a[i][j]))
 }
 
+/// Returns the normalized quaternion; 1 for a quaternion of length 0.
 fn unit(q: [f64; 4]) -> [f64; 4] {
     let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
     if length > 0.0 { q.map(|x| x / length) } else { [1.0, 0.0, 0.0, 0.0] }
 }
 
-/// The rotation of two quaternions of any length but 0, which counts as 1; not `flipped`: as in checkpoints from before
-/// 15 September 2024, without the reversal.
+/// Returns the rotation matrix of two quaternions of any length; length 0 counts as the quaternion 1. `flipped`
+/// reverses both axes; checkpoints from before 15 September 2024 have no reversal.
 pub(super) fn rotation([l, r]: [[f64; 4]; 2], flipped: bool) -> Matrix {
     let whole = product(&left(unit(l)), &right(unit(r)));
     if flipped { reversed(&whole) } else { whole }
 }
 
-/// Unit quaternions whose rotation is `matrix`, one of determinant 1.
+/// Returns unit quaternions whose rotation is `matrix`, which must have determinant 1.
 pub(super) fn quaternions(matrix: &Matrix, flipped: bool) -> [[f64; 4]; 2] {
     let matrix = if flipped { reversed(matrix) } else { *matrix };
     let axis = |i: usize| {
@@ -43,40 +48,41 @@ pub(super) fn quaternions(matrix: &Matrix, flipped: bool) -> [[f64; 4]; 2] {
         axis[i] = 1.0;
         axis
     };
-    // Products of the basis are orthogonal, each of squared length 4: these are the coefficients l_i·r_j, of rank 1.
+    // Products of the basis matrices are orthogonal, each with squared norm 4. The result is the matrix of coefficients
+    // l_i·r_j, of rank 1.
     let coefficient = |i: usize, j: usize| -> f64 {
-        let of = product(&left(axis(i)), &right(axis(j)));
-        of.iter().flatten().zip(matrix.iter().flatten()).map(|(a, b)| a * b).sum::<f64>() / 4.0
+        let basis = product(&left(axis(i)), &right(axis(j)));
+        basis.iter().flatten().zip(matrix.iter().flatten()).map(|(a, b)| a * b).sum::<f64>() / 4.0
     };
     let rows: [[f64; 4]; 4] = [0, 1, 2, 3].map(|i| [0, 1, 2, 3].map(|j| coefficient(i, j)));
     let square = |row: &[f64; 4]| row.iter().map(|x| x * x).sum::<f64>();
-    let strongest = (1..4).fold(0, |most, i| if square(&rows[i]) > square(&rows[most]) { i } else { most });
+    let strongest = (1..4).fold(0, |largest, i| if square(&rows[i]) > square(&rows[largest]) { i } else { largest });
     let r = unit(rows[strongest]);
     let l = rows.map(|row| row.iter().zip(r).map(|(a, b)| a * b).sum::<f64>());
     [unit(l), r]
 }
 
-/// R diag(s)² Rᵀ.
+/// Returns R diag(s)² Rᵀ.
 pub(super) fn covariance(rotation: &Matrix, scales: [f64; 4]) -> Matrix {
     [0, 1, 2, 3]
         .map(|i| [0, 1, 2, 3].map(|j| (0..4).map(|k| rotation[i][k] * scales[k].powi(2) * rotation[j][k]).sum()))
 }
 
-/// Scales and rotation (determinant 1) of a covariance, by Jacobi's method: the axis that goes furthest along time is last.
-/// Squares of scales are at least 1e-14.
+/// Returns scales and rotation (determinant 1) of a covariance by Jacobi's method. The axis with the largest time
+/// component comes last. Squares of scales are at least 1e-14.
 pub(super) fn decomposed(covariance: &Matrix) -> ([f64; 4], Matrix) {
     const SWEEPS: usize = 16;
-    const LEAST: f64 = 1e-14;
+    const MIN_SQUARE: f64 = 1e-14;
     let mut a = [0, 1, 2, 3].map(|i| [0, 1, 2, 3].map(|j| 0.5 * (covariance[i][j] + covariance[j][i])));
     // Row i is axis i.
     let mut axes = [0, 1, 2, 3].map(|i| [0, 1, 2, 3].map(|j| f64::from(u8::from(i == j))));
-    let most = a.iter().flatten().fold(0.0f64, |most, x| most.max(x.abs()));
+    let largest = a.iter().flatten().fold(0.0f64, |largest, x| largest.max(x.abs()));
     for _ in 0..SWEEPS {
-        let mut off = 0.0f64;
+        let mut relative_difference = 0.0f64;
         for p in 0..4 {
             for q in p + 1..4 {
-                off = off.max(a[p][q].abs());
-                if a[p][q].abs() <= 1e-19 * most {
+                relative_difference = relative_difference.max(a[p][q].abs());
+                if a[p][q].abs() <= 1e-19 * largest {
                     continue;
                 }
                 let zeta = (a[q][q] - a[p][p]) / (2.0 * a[p][q]);
@@ -93,14 +99,14 @@ pub(super) fn decomposed(covariance: &Matrix) -> ([f64; 4], Matrix) {
                 }
             }
         }
-        if off <= 1e-18 * most {
+        if relative_difference <= 1e-18 * largest {
             break;
         }
     }
-    let along = (0..3).fold(3, |last, i| if axes[i][3].abs() > axes[last][3].abs() { i } else { last });
+    let time_axis = (0..3).fold(3, |last, i| if axes[i][3].abs() > axes[last][3].abs() { i } else { last });
     let mut order = [0, 1, 2, 3];
-    order.swap(along, 3);
-    let scales = order.map(|i| a[i][i].max(LEAST).sqrt());
+    order.swap(time_axis, 3);
+    let scales = order.map(|i| a[i][i].max(MIN_SQUARE).sqrt());
     let mut rotation = [0, 1, 2, 3].map(|row| order.map(|i| axes[i][row]));
     if determinant(&rotation) < 0.0 {
         rotation.iter_mut().for_each(|row| row[0] = -row[0]);
@@ -108,11 +114,13 @@ pub(super) fn decomposed(covariance: &Matrix) -> ([f64; 4], Matrix) {
     (scales, rotation)
 }
 
+/// Returns the determinant by expansion along the first row.
 fn determinant(a: &Matrix) -> f64 {
     let minor = |row: [usize; 3], column: [usize; 3]| {
-        let of = |i: usize, j: usize| a[row[i]][column[j]];
-        of(0, 0) * (of(1, 1) * of(2, 2) - of(1, 2) * of(2, 1)) - of(0, 1) * (of(1, 0) * of(2, 2) - of(1, 2) * of(2, 0))
-            + of(0, 2) * (of(1, 0) * of(2, 1) - of(1, 1) * of(2, 0))
+        let entry = |i: usize, j: usize| a[row[i]][column[j]];
+        entry(0, 0) * (entry(1, 1) * entry(2, 2) - entry(1, 2) * entry(2, 1))
+            - entry(0, 1) * (entry(1, 0) * entry(2, 2) - entry(1, 2) * entry(2, 0))
+            + entry(0, 2) * (entry(1, 0) * entry(2, 1) - entry(1, 1) * entry(2, 0))
     };
     let columns = [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]];
     (0..4).map(|j| if j % 2 == 0 { 1.0 } else { -1.0 } * a[0][j] * minor([1, 2, 3], columns[j])).sum()
@@ -124,7 +132,7 @@ mod tests {
 
     use super::*;
 
-    /// Of quaternions as (w, x, y, z).
+    /// Returns the product of two quaternions (w, x, y, z).
     fn hamilton([a, b, c, d]: [f64; 4], [p, q, r, s]: [f64; 4]) -> [f64; 4] {
         [
             a * p - b * q - c * r - d * s,
@@ -138,14 +146,18 @@ mod tests {
         prop::array::uniform4(-2.0..2.0f64).prop_filter("direction", |q| q.iter().map(|x| x * x).sum::<f64>() > 0.05)
     }
 
-    fn off(a: &Matrix, b: &Matrix) -> f64 {
-        let most = b.iter().flatten().fold(0.0f64, |most, x| most.max(x.abs()));
-        a.iter().flatten().zip(b.iter().flatten()).fold(0.0f64, |off, (a, b)| off.max((a - b).abs())) / most
+    fn relative_difference(a: &Matrix, b: &Matrix) -> f64 {
+        let largest = b.iter().flatten().fold(0.0f64, |largest, x| largest.max(x.abs()));
+        a.iter()
+            .flatten()
+            .zip(b.iter().flatten())
+            .fold(0.0f64, |relative_difference, (a, b)| relative_difference.max((a - b).abs()))
+            / largest
     }
 
     proptest! {
         #[test]
-        fn a_rotation_multiplies_by_one_quaternion_and_the_conjugate_of_the_other(
+        fn rotation_multiplies_by_l_and_the_conjugate_of_r(
             l in quaternion(), r in quaternion(), at in quaternion()
         ) {
             let conjugate = |[a, b, c, d]: [f64; 4]| [a, -b, -c, -d];
@@ -153,21 +165,21 @@ mod tests {
             let apply = |matrix: &Matrix, at: [f64; 4]| matrix.map(|row| (0..4).map(|k| row[k] * at[k]).sum::<f64>());
             let got = apply(&rotation([l, r], false), at);
             prop_assert!((0..4).all(|i| (got[i] - expected[i]).abs() < 1e-13), "{got:?} {expected:?}");
-            // Reversed: of (z, y, x, w), as (z, y, x, w).
+            // Reversed axes map (z, y, x, w) to (z, y, x, w).
             let back = |[a, b, c, d]: [f64; 4]| [d, c, b, a];
             let got = back(apply(&rotation([l, r], true), back(at)));
             prop_assert!((0..4).all(|i| (got[i] - expected[i]).abs() < 1e-13), "{got:?} {expected:?}");
         }
 
         #[test]
-        fn quaternions_are_those_of_the_rotation(l in quaternion(), r in quaternion(), flipped: bool) {
+        fn quaternions_reproduce_the_rotation(l in quaternion(), r in quaternion(), flipped: bool) {
             let matrix = rotation([l, r], flipped);
             prop_assert!((determinant(&matrix) - 1.0).abs() < 1e-13);
-            prop_assert!(off(&rotation(quaternions(&matrix, flipped), flipped), &matrix) < 1e-14);
+            prop_assert!(relative_difference(&rotation(quaternions(&matrix, flipped), flipped), &matrix) < 1e-14);
         }
 
         #[test]
-        fn a_decomposed_covariance_is_made_again(
+        fn decomposition_reproduces_the_covariance(
             l in quaternion(), r in quaternion(), logs in prop::array::uniform4(-5.0..1.0f64), flipped: bool
         ) {
             let expected = covariance(&rotation([l, r], flipped), logs.map(f64::exp));
@@ -175,7 +187,7 @@ mod tests {
             prop_assert!((determinant(&found) - 1.0).abs() < 1e-12);
             prop_assert!((0..3).all(|i| found[3][i].abs() <= found[3][3].abs()));
             let again = covariance(&rotation(quaternions(&found, flipped), flipped), scales);
-            prop_assert!(off(&again, &expected) < 1e-14, "{}", off(&again, &expected));
+            prop_assert!(relative_difference(&again, &expected) < 1e-14, "{}", relative_difference(&again, &expected));
         }
     }
 }

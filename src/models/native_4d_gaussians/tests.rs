@@ -21,17 +21,17 @@ use crate::recipe::Recipe;
 const COUNT: usize = 6;
 const TIMES: [f64; 5] = [0.0, 0.3, 0.5, 1.1, 1.9];
 
-/// As good as noise, from -½ to ½.
+/// Returns pseudo-random values from -½ to ½.
 fn noise(n: usize, seed: f64) -> Vec<f32> {
     (0..n).map(|i| ((i as f64 * 0.754_877 + seed * 0.569_84).fract() - 0.5) as f32).collect()
 }
 
-/// The parameters of a made model, in the capture's order.
+/// Returns the parameters of a test model, with their indices in the capture.
 fn parameters(turns: bool) -> Vec<(usize, MadeTensor)> {
     let add = |values: Vec<f32>, by: f32| values.into_iter().map(|x| x + by).collect::<Vec<f32>>();
     let (n, shape) = (COUNT, |row: &[usize]| [&[COUNT], row].concat());
     let right: (&[usize], usize) = if turns { (&[4], 4) } else { (&[0], 0) };
-    let of: [(usize, &[usize], Vec<f32>); 9] = [
+    let tensors: [(usize, &[usize], Vec<f32>); 9] = [
         (1, &[3], noise(3 * n, 1.0)),
         (2, &[1, 3], noise(3 * n, 2.0)),
         (3, &[47, 3], noise(141 * n, 3.0)),
@@ -42,11 +42,12 @@ fn parameters(turns: bool) -> Vec<(usize, MadeTensor)> {
         (14, &[1], add(noise(n, 8.0), -1.0)),
         (15, right.0, noise(right.1 * n, 9.0)),
     ];
-    of.into_iter().enumerate().map(|(k, (i, row, values))| (i, tensor(k, &shape(row), &values))).collect()
+    tensors.into_iter().enumerate().map(|(k, (i, row, values))| (i, tensor(k, &shape(row), &values))).collect()
 }
 
+/// Returns the parts of the capture tuple of a test model.
 fn capture(turns: bool) -> Vec<Made> {
-    let mut parts = vec![Made::None; MOVING];
+    let mut parts = vec![Made::None; CAPTURE_LENGTH_4D];
     let mut state = Vec::new();
     for (k, (i, tensor)) in parameters(turns).into_iter().enumerate() {
         let adam = |seed: f64, storage: usize| MadeTensor {
@@ -72,18 +73,18 @@ fn capture(turns: bool) -> Vec<Made> {
     parts
 }
 
-struct Place(tempfile::TempDir);
+struct CheckpointFolder(tempfile::TempDir);
 
-impl Place {
-    fn new() -> Place {
-        Place(tempfile::tempdir().unwrap())
+impl CheckpointFolder {
+    fn new() -> CheckpointFolder {
+        CheckpointFolder(tempfile::tempdir().unwrap())
     }
 
     fn path(&self, name: &str) -> PathBuf {
         self.0.path().join(name)
     }
 
-    /// A folder with these parts as its checkpoint.
+    /// Writes a model folder with these parts as its checkpoint.
     fn put(&self, parts: Vec<Made>) -> PathBuf {
         let root = self.path("model");
         fs::create_dir_all(&root).unwrap();
@@ -125,12 +126,12 @@ fn rule() -> crate::recipe::MergeParams {
     Recipe::preset("default").unwrap().merge
 }
 
-/// A row, by way of the inverse: the covariance of a slice is that of the block of the inverse of Σ₄ for space. The rotation by
-/// what it does to the axes as quaternions.
+/// Checks a row against an independent computation. The covariance of a slice is the inverse of the spatial block of
+/// the inverse of Σ₄. The rotation is computed by applying the quaternions to each axis.
 fn check(parameters: &[(usize, MadeTensor)], flipped: bool, row: usize, time: f64, state: &Gaussians) {
-    let of = |i: usize| floats(&parameters.iter().find(|part| part.0 == i).unwrap().1, row);
+    let values = |i: usize| floats(&parameters.iter().find(|part| part.0 == i).unwrap().1, row);
     let unit = |q: Vec<f64>| DVec4::from_slice(&q).normalize().to_array();
-    let (l, r) = (unit(of(5)), unit(of(15)));
+    let (l, r) = (unit(values(5)), unit(values(15)));
     let hamilton = |[a, b, c, d]: [f64; 4], [p, q, r, s]: [f64; 4]| {
         [
             a * p - b * q - c * r - d * s,
@@ -146,13 +147,13 @@ fn check(parameters: &[(usize, MadeTensor)], flipped: bool, row: usize, time: f6
         DVec4::from(back(hamilton(hamilton(l, back(axis)), [r[0], -r[1], -r[2], -r[3]])))
     };
     let turn = DMat4::from_cols(axis(0), axis(1), axis(2), axis(3));
-    let scales = [of(4), of(14)].concat();
+    let scales = [values(4), values(14)].concat();
     let squares = DMat4::from_diagonal(DVec4::from_slice(&scales).map(|x| (2.0 * x).exp()));
     let whole = turn * squares * turn.transpose();
     let slice = DMat3::from_mat4(whole.inverse()).inverse();
-    let (dt, variance) = (time - of(13)[0], whole.col(3)[3]);
+    let (dt, variance) = (time - values(13)[0], whole.col(3)[3]);
     for c in 0..3 {
-        let expected = of(1)[c] + whole.col(3)[c] / variance * dt;
+        let expected = values(1)[c] + whole.col(3)[c] / variance * dt;
         let got = f64::from(state.position.plane(c)[row]);
         assert!((got - expected).abs() < 1e-6, "position {c}: {got} {expected}");
     }
@@ -165,11 +166,11 @@ fn check(parameters: &[(usize, MadeTensor)], flipped: bool, row: usize, time: f6
     let most = expected.iter().fold(0.0f64, |most, x| most.max(x.abs()));
     got.iter().zip(expected).for_each(|(a, b)| assert!((a - b).abs() < 2e-6 * most, "{got:?} {expected:?}"));
     let m = (-0.5 * dt * dt / variance).exp();
-    let expected = if m > 0.05 { m / (1.0 + (-of(6)[0]).exp()) } else { 0.0 };
+    let expected = if m > 0.05 { m / (1.0 + (-values(6)[0]).exp()) } else { 0.0 };
     let got = opacity(state.opacity_logit.plane(0)[row]);
     assert!((got - expected).abs() < 2e-7, "opacity {got} {expected}");
     let angle = std::f64::consts::TAU * -dt / 2.0;
-    let harmonics = [of(2), of(3)].concat();
+    let harmonics = [values(2), values(3)].concat();
     for c in 0..48 {
         let expected = harmonics[c] + angle.cos() * harmonics[48 + c] + (2.0 * angle).cos() * harmonics[96 + c];
         let got = f64::from(state.sh.plane(c)[row]);
@@ -178,9 +179,9 @@ fn check(parameters: &[(usize, MadeTensor)], flipped: bool, row: usize, time: f6
 }
 
 #[test]
-fn states_are_slices_of_four_dimensions_in_both_conventions() {
-    let place = Place::new();
-    let root = place.put(capture(true));
+fn states_are_4d_slices_in_both_conventions() {
+    let folder = CheckpointFolder::new();
+    let root = folder.put(capture(true));
     for unflipped in [false, true] {
         let model = open_as(&root, unflipped).unwrap();
         assert_eq!((model.kind(), model.background()), ("4D Gaussian Splatting checkpoint", Some([1.0; 3])));
@@ -188,43 +189,43 @@ fn states_are_slices_of_four_dimensions_in_both_conventions() {
             (0..COUNT).for_each(|row| check(&parameters(true), !unflipped, row, time, state));
         }
     }
-    // Some are cut off, and some are not.
+    // Some states are below the cutoff and some are not.
     let cut = |x: &&f32| **x == -40.0;
-    let of = states(&*open(&root));
-    let cuts: usize = of.iter().map(|state| state.opacity_logit.planes().iter().filter(cut).count()).sum();
+    let all_states = states(&*open(&root));
+    let cuts: usize = all_states.iter().map(|state| state.opacity_logit.planes().iter().filter(cut).count()).sum();
     assert!((1..TIMES.len() * COUNT - 1).contains(&cuts), "{cuts}");
 }
 
 #[test]
-fn without_a_rotation_of_four_dimensions_time_stands_alone() {
-    let place = Place::new();
+fn without_4d_rotation_space_and_time_are_independent() {
+    let folder = CheckpointFolder::new();
     let parts = parameters(false);
-    let model = open(&place.put(capture(false)));
-    let of = |i: usize, row: usize| floats(&parts.iter().find(|part| part.0 == i).unwrap().1, row);
+    let model = open(&folder.put(capture(false)));
+    let values = |i: usize, row: usize| floats(&parts.iter().find(|part| part.0 == i).unwrap().1, row);
     for (state, time) in states(&*model).iter().zip(TIMES) {
         for row in 0..COUNT {
-            assert_eq!(state.position.row::<3>(row).map(f64::from).to_vec(), of(1, row));
-            assert_eq!(state.log_scale.row::<3>(row).map(f64::from).to_vec(), of(4, row));
-            let m = (-0.5 * (time - of(13, row)[0]).powi(2) / of(14, row)[0].exp()).exp();
-            let expected = if m > 0.05 { m / (1.0 + (-of(6, row)[0]).exp()) } else { 0.0 };
+            assert_eq!(state.position.row::<3>(row).map(f64::from).to_vec(), values(1, row));
+            assert_eq!(state.log_scale.row::<3>(row).map(f64::from).to_vec(), values(4, row));
+            let m = (-0.5 * (time - values(13, row)[0]).powi(2) / values(14, row)[0].exp()).exp();
+            let expected = if m > 0.05 { m / (1.0 + (-values(6, row)[0]).exp()) } else { 0.0 };
             assert!((opacity(state.opacity_logit.plane(0)[row]) - expected).abs() < 2e-7);
         }
     }
 }
 
 #[test]
-fn what_is_left_keeps_its_bytes_in_every_tensor_with_rows() {
-    let place = Place::new();
-    let model = open(&place.put(capture(true)));
+fn kept_rows_keep_their_bytes_in_every_tensor() {
+    let folder = CheckpointFolder::new();
+    let model = open(&folder.put(capture(true)));
     let whole = states(&*model);
-    let result = place.written(&*model, &CompressedModel::pruned(vec![1, 4, 5], &rule()));
+    let result = folder.written(&*model, &CompressedModel::pruned(vec![1, 4, 5], &rule()));
     let left = states(&*open(&result));
     left.iter().zip(&whole).for_each(|(left, whole)| assert_eq!(*left, whole.pick(&[1, 4, 5])));
-    assert_eq!(fs::read(result.join("cfg_args")).unwrap(), fs::read(place.path("model/cfg_args")).unwrap());
-    let checkpoints = [place.path("model"), result]
+    assert_eq!(fs::read(result.join("cfg_args")).unwrap(), fs::read(folder.path("model/cfg_args")).unwrap());
+    let checkpoints = [folder.path("model"), result]
         .map(|root| Checkpoint::open(&root.join("chkpnt30000.pth"), ReadLimit::NONE).unwrap());
     let [before, after] = checkpoints.each_ref().map(|checkpoint| checkpoint.tensors().collect::<Vec<_>>());
-    // Nine parameters, two values that training keeps of each, four of its statistics.
+    // Nine parameters with two optimizer values each, and four training statistics.
     assert_eq!((before.len(), after.len()), (31, 31));
     for (b, a) in before.iter().zip(&after) {
         assert_eq!(a.shape, [&[3], &b.shape[1..]].concat());
@@ -236,16 +237,16 @@ fn what_is_left_keeps_its_bytes_in_every_tensor_with_rows() {
 }
 
 #[test]
-fn merged_and_changed_ones_read_back_as_they_were_shown() {
-    let place = Place::new();
-    // The second is the first again, but for its opacity.
+fn written_proxies_and_deltas_read_back() {
+    let folder = CheckpointFolder::new();
+    // Gaussian 1 is a copy of Gaussian 0.
     let mut parts = capture(true);
     for (i, mut tensor) in parameters(true) {
         let width = tensor.bytes.len() / COUNT;
         tensor.bytes.copy_within(0..width, width);
         parts[i] = Made::Parameter(tensor);
     }
-    let model = open(&place.put(parts));
+    let model = open(&folder.put(parts));
     let cluster = Cluster { output: 0, leader: 0, members: vec![(0, 0.6), (1, 0.4)] };
     let reference = Reference { frame: 2, extent: 10.0 };
     let proxies = model.solve(std::slice::from_ref(&cluster), reference, &rule()).unwrap();
@@ -257,17 +258,17 @@ fn merged_and_changed_ones_read_back_as_they_were_shown() {
     let by = Gaussians { rotation: Default::default(), log_scale: Default::default(), ..by };
     let reduction = CompressedModel { clusters: vec![cluster], proxies, change: ParamDelta(by), ..pruned };
     let shown = model.reduced(&reduction).unwrap();
-    let result = place.written(&*model, &reduction);
+    let result = folder.written(&*model, &reduction);
     let whole = states(&*model);
     for (frame, state) in states(&*open(&result)).iter().enumerate() {
         assert_eq!(*state, gather_all(&*shown, frame, Columns::all()).unwrap());
-        // Two alike move as one of them.
+        // A proxy of two equal Gaussians moves as they do.
         let [got, expected] = [(state, 0), (&whole[frame], 1)].map(|(state, row)| state.position.row::<3>(row));
         (0..3).for_each(|c| assert!((got[c] - expected[c]).abs() < 2e-6, "{got:?} {expected:?}"));
         let moved = state.position.row::<1>(2)[0] - whole[frame].position.row::<1>(4)[0];
         assert!((moved - 0.5).abs() < 1e-6, "{moved}");
     }
-    // What training kept of it does not belong to it any more.
+    // Optimizer state of merged Gaussians is reset.
     let checkpoint = Checkpoint::open(&result.join("chkpnt30000.pth"), ReadLimit::NONE).unwrap();
     let average = checkpoint.tensors().find(|tensor| tensor.storage == "20").unwrap();
     let values = checkpoint.floats(&average, "").unwrap();
@@ -275,47 +276,48 @@ fn merged_and_changed_ones_read_back_as_they_were_shown() {
 }
 
 #[test]
-fn a_static_capture_is_a_static_model() {
-    let place = Place::new();
+fn static_capture_is_read_as_static_model() {
+    let folder = CheckpointFolder::new();
     let moving = capture(false);
     let order = [0, 1, 2, 3, 4, 5, 6, 7, 8, 10, 11, 12];
     let mut parts: Vec<Made> = order.iter().map(|&i| moving[i].clone()).collect();
     parts[3] = Made::Parameter(tensor(2, &[COUNT, 15, 3], &noise(45 * COUNT, 3.0)));
-    let root = place.put(parts);
+    let root = folder.put(parts);
     let model = models::open(&root, &OpenOptions::default()).unwrap();
     assert_eq!(model.kind(), "3D Gaussian Splatting checkpoint");
     let state = gather_all(model.source(), 0, Columns::all()).unwrap();
     assert_eq!(f64::from(state.sh.plane(5)[2]), floats(&tensor(0, &[COUNT, 45], &noise(45 * COUNT, 3.0)), 2)[2]);
-    let result = place.written(&*model, &CompressedModel::pruned(vec![2], &rule()));
+    let result = folder.written(&*model, &CompressedModel::pruned(vec![2], &rule()));
     let left = models::open(&result, &OpenOptions::default()).unwrap();
     assert_eq!(gather_all(left.source(), 0, Columns::all()).unwrap(), state.pick(&[2]));
 }
 
 #[test]
-fn the_best_checkpoint_is_read_or_the_one_that_is_named() {
-    let place = Place::new();
-    let root = place.put(capture(true));
+fn best_or_requested_checkpoint_is_read() {
+    let folder = CheckpointFolder::new();
+    let root = folder.put(capture(true));
     fs::copy(root.join("chkpnt30000.pth"), root.join("chkpnt_best.pth")).unwrap();
     let notes = models::open(&root, &OpenOptions::default()).unwrap().notes();
     assert!(notes.iter().any(|note| note.contains("chkpnt_best.pth is read")), "{notes:?}");
     assert!(notes.iter().any(|note| note.contains("--time-duration")), "{notes:?}");
-    let of = |iteration| models::open(&root, &OpenOptions { iteration: Some(iteration), ..OpenOptions::default() });
-    assert!(of(30_000).unwrap().notes().iter().all(|note| !note.contains("best")));
-    let error = of(7).err().unwrap().to_string();
+    let open_iteration =
+        |iteration| models::open(&root, &OpenOptions { iteration: Some(iteration), ..OpenOptions::default() });
+    assert!(open_iteration(30_000).unwrap().notes().iter().all(|note| !note.contains("best")));
+    let error = open_iteration(7).err().unwrap().to_string();
     assert!(error.contains("chkpnt7.pth") && error.contains("chkpnt30000.pth"), "{error}");
-    // The period that is guessed follows from the times.
+    // The guessed period depends on the times.
     let at = |times: Vec<f64>| models::open(&root, &OpenOptions::default()).unwrap().with_times(times).unwrap().notes();
     assert!(at(vec![0.0, 1.0]).iter().any(|note| note.contains("every 1 ")), "{:?}", at(vec![0.0]));
     assert!(at(vec![0.0, 1.5]).iter().any(|note| note.contains("every 10 ")));
 }
 
 #[test]
-fn what_is_wrong_is_named() {
-    let place = Place::new();
-    let said = |change: &dyn Fn(&mut Vec<Made>)| {
+fn errors_name_the_tensor_and_the_problem() {
+    let folder = CheckpointFolder::new();
+    let error_message = |change: &dyn Fn(&mut Vec<Made>)| {
         let mut parts = capture(true);
         change(&mut parts);
-        open_as(&place.put(parts), false).err().expect("must be refused").to_string()
+        open_as(&folder.put(parts), false).err().expect("must be refused").to_string()
     };
     type Wrong = fn(&mut Vec<Made>);
     let cases: [(Wrong, &[&str]); 8] = [
@@ -343,13 +345,13 @@ fn what_is_wrong_is_named() {
         (|parts| parts.truncate(15), &["tuple of 15", "19"]),
     ];
     for (change, expected) in cases {
-        let message = said(&change);
+        let message = error_message(&change);
         assert!(expected.iter().chain(&["chkpnt30000.pth"]).all(|part| message.contains(part)), "{message}");
     }
-    let whole = fs::read(place.put(capture(true)).join("chkpnt30000.pth")).unwrap();
+    let whole = fs::read(folder.put(capture(true)).join("chkpnt30000.pth")).unwrap();
     for length in (0..whole.len()).step_by(997) {
-        fs::write(place.path("model/chkpnt30000.pth"), &whole[..length]).unwrap();
-        let message = open_as(&place.path("model"), false).err().unwrap().to_string();
+        fs::write(folder.path("model/chkpnt30000.pth"), &whole[..length]).unwrap();
+        let message = open_as(&folder.path("model"), false).err().unwrap().to_string();
         assert!(message.contains("chkpnt30000.pth"), "{message}");
     }
 }

@@ -1,18 +1,22 @@
-//! SC-GS as a family: a canonical cloud that follows a few nodes, which a network of position and time moves.
+//! SC-GS as a model format: canonical Gaussians that follow a few control nodes, which a network of position and time
+//! moves.
 //!
-//! State at t: what the network says of each node is summed with the shares that a Gaussian has in the nodes nearest to it
-//! ([`Nodes`]) and multiplied by its mask, σ of its last feature (1 without one). x = xyz + warp; scale = exp(scale) + d_scaling, of
-//! which only the square counts; rotation = rot + d_rotation, of the raw rot, made unit afterwards. Where the network predicts
-//! them, opacity = σ(opacity) + d_opacity, and a color is added to harmonics of degree 0. With `deform_type='mlp'` there are
-//! neither nodes nor mask, and the network sees each Gaussian. Source: Huang et al., "SC-GS: Sparse-Controlled Gaussian
-//! Splatting for Editable Dynamic Scenes", 2024, and its public code.
+//! State at time t: the network's outputs for the nodes nearest to a Gaussian are summed with its node weights
+//! ([`Nodes`]) and multiplied by its motion mask, σ of its last feature (1 without a mask). x = xyz + warp; scale =
+//! exp(scale) + d_scaling, of which only the square matters; rotation = rot + d_rotation of the raw rot, normalized
+//! afterwards. If the network predicts them, opacity = σ(opacity) + d_opacity, and a color is added to the SH
+//! coefficients of degree 0. With `deform_type='mlp'` there are neither nodes nor mask, and the network is evaluated at
+//! each Gaussian. Source: Huang et al., "SC-GS: Sparse-Controlled Gaussian Splatting for Editable Dynamic Scenes",
+//! 2024, and its public code.
 
 mod nodes;
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, PoisonError};
 
-use super::deform_folder::{Arguments, Deforming, Folder, LEAST_SCALE, Parts, has_network, names_of_network};
+use super::deform_folder::{
+    Arguments, DeformFolder, MIN_SCALE, ModelParts, NetworkMotionModel, has_network, network_tensor_names,
+};
 use crate::deform::{Encoded, Network, PredictedMotion};
 use crate::error::{Error, Result, quoted};
 use crate::model::functions::{exp, ln};
@@ -21,7 +25,7 @@ use crate::models::input_model::ModelFormat;
 use crate::models::motion_model::{MotionModel, copy_stored};
 use nodes::Nodes;
 
-/// A model folder, told from the other family of such by a key of its configuration or by its nodes.
+/// SC-GS model folder, distinguished from Deformable-3D-Gaussians by a key of its configuration or by its nodes.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
     recognizes: |found| {
         let typed = || {
@@ -30,60 +34,67 @@ pub(super) const ENTRY: ModelFormat = ModelFormat {
         };
         found.is_folder
             && has_network(found.path)
-            && (typed() || names_of_network(found.path, found.memory).iter().any(|name| name == "nodes"))
+            && (typed() || network_tensor_names(found.path, found.memory).iter().any(|name| name == "nodes"))
     },
-    open: |path, options| Folder::open(path, options, Control::new),
+    open: |path, options| DeformFolder::open(path, options, NodeMotion::new),
 };
 
-/// Bytes of the outputs that are kept, each of all nodes at one time.
-const KEPT_BYTES: usize = 16 << 20;
-/// Largest logarithm of a scale, either way: what is beyond has no size to be drawn in.
-const MOST_LOG_SCALE: f64 = 600.0;
-/// Largest logit of an opacity that the network adds to.
-const MOST_LOGIT: f64 = 40.0;
+/// Maximum bytes of cached network outputs, each of all nodes at one time.
+const MAX_CACHE_BYTES: usize = 16 << 20;
+/// Maximum absolute value of a log scale; Gaussians beyond it are too small or large to be drawn.
+const MAX_LOG_SCALE: f64 = 600.0;
+/// Maximum absolute logit of an opacity that the network changes.
+const MAX_LOGIT: f64 = 40.0;
 
-/// How a network moves Gaussians.
+/// Motion model of SC-GS.
 #[derive(Debug)]
-struct Control {
+struct NodeMotion {
     network: Network,
-    nodes: Option<Sparse>,
+    /// Control nodes; `None` if the network moves each Gaussian directly.
+    nodes: Option<CachedNodes>,
 }
 
-/// By nodes.
+/// Control nodes with cached network outputs.
 #[derive(Debug)]
-struct Sparse {
+struct CachedNodes {
     nodes: Nodes,
+    /// Canonical positions of the nodes, encoded for the network.
     encoded: Encoded,
-    masked: bool,
-    /// Outputs at times (their f32 bits) that were asked for last, the oldest first.
-    kept: Mutex<VecDeque<(u32, Arc<PredictedMotion>)>>,
+    /// Whether the last feature of a Gaussian is a motion mask.
+    has_mask: bool,
+    /// Network outputs at the last requested times (keyed by f32 bits), oldest first.
+    cache: Mutex<VecDeque<(u32, Arc<PredictedMotion>)>>,
 }
 
-/// What is known of a block of Gaussians for all times.
+/// Time-independent values of a block of Gaussians.
 enum PreparedNodes {
-    /// Their shares, K of each, times the mask.
+    /// Node weights, K per Gaussian, multiplied by the mask.
     Shares(Vec<(u32, f64)>),
+    /// Encoded positions, for a network without nodes.
     Encoded(Encoded),
 }
 
-impl Control {
-    fn new(parts: &Parts<'_>) -> Result<(Control, Vec<String>)> {
+impl NodeMotion {
+    /// Reads the network and its nodes. Refuses options of training whose models are not supported.
+    fn new(parts: &ModelParts<'_>) -> Result<(NodeMotion, Vec<String>)> {
         let arguments = parts.arguments;
         let refuse = |key: &'static str, found: &str| {
-            Error::input(arguments.path(), format!("key {key}"), "a model of SC-GS as it is trained by default", found)
-                .hint("write what it renders from as a PLY for each time, and give the folder of them")
+            Error::input(arguments.path(), format!("key {key}"), "the default setting of SC-GS", found).hint(
+                "export the Gaussians of each frame as a PLY with the model's own code, and give the folder of \
+                       these files",
+            )
         };
         for key in ["skinning", "use_hash", "local_frame", "progressive_brand_time"] {
             if arguments.get(key).bool(false)? {
-                return Err(refuse(key, "True, which is not read"));
+                return Err(refuse(key, "True, which is not supported"));
             }
         }
         if !arguments.get("d_rot_as_res").bool(true)? {
-            return Err(refuse("d_rot_as_res", "False, which is not read"));
+            return Err(refuse("d_rot_as_res", "False, which is not supported"));
         }
         let largest = arguments.get("max_d_scale").float(-1.0)?;
         if largest > 0.0 {
-            return Err(refuse("max_d_scale", &format!("{largest}: a bound of scales, which is not read")));
+            return Err(refuse("max_d_scale", &format!("{largest}, a limit of scales, which is not supported")));
         }
         let kind = arguments.get("deform_type").string()?;
         let has_nodes = parts.tensors.contains_key("nodes");
@@ -92,94 +103,105 @@ impl Control {
             Some("mlp") if !has_nodes => (),
             Some(kind @ ("node" | "mlp")) => {
                 let found = format!("deform_type = '{kind}'");
-                let expected = if has_nodes { "'node': there are nodes" } else { "'mlp': there are no nodes" };
-                return Err(Error::input(parts.file, "tensor nodes", format!("what goes with {expected}"), found));
+                let expected = match has_nodes {
+                    true => "deform_type = 'node', since the file has nodes",
+                    false => "deform_type = 'mlp', since the file has no nodes",
+                };
+                return Err(Error::input(parts.file, "tensor nodes", expected, found));
             }
             kind => {
-                return Err(refuse("deform_type", &format!("{}, which is not read", quoted(kind.unwrap_or_default()))));
+                return Err(refuse(
+                    "deform_type",
+                    &format!("{}, which is not supported", quoted(kind.unwrap_or_default())),
+                ));
             }
         }
         let prefix = if has_nodes { "network." } else { "" };
-        // Other ways to a color have layers within, and a frame of a node has a head.
+        // Other color heads have inner layers, and nodes with local frames have a rotation head.
         for inner in ["gaussian_color.0.weight", "gaussian_color.layers.0.weight", "local_rotation.weight"] {
             let name = format!("{prefix}{inner}");
             if parts.tensors.contains_key(&name) {
                 return Err(Error::input(
                     parts.file,
                     format!("tensor {name}"),
-                    "a network as it is trained by default",
-                    "more",
+                    "no such tensor, as in networks with default settings",
+                    "a tensor",
                 )
-                .hint("write what it renders from as a PLY for each time, and give the folder of them"));
+                .hint(
+                    "export the Gaussians of each frame as a PLY with the model's own code, and give the folder of \
+                       these files",
+                ));
             }
         }
         let network = Network::new(parts.tensors, prefix, parts.file)?;
         let mut notes = Vec::new();
         if !has_nodes {
-            return Ok((Control { network, nodes: None }, notes));
+            return Ok((NodeMotion { network, nodes: None }, notes));
         }
         let nearest = arguments.get("K").int(3)?;
         let Some(nearest) = usize::try_from(nearest).ok().filter(|&nearest| nearest > 0) else {
             return Err(Error::input(arguments.path(), "key K", "at least 1", nearest.to_string()));
         };
         let nodes = Nodes::new(parts.tensors, nearest, parts.file)?;
-        let masked = match parts.features.checked_sub(nodes.features()) {
+        let has_mask = match parts.features.checked_sub(nodes.features()) {
             Some(more @ (0 | 1)) => more == 1,
             _ => {
-                let expected = format!("{} properties fea_*, as nodes have, or one more, a mask", nodes.features());
+                let expected =
+                    format!("{} properties fea_* (as many as nodes have), or one more for a mask", nodes.features());
                 return Err(Error::input(parts.cloud, "element vertex", expected, parts.features.to_string()));
             }
         };
-        if arguments.get("gs_with_motion_mask").bool(masked)? != masked {
-            let there = if masked { "there is one" } else { "there is none" };
+        if arguments.get("gs_with_motion_mask").bool(has_mask)? != has_mask {
+            let actual = if has_mask { "has one" } else { "has none" };
             notes.push(format!(
-                "cfg_args says otherwise of a motion mask, and in the cloud {there}: the cloud is believed"
+                "cfg_args contradicts the point cloud file about a motion mask: the file {actual} and is used"
             ));
         }
         let encoded = network.encode(&nodes.position());
-        let nodes = Sparse { nodes, encoded, masked, kept: Mutex::default() };
-        Ok((Control { network, nodes: Some(nodes) }, notes))
+        let nodes = CachedNodes { nodes, encoded, has_mask, cache: Mutex::default() };
+        Ok((NodeMotion { network, nodes: Some(nodes) }, notes))
     }
 }
 
-impl Sparse {
-    /// σ of the mask of a Gaussian.
+impl CachedNodes {
+    /// Returns the motion mask of a Gaussian, σ of its last feature; 1 without a mask.
     fn mask(&self, raw: &Raw, row: usize) -> f64 {
-        if self.masked { opacity(raw.own.plane(self.nodes.features())[row]) } else { 1.0 }
+        if self.has_mask { opacity(raw.own.plane(self.nodes.features())[row]) } else { 1.0 }
     }
 
-    /// What the network says of all nodes at `time`. The same for all blocks, so it is kept for a while; two threads that want
-    /// a time at once find the same.
+    /// Returns the network's output for all nodes at `time`. The output is the same for all blocks, so it is cached.
+    /// Two threads that compute the same time get equal values.
     fn motion(&self, network: &Network, time: f64) -> Result<Arc<PredictedMotion>> {
         let key = (time as f32).to_bits();
-        let kept = || self.kept.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some((_, found)) = kept().iter().find(|(of, _)| *of == key) {
+        let cache = || self.cache.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some((_, found)) = cache().iter().find(|(of, _)| *of == key) {
             return Ok(Arc::clone(found));
         }
         let mut motion = PredictedMotion::default();
         network.motion(&self.encoded, time, Columns::all(), &mut motion)?;
         let motion = Arc::new(motion);
-        let mut kept = kept();
-        if !kept.iter().any(|(of, _)| *of == key) {
-            if kept.len() >= self.most_kept() {
-                kept.pop_front();
+        let mut cache = cache();
+        if !cache.iter().any(|(of, _)| *of == key) {
+            if cache.len() >= self.max_cached() {
+                cache.pop_front();
             }
-            kept.push_back((key, Arc::clone(&motion)));
+            cache.push_back((key, Arc::clone(&motion)));
         }
         Ok(motion)
     }
 
-    /// Times of which outputs are kept.
-    fn most_kept(&self) -> usize {
-        (KEPT_BYTES / (4 * 14 * self.nodes.len())).max(2)
+    /// Returns the maximum number of times whose outputs are cached.
+    fn max_cached(&self) -> usize {
+        (MAX_CACHE_BYTES / (4 * 14 * self.nodes.len())).max(2)
     }
 }
 
-/// Sums the rows of `of` with the shares of Gaussians, `each` of every one.
-fn blend(of: &Column, shares: &[(u32, f64)], each: usize) -> Column {
-    let mut out = Column::zeros(of.width(), shares.len() / each.max(1));
-    for c in 0..of.width() {
-        let plane = of.plane(c);
+/// Returns the sum of the rows of `output`, weighted by the node weights of each Gaussian. `each` is the number of nodes
+/// per Gaussian.
+fn blend(output: &Column, shares: &[(u32, f64)], each: usize) -> Column {
+    let mut out = Column::zeros(output.width(), shares.len() / each.max(1));
+    for c in 0..output.width() {
+        let plane = output.plane(c);
         for (out, shares) in out.plane_mut(c).iter_mut().zip(shares.chunks_exact(each)) {
             *out = shares.iter().map(|&(node, share)| share * f64::from(plane[node as usize])).sum::<f64>() as f32;
         }
@@ -187,8 +209,8 @@ fn blend(of: &Column, shares: &[(u32, f64)], each: usize) -> Column {
     out
 }
 
-impl Control {
-    /// What the network says of the columns `want` of a block.
+impl NodeMotion {
+    /// Returns the network's output for the columns `want` of a block.
     fn motion(&self, time: f64, prepared: &PreparedNodes, want: Columns) -> Result<PredictedMotion> {
         let (mut motion, want) = (PredictedMotion::default(), want & self.network.active());
         match (prepared, &self.nodes) {
@@ -196,27 +218,27 @@ impl Control {
             (PreparedNodes::Encoded(encoded), _) => self.network.motion(encoded, time, want, &mut motion)?,
             (PreparedNodes::Shares(shares), Some(sparse)) => {
                 let (of_nodes, each) = (sparse.motion(&self.network, time)?, sparse.nodes.nearest());
-                let of = |column: Columns, of: &Column| match want.contains(column) {
-                    true => blend(of, shares, each),
+                let blended = |column: Columns, output: &Column| match want.contains(column) {
+                    true => blend(output, shares, each),
                     false => Column::default(),
                 };
                 motion = PredictedMotion {
-                    warp: of(Columns::POSITION, &of_nodes.warp),
-                    rotation: of(Columns::ROTATION, &of_nodes.rotation),
-                    scaling: of(Columns::LOG_SCALE, &of_nodes.scaling),
-                    opacity: of(Columns::OPACITY, &of_nodes.opacity),
-                    color: of(Columns::SH, &of_nodes.color),
+                    warp: blended(Columns::POSITION, &of_nodes.warp),
+                    rotation: blended(Columns::ROTATION, &of_nodes.rotation),
+                    scaling: blended(Columns::LOG_SCALE, &of_nodes.scaling),
+                    opacity: blended(Columns::OPACITY, &of_nodes.opacity),
+                    color: blended(Columns::SH, &of_nodes.color),
                 };
             }
             (PreparedNodes::Shares(_), None) => {
-                return Err(Error::internal("a block prepared by another law was given"));
+                return Err(Error::internal("a block prepared by another motion model was given"));
             }
         }
         Ok(motion)
     }
 }
 
-impl MotionModel for Control {
+impl MotionModel for NodeMotion {
     type Prepared = PreparedNodes;
 
     fn prepare(&self, raw: &Raw) -> PreparedNodes {
@@ -252,11 +274,11 @@ impl MotionModel for Control {
                 Columns::ROTATION => add(&motion.rotation, to),
                 Columns::LOG_SCALE => each(&motion.scaling, to, |log, by| {
                     let log = f64::from(log);
-                    let log = if log > MOST_LOG_SCALE { MOST_LOG_SCALE } else { log };
-                    let log = if log < -MOST_LOG_SCALE { -MOST_LOG_SCALE } else { log };
-                    ln((exp(log) + f64::from(by)).abs().max(LEAST_SCALE)) as f32
+                    let log = if log > MAX_LOG_SCALE { MAX_LOG_SCALE } else { log };
+                    let log = if log < -MAX_LOG_SCALE { -MAX_LOG_SCALE } else { log };
+                    ln((exp(log) + f64::from(by)).abs().max(MIN_SCALE)) as f32
                 }),
-                Columns::OPACITY => each(&motion.opacity, to, |logit, by| added(logit, by) as f32),
+                Columns::OPACITY => each(&motion.opacity, to, |logit, by| add_to_opacity(logit, by) as f32),
                 _ => add(&motion.color, to),
             }
         }
@@ -268,7 +290,7 @@ impl MotionModel for Control {
         let motion = self.motion(time, prepared, want.difference(Columns::POSITION))?;
         if want.contains(Columns::POSITION) {
             *found.column_mut(Columns::POSITION) = match &self.nodes {
-                Some(sparse) => of_shares(sparse, &self.network, raw, time)?,
+                Some(sparse) => position_slopes(sparse, &self.network, raw, time)?,
                 None => {
                     let mut slopes = self.network.slopes(&raw.gaussians.position, time)?;
                     (0..3).for_each(|c| slopes.plane_mut(4 * c).iter_mut().for_each(|slope| *slope += 1.0));
@@ -277,13 +299,13 @@ impl MotionModel for Control {
             };
         }
         if want.contains(Columns::LOG_SCALE) {
-            // Each of the three by its own.
+            // Each scale depends on its own stored value only.
             let mut out = Column::zeros(9, raw.len());
             for c in 0..3 {
-                let of = raw.gaussians.log_scale.plane(c).iter().zip(motion.scaling.plane(c));
-                for (out, (&log, &by)) in out.plane_mut(4 * c).iter_mut().zip(of) {
+                let pairs = raw.gaussians.log_scale.plane(c).iter().zip(motion.scaling.plane(c));
+                for (out, (&log, &by)) in out.plane_mut(4 * c).iter_mut().zip(pairs) {
                     let (own, by) = (f64::from(log).exp(), f64::from(by));
-                    *out = if (own + by).abs() > LEAST_SCALE { (own / (own + by)) as f32 } else { 0.0 };
+                    *out = if (own + by).abs() > MIN_SCALE { (own / (own + by)) as f32 } else { 0.0 };
                 }
             }
             *found.column_mut(Columns::LOG_SCALE) = out;
@@ -291,9 +313,9 @@ impl MotionModel for Control {
         if want.contains(Columns::OPACITY) && !motion.opacity.is_empty() {
             let mut out = raw.gaussians.opacity_logit.clone();
             each(&motion.opacity, &mut out, |logit, by| {
-                let (own, state) = (opacity(logit), added(logit, by));
+                let (own, state) = (opacity(logit), add_to_opacity(logit, by));
                 let whole = opacity(state as f32);
-                if state.abs() < MOST_LOGIT { (own * (1.0 - own) / (whole * (1.0 - whole))) as f32 } else { 0.0 }
+                if state.abs() < MAX_LOGIT { (own * (1.0 - own) / (whole * (1.0 - whole))) as f32 } else { 0.0 }
             });
             *found.column_mut(Columns::OPACITY) = out;
         }
@@ -301,12 +323,12 @@ impl MotionModel for Control {
     }
 }
 
-/// Adds `by`, where there is some, to the first planes of `to`.
+/// Adds `by` to the first planes of `to`. Does nothing if `by` is empty.
 fn add(by: &Column, to: &mut Column) {
     each(by, to, |value, by| value + by);
 }
 
-/// Applies `f` to the values of the planes that `by` has, and to those of `by`.
+/// Replaces each value of the planes that `by` has by `f` of it and the value of `by`.
 #[inline(always)]
 fn each(by: &Column, to: &mut Column, f: impl Fn(f32, f32) -> f32) {
     for c in 0..by.width().min(to.width()) {
@@ -314,14 +336,14 @@ fn each(by: &Column, to: &mut Column, f: impl Fn(f32, f32) -> f32) {
     }
 }
 
-/// The logit of an opacity with `by` added to it.
-fn added(stored: f32, by: f32) -> f64 {
+/// Returns the logit of a stored opacity after adding `by` to the opacity.
+fn add_to_opacity(stored: f32, by: f32) -> f64 {
     let alpha = opacity(stored) + f64::from(by);
-    logit(alpha.clamp(0.0, 1.0)).clamp(-MOST_LOGIT, MOST_LOGIT)
+    logit(alpha.clamp(0.0, 1.0)).clamp(-MAX_LOGIT, MAX_LOGIT)
 }
 
-/// How positions change that follow nodes: as the shares in them do.
-fn of_shares(sparse: &Sparse, network: &Network, raw: &Raw, time: f64) -> Result<Column> {
+/// Returns the derivatives of positions that follow nodes, whose node weights depend on the position.
+fn position_slopes(sparse: &CachedNodes, network: &Network, raw: &Raw, time: f64) -> Result<Column> {
     let motion = sparse.motion(network, time)?;
     let (mut out, mut shares) = (Column::zeros(9, raw.len()), Vec::new());
     for row in 0..raw.len() {
@@ -343,9 +365,9 @@ fn of_shares(sparse: &Sparse, network: &Network, raw: &Raw, time: f64) -> Result
     Ok(out)
 }
 
-impl Deforming for Control {
+impl NetworkMotionModel for NodeMotion {
     const KIND: &'static str = "SC-GS model";
-    const NORMALISES: bool = false;
+    const NORMALIZES_ROTATION: bool = false;
 
     fn bytes_per_gaussian(&self) -> usize {
         match &self.nodes {
@@ -355,10 +377,10 @@ impl Deforming for Control {
     }
 
     fn bytes(&self) -> usize {
-        self.nodes.as_ref().map_or(0, |sparse| KEPT_BYTES + Network::BYTES_PER_GAUSSIAN * sparse.nodes.len())
+        self.nodes.as_ref().map_or(0, |sparse| MAX_CACHE_BYTES + Network::BYTES_PER_GAUSSIAN * sparse.nodes.len())
     }
 
-    /// `benches/families.rs`.
+    /// Returns the seconds measured by `benches/families.rs`.
     fn seconds_per_state(&self) -> f64 {
         match &self.nodes {
             Some(_) => 2e-7,

@@ -1,8 +1,8 @@
-//! Control nodes: which of them move a Gaussian, and by how much of each.
+//! Control nodes, and the weights with which they move a Gaussian.
 //!
-//! Of a Gaussian at x with features f: the K nodes nearest to [x, f] by squared distance d² over all values, ties to the first;
-//! u = exp(−d²/(2r²))·σ(weight) + 1e-7, divided by their sum. All of it is constant in time. Source: `cal_nn_weight` of the
-//! family's code.
+//! For a Gaussian at x with features f: the K nodes nearest to [x, f] by squared distance d² over all values, ties to
+//! the first; u = exp(−d²/(2r²))·σ(weight) + 1e-7, divided by the sum of u. The weights are constant in time. Source:
+//! `cal_nn_weight` of the authors' code.
 
 use std::path::Path;
 
@@ -10,36 +10,38 @@ use crate::deform::{Tensor, Tensors};
 use crate::error::{Error, Result};
 use crate::model::{Column, Raw, opacity};
 
-/// Added to what a node counts.
+/// Value added to every kernel before normalization.
 const FLOOR: f64 = 1e-7;
 
-/// The nodes of a model.
+/// Control nodes of a model, M in number, with h features each.
 #[derive(Debug)]
 pub(super) struct Nodes {
-    /// `[M, 3 + h]`
+    /// Positions and features, `[M, 3 + h]`.
     values: Vec<f32>,
+    /// Number of values per node, 3 + h.
     width: usize,
-    /// 1/(2r²) and σ(weight) by node.
+    /// 1/(2r²) and σ(weight) of each node.
     kernels: Vec<[f64; 2]>,
-    /// K.
+    /// Number K of nodes that move a Gaussian.
     nearest: usize,
 }
 
-/// What moves a Gaussian.
+/// Node that moves a Gaussian, and its weight.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Share {
+    /// Index of the node.
     pub(super) node: u32,
-    /// u, between 0 and 1.
+    /// Normalized weight u, between 0 and 1.
     pub(super) weight: f64,
-    /// What the node counts before 1e-7 is added.
-    counts: f64,
+    /// Kernel of the node before 1e-7 is added.
+    kernel: f64,
 }
 
 impl Nodes {
-    /// The nodes among `tensors`, of which `nearest` move a Gaussian.
+    /// Reads the nodes from `tensors`. `nearest` is the number K of nodes that move a Gaussian.
     ///
     /// # Errors
-    /// Tensors that are missing, of other shapes, or not finite.
+    /// Fails if tensors are missing, have other shapes or are not finite.
     pub(super) fn new(tensors: &Tensors, nearest: usize, file: &Path) -> Result<Nodes> {
         let get = |name: &str, expected: &str, fits: &dyn Fn(&[usize]) -> bool| -> Result<&Tensor> {
             let place = format!("tensor {name}");
@@ -69,28 +71,28 @@ impl Nodes {
         Ok(Nodes { values: nodes.data.clone(), width, kernels, nearest: nearest.clamp(1, count) })
     }
 
-    /// h.
+    /// Returns the number h of features per node.
     pub(super) fn features(&self) -> usize {
         self.width - 3
     }
 
-    /// M.
+    /// Returns the number M of nodes.
     pub(super) fn len(&self) -> usize {
         self.kernels.len()
     }
 
-    /// K.
+    /// Returns the number K of nodes that move a Gaussian.
     pub(super) fn nearest(&self) -> usize {
         self.nearest
     }
 
-    /// Where they are, `[M, 3]`.
+    /// Returns the canonical positions of the nodes, `[M, 3]`.
     pub(super) fn position(&self) -> Column {
         let planes = (0..3).flat_map(|c| self.values.iter().skip(c).step_by(self.width).copied());
         Column::from_planes(3, planes.collect())
     }
 
-    /// What moves Gaussian `row` of `raw`, nearest first, into `out`.
+    /// Appends the nodes that move Gaussian `row` of `raw` to `out`, nearest first.
     pub(super) fn shares(&self, raw: &Raw, row: usize, out: &mut Vec<Share>) {
         let mut at: Vec<f32> = raw.gaussians.position.row::<3>(row).to_vec();
         at.extend((0..self.features()).map(|k| raw.own.plane(k)[row]));
@@ -103,28 +105,28 @@ impl Nodes {
                 nearest.truncate(self.nearest);
             }
         }
-        let counts = |&(distance, node): &(f64, u32)| {
+        let kernel = |&(distance, node): &(f64, u32)| {
             let [sharpness, weight] = self.kernels[node as usize];
             (-distance * sharpness).exp() * weight
         };
-        let sum: f64 = nearest.iter().map(|found| counts(found) + FLOOR).sum();
+        let sum: f64 = nearest.iter().map(|found| kernel(found) + FLOOR).sum();
         out.extend(nearest.iter().map(|found| {
-            let counts = counts(found);
-            Share { node: found.1, weight: (counts + FLOOR) / sum, counts }
+            let kernel = kernel(found);
+            Share { node: found.1, weight: (kernel + FLOOR) / sum, kernel }
         }));
     }
 
-    /// How the shares of a Gaussian at `x` change along each axis.
+    /// Returns the derivative of each weight in `shares` with respect to the position `x`.
     pub(super) fn slopes(&self, x: [f32; 3], shares: &[Share]) -> Vec<[f64; 3]> {
-        let sum: f64 = shares.iter().map(|share| share.counts + FLOOR).sum();
+        let sum: f64 = shares.iter().map(|share| share.kernel + FLOOR).sum();
         let own = |share: &Share| {
             let node = &self.values[share.node as usize * self.width..][..3];
-            let by = -2.0 * self.kernels[share.node as usize][0] * share.counts;
+            let by = -2.0 * self.kernels[share.node as usize][0] * share.kernel;
             [0, 1, 2].map(|c| by * (f64::from(x[c]) - f64::from(node[c])))
         };
         let all: Vec<[f64; 3]> = shares.iter().map(own).collect();
         let total = [0, 1, 2].map(|c| all.iter().map(|own| own[c]).sum::<f64>());
-        let of = |(share, own): (&Share, &[f64; 3])| [0, 1, 2].map(|c| (own[c] - share.weight * total[c]) / sum);
-        shares.iter().zip(&all).map(of).collect()
+        let slope = |(share, own): (&Share, &[f64; 3])| [0, 1, 2].map(|c| (own[c] - share.weight * total[c]) / sum);
+        shares.iter().zip(&all).map(slope).collect()
     }
 }

@@ -1,40 +1,40 @@
-//! The PLY of a model: which property is which parameter.
+//! Point cloud file of a SpacetimeGaussians model, with the mapping of its properties to parameters.
 //!
-//! `x y z trbf_center trbf_scale nx ny nz motion_0..8 f_dc_0..(2|5) opacity scale_0..2 rot_0..3 omega_0..3 [f_t_0..2]`, in any
-//! order. The authors' loader counts properties by how their names begin, so none may be there that begins so beside these.
-//! Source: `save_ply`, `load_ply` of their code.
+//! `x y z trbf_center trbf_scale nx ny nz motion_0..8 f_dc_0..(2|5) opacity scale_0..2 rot_0..3 omega_0..3 [f_t_0..2]`,
+//! in any order. The authors' loader counts properties by name prefix, so the file may have no other properties with
+//! these prefixes. Source: `save_ply`, `load_ply` of their code.
 
 use std::path::Path;
 
-use super::decoder::Act;
-use super::law::{FEATURES, FULL_WIDTH, MOTION, OMEGA, WIDTH};
+use super::decoder::ColorActivation;
+use super::frame_state::{FEATURES, FULL_WIDTH, MOTION, OMEGA, WIDTH};
 use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result};
 use crate::files::ply::write::{out_rows, put, value, write_rows_like};
 use crate::files::ply::{PlaneSource, Ply, PlyEncoding, PlyOptions, Property};
 use crate::model::{Column, Columns, Raw, SH_C0, harmonic};
 
-/// The property that no other kind of cloud has.
-pub(super) const MARK: &str = "trbf_center";
+/// Name of a property that no other format has.
+pub(super) const MARKER_PROPERTY: &str = "trbf_center";
 
-/// An open PLY.
+/// Open point cloud file.
 #[derive(Debug)]
-pub(super) struct Cloud {
+pub(super) struct PointCloudFile {
     ply: Ply,
-    /// Properties of the planes of [`Raw::own`].
+    /// Property of each plane of [`Raw::own`].
     own: Vec<Property>,
 }
 
-impl Cloud {
+impl PointCloudFile {
     /// Opens the PLY at `path`.
     ///
     /// # Errors
-    /// A PLY that is none of Gaussians; properties that are missing, or too many.
-    pub(super) fn open(path: &Path, options: &PlyOptions) -> Result<Cloud> {
+    /// Fails if the PLY holds no Gaussians, or if properties are missing or too many.
+    pub(super) fn open(path: &Path, options: &PlyOptions) -> Result<PointCloudFile> {
         let ply = Ply::open_with(path, options)?;
-        let beginning =
+        let count_prefix =
             |prefix: &str| ply.properties().iter().filter(|property| property.name.starts_with(prefix)).count();
-        let features = beginning("f_dc");
+        let features = count_prefix("f_dc");
         let is_full = features > 3;
         let counts: [(&str, &[usize]); 8] = [
             ("f_dc", &[3, 6]),
@@ -47,7 +47,7 @@ impl Cloud {
             ("trbf_", &[2]),
         ];
         for (prefix, expected) in counts {
-            let found = beginning(prefix);
+            let found = count_prefix(prefix);
             if !expected.contains(&found) {
                 let expected: Vec<String> = expected.iter().map(usize::to_string).collect();
                 let expected = format!("{} properties that begin with {prefix}", expected.join(" or "));
@@ -58,23 +58,23 @@ impl Cloud {
                 return Err(Error::input(path, "element vertex", expected, found.to_string()).hint(hint));
             }
         }
-        let own = names(is_full).into_iter().map(|name| {
+        let own = own_property_names(is_full).into_iter().map(|name| {
             let found = ply.properties().iter().find(|property| property.name == name).cloned();
             found.ok_or_else(|| Error::input(path, "element vertex", format!("property {name}"), "none"))
         });
-        Ok(Cloud { own: own.collect::<Result<_>>()?, ply })
+        Ok(PointCloudFile { own: own.collect::<Result<_>>()?, ply })
     }
 
-    /// Whether it is of the full model.
+    /// Returns whether the file belongs to the full model.
     pub(super) fn is_full(&self) -> bool {
         self.own.len() == FULL_WIDTH
     }
 
-    /// The parameters of all Gaussians; `act` makes colors of the full model's first features.
+    /// Reads the parameters of all Gaussians. `activation` turns the first features of the full model into colors.
     ///
     /// # Errors
-    /// A value that is no finite number; a file cut short since it was opened.
-    pub(super) fn raw(&self, act: Act) -> Result<Raw> {
+    /// Fails if a value is not finite or the file was cut short since it was opened.
+    pub(super) fn raw(&self, activation: ColorActivation) -> Result<Raw> {
         let count = self.ply.count();
         let mut raw = Raw { gaussians: self.ply.whole()?, own: Column::zeros(0, count) };
         let mut own = Vec::with_capacity(self.own.len() * count);
@@ -95,44 +95,46 @@ impl Cloud {
         for (plane, property) in self.own.iter().enumerate() {
             self.check(&property.name, raw.own.plane(plane))?;
         }
-        paint(&mut raw, self.is_full().then_some(act));
+        set_colors(&mut raw, self.is_full().then_some(activation));
         Ok(raw)
     }
 
-    /// What stands for red, green and blue of all Gaussians.
+    /// Reads the stored red, green and blue of all Gaussians (`f_dc_0..2`).
     ///
     /// # Errors
-    /// A file cut short since it was opened.
+    /// Fails if the file was cut short since it was opened.
     pub(super) fn colors(&self) -> Result<[Vec<f32>; 3]> {
-        let of = |name: &str| -> Result<Vec<f32>> { Ok(self.ply.values(name)?.unwrap_or_default()) };
-        Ok([of("f_dc_0")?, of("f_dc_1")?, of("f_dc_2")?])
+        let values = |name: &str| -> Result<Vec<f32>> { Ok(self.ply.values(name)?.unwrap_or_default()) };
+        Ok([values("f_dc_0")?, values("f_dc_1")?, values("f_dc_2")?])
     }
 
-    /// Confirms that the values of a property are finite.
+    /// Checks that the values of a property are finite.
     fn check(&self, name: &str, values: &[f32]) -> Result<()> {
         match values.iter().position(|x| !x.is_finite()) {
             Some(row) => {
                 let found = values[row].to_string();
-                Err(Error::input(self.ply.path(), format!("Gaussian {row}, {name}"), "a finite number", found)
-                    .hint("drop such Gaussians in training: one that is not drawn may still be in the file"))
+                Err(Error::input(self.ply.path(), format!("Gaussian {row}, {name}"), "a finite number", found).hint(
+                    "remove such Gaussians from the model: the file may hold them even if no renderer draws them",
+                ))
             }
             None => Ok(()),
         }
     }
 
-    /// Writes what `reduction` leaves, under the same header: rows as they are, but proxies in their places, and changes added.
+    /// Writes the compressed model under the same header. Rows are copied byte for byte; proxies are written in place
+    /// of their leaders, and parameter deltas are added.
     ///
     /// # Errors
-    /// A file cut short since it was opened; a failed write.
+    /// Fails if the file was cut short since it was opened or a write fails.
     pub(super) fn write(&self, reduction: &CompressedModel, path: &Path) -> Result<()> {
         let (layout, rows) = (self.ply.layout(), out_rows(reduction));
         let big_endian = self.ply.header().encoding == PlyEncoding::BigEndian;
         let (proxies, by) = (reduction.proxies.raw.as_ref(), &reduction.change.0);
         let places = |column: Columns| layout.planes(column).iter().enumerate();
         let columns: Vec<Columns> = Columns::all().iter().filter(|&of| of != Columns::SH || !self.is_full()).collect();
-        // A color stands as it is, not as a harmonic.
-        let unit = |column: Columns| if column == Columns::SH { SH_C0 } else { 1.0 };
-        let zero = |column: Columns| if column == Columns::SH { 0.5 } else { 0.0 };
+        // The lite model stores colors, not SH coefficients.
+        let color_scale = |column: Columns| if column == Columns::SH { SH_C0 } else { 1.0 };
+        let color_offset = |column: Columns| if column == Columns::SH { 0.5 } else { 0.0 };
         write_rows_like(
             &self.ply,
             &reduction.kept,
@@ -151,11 +153,16 @@ impl Cloud {
                         let before = match proxy {
                             Some((proxy, raw)) => {
                                 let stored = f64::from(raw.gaussians.column(column).plane(c)[proxy as usize]);
-                                zero(column) + unit(column) * stored
+                                color_offset(column) + color_scale(column) * stored
                             }
                             None => f64::from(value(bytes, property, big_endian)),
                         };
-                        put(bytes, property, big_endian, before as f32 + (unit(column) * f64::from(change)) as f32);
+                        put(
+                            bytes,
+                            property,
+                            big_endian,
+                            before as f32 + (color_scale(column) * f64::from(change)) as f32,
+                        );
                     }
                 }
                 if let Some((proxy, raw)) = rows[place].proxy.zip(proxies) {
@@ -168,10 +175,10 @@ impl Cloud {
     }
 }
 
-/// Names of the planes of [`Raw::own`].
-fn names(is_full: bool) -> Vec<String> {
+/// Returns the property names of the planes of [`Raw::own`].
+fn own_property_names(is_full: bool) -> Vec<String> {
     let numbered = |name: &'static str, count: usize| (0..count).map(move |k| format!("{name}_{k}"));
-    let mut names: Vec<String> = vec![MARK.to_owned(), "trbf_scale".to_owned()];
+    let mut names: Vec<String> = vec![MARKER_PROPERTY.to_owned(), "trbf_scale".to_owned()];
     names.extend(numbered("motion", OMEGA - MOTION).chain(numbered("omega", WIDTH - OMEGA)));
     if is_full {
         names.extend(numbered("f_dc", 6).chain(numbered("f_t", 3)));
@@ -179,13 +186,13 @@ fn names(is_full: bool) -> Vec<String> {
     names
 }
 
-/// Turns what stands for a color into a harmonic: with `act`, that of the first features, else the color itself, which
-/// stands where a harmonic would.
-fn paint(raw: &mut Raw, act: Option<Act>) {
+/// Replaces stored colors by SH coefficients of degree 0. With `activation`, the color is `activation` of the first features;
+/// without, it is the stored color, which the PLY reader put where a coefficient would be.
+fn set_colors(raw: &mut Raw, activation: Option<ColorActivation>) {
     for c in 0..3 {
         let features = raw.own.width() > FEATURES;
         let from: Vec<f32> = if features { raw.own.plane(FEATURES + c) } else { raw.gaussians.sh.plane(c) }.to_vec();
-        let color = |x: f32| act.map_or(f64::from(x), |act| act.apply(f64::from(x)));
+        let color = |x: f32| activation.map_or(f64::from(x), |activation| activation.apply(f64::from(x)));
         raw.gaussians.sh.plane_mut(c).iter_mut().zip(from).for_each(|(to, x)| *to = harmonic(color(x)));
     }
 }

@@ -1,4 +1,4 @@
-//! What a model folder and a `.splatv` have in common.
+//! Functions shared by model folders and `.splatv`.
 
 use crate::error::{Error, Result};
 use crate::model::{Columns, Jacobian};
@@ -7,13 +7,13 @@ use crate::models::trajectories::{NO_ARCHIVE, state_bytes};
 use crate::outputs::container::GAUSSIAN_BLOCK;
 use crate::outputs::kind::OutputKind;
 
-/// What an open model of `width` planes of its own keeps in memory.
+/// Returns the memory profile of an open model with `width` planes of format-specific parameters.
 pub(super) fn residence(width: usize) -> MemoryProfile {
     let whole = state_bytes(0, Columns::all()) + 4 * width as u64;
     MemoryProfile {
         per_gaussian: whole,
         opening: whole,
-        // The raw parameters again, and what is prepared of them.
+        // A copy of the raw parameters with the prepared values.
         reader: whole + 16 + 8,
         reduced: 2 * whole,
         jacobian: Jacobian::BYTES_PER_GAUSSIAN as u64,
@@ -27,12 +27,13 @@ pub(super) fn residence(width: usize) -> MemoryProfile {
     }
 }
 
-/// Confirms that a result of several frames can be of `kind`, beside those that are made of a model's own parameters.
+/// Checks that an output can be of `kind`. The caller handles the kinds that store the model's own parameters.
 pub(super) fn check_kind(kind: OutputKind, is_full: bool) -> Result<()> {
     match kind {
         OutputKind::Archive => Err(Error::usage(NO_ARCHIVE)),
         OutputKind::Splatv if is_full => Err(Error::usage(
-            "a .splatv has colours, not features: it holds lite models of SpacetimeGaussians alone\n  write a model folder or a .gseq",
+            "a .splatv stores colors, not features: it holds only lite models of SpacetimeGaussians\n  write a model \
+             folder or a .gseq",
         )),
         _ => Ok(()),
     }

@@ -1,66 +1,67 @@
-//! What makes colors of the nine features that the full model blends.
+//! Network that computes pixel colors from the nine blended features of the full model.
 //!
-//! Of a pixel's features F, camera center o and unit ray d: act(F₀₋₂ + W₂·relu(W₁·[F₃₋₅, F₆₋₈, o, d])). W₁ is `mlp1.weight`
-//! [6, 12, 1, 1], W₂ `mlp2.weight` [3, 6, 1, 1] of `point_cloud.pt`; neither has a bias. Source: `helper_model.py` of the
-//! authors' code.
+//! With features F of a pixel, camera center o and unit ray d, the color is act(F₀₋₂ + W₂·relu(W₁·[F₃₋₅, F₆₋₈, o, d])).
+//! W₁ is `mlp1.weight` [6, 12, 1, 1] and W₂ is `mlp2.weight` [3, 6, 1, 1] of `point_cloud.pt`; neither has a bias.
+//! Source: `helper_model.py` of the authors' code.
 
 use std::path::Path;
 
 use crate::deform::Tensors;
 use crate::error::{Error, Result, quoted};
 
-/// Features that are blended.
+/// Number of features that are blended.
 pub(super) const FEATURES: usize = 9;
-/// Inputs of the network: features 3 to 8, camera center, ray.
+/// Number of network inputs: features 3 to 8, camera center, ray.
 const INPUTS: usize = 12;
+/// Number of hidden units.
 const HIDDEN: usize = 6;
 
-/// What is done to a color last.
+/// Function applied to a color as the last step.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Act {
-    /// The logistic function.
+pub(super) enum ColorActivation {
+    /// Logistic function.
     Sigmoid,
-    /// Confined to 0 … 1.
+    /// Clamp to 0 … 1.
     Clamp,
-    /// Nothing.
+    /// Identity.
     None,
 }
 
-impl Act {
-    /// As `rgbfunction` of `cfg_args` calls it.
-    pub(super) fn named(name: &str) -> Option<Act> {
+impl ColorActivation {
+    /// Returns the function that `rgbfunction` of `cfg_args` names; `None` for other names.
+    pub(super) fn named(name: &str) -> Option<ColorActivation> {
         match name {
-            "sandwich" => Some(Act::Sigmoid),
-            "sandwichnoact" => Some(Act::Clamp),
-            "sandwichnoactss" => Some(Act::None),
+            "sandwich" => Some(ColorActivation::Sigmoid),
+            "sandwichnoact" => Some(ColorActivation::Clamp),
+            "sandwichnoactss" => Some(ColorActivation::None),
             _ => None,
         }
     }
 
-    /// Of a color before it.
+    /// Applies the function to a color value.
     pub(super) fn apply(self, x: f64) -> f64 {
         match self {
-            Act::Sigmoid => 1.0 / (1.0 + (-x).exp()),
-            Act::Clamp => x.clamp(0.0, 1.0),
-            Act::None => x,
+            ColorActivation::Sigmoid => 1.0 / (1.0 + (-x).exp()),
+            ColorActivation::Clamp => x.clamp(0.0, 1.0),
+            ColorActivation::None => x,
         }
     }
 }
 
-/// The network.
+/// Weights of the network, and its last function.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct ColorDecoder {
     first: [[f64; INPUTS]; HIDDEN],
     second: [[f64; HIDDEN]; 3],
-    act: Act,
+    activation: ColorActivation,
 }
 
 impl ColorDecoder {
-    /// The network of the state dict `tensors`, read from `path`.
+    /// Reads the network from the state dict `tensors` of the file `path`.
     ///
     /// # Errors
-    /// Weights that are missing, of other shapes, or no finite numbers.
-    pub(super) fn new(tensors: &Tensors, act: Act, path: &Path) -> Result<ColorDecoder> {
+    /// Fails if weights are missing, have other shapes or are not finite.
+    pub(super) fn new(tensors: &Tensors, activation: ColorActivation, path: &Path) -> Result<ColorDecoder> {
         let weights = |name: &str, shape: [usize; 4]| {
             let place = || format!("tensor {name}");
             let expected = format!("shape {shape:?}");
@@ -88,18 +89,19 @@ impl ColorDecoder {
         Ok(ColorDecoder {
             first: std::array::from_fn(|i| std::array::from_fn(|j| first[i * INPUTS + j].into())),
             second: std::array::from_fn(|i| std::array::from_fn(|j| second[i * HIDDEN + j].into())),
-            act,
+            activation,
         })
     }
 
-    /// The color of a pixel whose [`FEATURES`] are `features`, seen from `center` along the unit `ray`.
+    /// Returns the color of a pixel with blended `features` ([`FEATURES`] values), seen from the camera center `center`
+    /// along the unit vector `ray`.
     pub(super) fn color(&self, features: &[f32], center: [f32; 3], ray: [f32; 3]) -> [f32; 3] {
         let mut inputs = [0.0; INPUTS];
         let all = features[3..].iter().chain(&center).chain(&ray);
         inputs.iter_mut().zip(all).for_each(|(to, &of)| *to = of.into());
-        let sum = |weights: &[f64], of: &[f64]| weights.iter().zip(of).map(|(w, x)| w * x).sum::<f64>();
+        let sum = |weights: &[f64], values: &[f64]| weights.iter().zip(values).map(|(w, x)| w * x).sum::<f64>();
         let hidden = self.first.map(|row| sum(&row, &inputs).max(0.0));
-        std::array::from_fn(|c| self.act.apply(f64::from(features[c]) + sum(&self.second[c], &hidden)) as f32)
+        std::array::from_fn(|c| self.activation.apply(f64::from(features[c]) + sum(&self.second[c], &hidden)) as f32)
     }
 }
 
@@ -109,7 +111,7 @@ pub(crate) mod tests {
     use crate::deform::Tensor;
     use crate::model::opacity;
 
-    /// Weights of a small network, as a state dict has them.
+    /// Returns the weights of a small network as in a state dict.
     pub(in super::super) fn weights() -> Tensors {
         let ramp = |n: usize, by: f32| (0..n).map(|i| by * ((i * 7 % 11) as f32 - 5.0)).collect::<Vec<f32>>();
         [
@@ -120,29 +122,30 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn a_network_without_hidden_light_leaves_the_first_features() {
+    fn network_with_zero_output_returns_the_first_features() {
         let mut tensors = weights();
         tensors.get_mut("mlp2.weight").unwrap().data.fill(0.0);
         let features = [0.5, -1.0, 2.0, 9.0, 9.0, 9.0, 9.0, 9.0, 9.0];
-        let color =
-            |act| ColorDecoder::new(&tensors, act, Path::new("x.pt")).unwrap().color(&features, [1.0; 3], [1.0; 3]);
-        assert_eq!(color(Act::None), [0.5, -1.0, 2.0]);
-        assert_eq!(color(Act::Clamp), [0.5, 0.0, 1.0]);
-        let sigmoid = color(Act::Sigmoid);
+        let color = |activation| {
+            ColorDecoder::new(&tensors, activation, Path::new("x.pt")).unwrap().color(&features, [1.0; 3], [1.0; 3])
+        };
+        assert_eq!(color(ColorActivation::None), [0.5, -1.0, 2.0]);
+        assert_eq!(color(ColorActivation::Clamp), [0.5, 0.0, 1.0]);
+        let sigmoid = color(ColorActivation::Sigmoid);
         assert!((0..3).all(|c| (f64::from(sigmoid[c]) - opacity(features[c])).abs() < 1e-7), "{sigmoid:?}");
     }
 
     #[test]
-    fn hidden_light_is_cut_at_zero_before_it_is_summed() {
+    fn hidden_units_are_clamped_at_zero() {
         let mut tensors = weights();
         let first = &mut tensors.get_mut("mlp1.weight").unwrap().data;
         first.fill(0.0);
-        // Hidden 0 sees feature 3, hidden 1 the ray's z.
+        // Hidden unit 0 reads feature 3; hidden unit 1 reads z of the ray.
         (first[0], first[12 + 11]) = (2.0, 3.0);
         let second = &mut tensors.get_mut("mlp2.weight").unwrap().data;
         second.fill(0.0);
         (second[0], second[1], second[6 + 1]) = (1.0, 10.0, -1.0);
-        let decoder = ColorDecoder::new(&tensors, Act::None, Path::new("x.pt")).unwrap();
+        let decoder = ColorDecoder::new(&tensors, ColorActivation::None, Path::new("x.pt")).unwrap();
         let mut features = [0.0; 9];
         features[3] = 0.25;
         assert_eq!(decoder.color(&features, [0.0; 3], [0.0, 0.0, 1.0]), [0.5 + 30.0, -3.0, 0.0]);
@@ -150,19 +153,21 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn weights_that_are_missing_or_wrong_are_named_with_what_is_there() {
-        let said = |change: &dyn Fn(&mut Tensors)| {
+    fn missing_or_wrong_weights_are_named() {
+        let error_message = |change: &dyn Fn(&mut Tensors)| {
             let mut tensors = weights();
             change(&mut tensors);
-            ColorDecoder::new(&tensors, Act::None, Path::new("some/point_cloud.pt")).unwrap_err().to_string()
+            ColorDecoder::new(&tensors, ColorActivation::None, Path::new("some/point_cloud.pt"))
+                .unwrap_err()
+                .to_string()
         };
-        let missing = said(&|tensors| drop(tensors.remove("mlp2.weight")));
+        let missing = error_message(&|tensors| drop(tensors.remove("mlp2.weight")));
         for part in ["some/point_cloud.pt", "mlp2.weight", "[3, 6, 1, 1]", "mlp1.weight"] {
             assert!(missing.contains(part), "{missing}");
         }
-        let wide = said(&|tensors| tensors.get_mut("mlp1.weight").unwrap().shape = vec![6, 6, 2, 1]);
+        let wide = error_message(&|tensors| tensors.get_mut("mlp1.weight").unwrap().shape = vec![6, 6, 2, 1]);
         assert!(wide.contains("[6, 12, 1, 1]") && wide.contains("[6, 6, 2, 1]"), "{wide}");
-        let nan = said(&|tensors| tensors.get_mut("mlp1.weight").unwrap().data[5] = f32::NAN);
+        let nan = error_message(&|tensors| tensors.get_mut("mlp1.weight").unwrap().data[5] = f32::NAN);
         assert!(nan.contains("mlp1.weight") && nan.contains("value 5") && nan.contains("NaN"), "{nan}");
     }
 }

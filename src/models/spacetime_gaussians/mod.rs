@@ -1,13 +1,15 @@
-//! SpacetimeGaussians, lite and full, as a family: a folder as its training writes it, its PLY alone, or a `.splatv`.
+//! SpacetimeGaussians (lite and full) as a model format: a folder as its training writes it, its PLY alone, or a
+//! `.splatv`.
 //!
-//! The result has the same layout with fewer Gaussians: rows of the PLY byte for byte, but for what merging and refining
-//! changed of them, in the family's own parameters; everything else is copied. Of the full model a renderer blends nine features
-//! and asks a network for the color of each pixel; what is looked at here is the color that the first three have by themselves.
+//! The output has the same layout with fewer Gaussians. Rows of the PLY are kept byte for byte, except for values that
+//! merging or refinement changed; other files are copied. The renderer of the full model blends nine features and a
+//! network computes the color of each pixel from them. Statistics, merging and refinement here use the color that the
+//! first three features have without the network.
 
 mod cloud;
 mod common;
 mod decoder;
-mod law;
+mod frame_state;
 mod motion;
 mod proxies;
 mod splatv;
@@ -19,7 +21,7 @@ use std::path::{Path, PathBuf};
 use xxhash_rust::xxh3::Xxh3;
 
 use super::files::copy;
-use super::iterations::iteration;
+use super::iterations::find_iteration;
 use super::size::{Size, bytes_below, bytes_of};
 use super::trajectories::{NO_ARCHIVE, write_sequence};
 use crate::compressed_model::{Cluster, CompressedModel, Proxies, Reference};
@@ -33,84 +35,91 @@ use crate::files::text::read_text;
 use crate::limits::Limits;
 use crate::model::{Raw, color};
 use crate::models::input_model::{InputModel, MemoryProfile, ModelFormat, OpenOptions, Timing};
-use crate::models::motion_model::{MotionModelFrames, left, solve};
+use crate::models::motion_model::{MotionModelFrames, compressed_raw, solve};
 use crate::outputs::kind::OutputKind;
 use crate::progress::Events;
 use crate::recipe::MergeParams;
 use crate::source::FrameSource;
-use cloud::{Cloud, MARK};
+use cloud::{MARKER_PROPERTY, PointCloudFile};
 use common::{check_kind, residence};
-use decoder::{Act, ColorDecoder};
-use law::{FULL_WIDTH, Spacetime, WIDTH};
+use decoder::{ColorActivation, ColorDecoder};
+use frame_state::{FULL_WIDTH, Spacetime, WIDTH};
 pub(super) use splatv::SPLATV;
 
-const CLOUDS: &str = "point_cloud";
-const CLOUD: &str = "point_cloud.ply";
+/// Name of the folder of iterations.
+const POINT_CLOUD_FOLDER: &str = "point_cloud";
+/// Name of the point cloud file in an iteration folder.
+const POINT_CLOUD_FILE: &str = "point_cloud.ply";
+/// Name of the file with the decoder network of the full model.
 const DECODER: &str = "point_cloud.pt";
+/// Name of the file with the training arguments.
 const CFG_ARGS: &str = "cfg_args";
-/// What is copied beside it, where it is there.
+/// File of the model folder that is copied to the output if it exists.
 const CAMERAS: &str = "cameras.json";
 
-/// A model's folder, or its PLY.
+/// SpacetimeGaussians model folder, or its PLY.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
     recognizes: |found| match found.is_folder {
-        true => iteration(&found.path.join(CLOUDS), None).is_ok_and(|(_, folder)| is_marked(&folder.join(CLOUD))),
-        false => found.is_file_of(b"ply", "ply") && is_marked(found.path),
+        true => find_iteration(&found.path.join(POINT_CLOUD_FOLDER), None)
+            .is_ok_and(|(_, folder)| has_marker_property(&folder.join(POINT_CLOUD_FILE))),
+        false => found.is_file_of(b"ply", "ply") && has_marker_property(found.path),
     },
     open: |path, options| Ok(Box::new(SpacetimeGaussians::open(path, options)?)),
 };
 
-/// Whether the header of the PLY at `path` has a property that only this family's has.
-pub(super) fn is_marked(path: &Path) -> bool {
-    // Enough for any header of this family; nothing of a model's values.
+/// Returns whether the header of the PLY at `path` has a property that only SpacetimeGaussians writes.
+pub(super) fn has_marker_property(path: &Path) -> bool {
+    // 16 KiB hold the whole header of any PLY of this format; the rest of the file is not read.
     let mut head = Vec::new();
     let read = open_file(path).is_ok_and(|file| file.take(1 << 14).read_to_end(&mut head).is_ok());
     let header = head.windows(10).position(|bytes| bytes == b"end_header").map_or(&head[..], |end| &head[..end]);
-    read && header.windows(MARK.len()).any(|bytes| bytes == MARK.as_bytes())
+    read && header.windows(MARKER_PROPERTY.len()).any(|bytes| bytes == MARKER_PROPERTY.as_bytes())
 }
 
-/// The files of a model.
+/// Paths of the files of a model.
 #[derive(Debug, Clone)]
 struct Files {
     cloud: PathBuf,
-    /// Of a folder: its root, and K of `iteration_K`.
+    /// Model folder and K of `iteration_K`; `None` for a PLY alone.
     folder: Option<(PathBuf, u32)>,
-    /// The network of the full model.
+    /// File of the decoder network of the full model.
     decoder: Option<PathBuf>,
 }
 
 impl Files {
+    /// Finds the files of the model at `path`, of the requested iteration or the largest.
     fn find(path: &Path, options: &OpenOptions) -> Result<Files> {
         if !path.is_dir() {
             options.refuse_for(path)?;
             return Ok(Files { cloud: path.to_owned(), folder: None, decoder: None });
         }
-        let (number, folder) = iteration(&path.join(CLOUDS), options.iteration)?;
+        let (number, folder) = find_iteration(&path.join(POINT_CLOUD_FOLDER), options.iteration)?;
         let decoder = Some(folder.join(DECODER)).filter(|path| path.exists());
-        Ok(Files { cloud: folder.join(CLOUD), folder: Some((path.to_owned(), number)), decoder })
+        Ok(Files { cloud: folder.join(POINT_CLOUD_FILE), folder: Some((path.to_owned(), number)), decoder })
     }
 
-    /// A file of the folder's root, where there is one.
-    fn of_root(&self, name: &str) -> Option<PathBuf> {
+    /// Returns the path of the file `name` in the model folder if it exists.
+    fn root_file(&self, name: &str) -> Option<PathBuf> {
         self.folder.as_ref().map(|(root, _)| root.join(name)).filter(|path| path.is_file())
     }
 
-    /// What a renderer opens beside the cloud.
-    fn rest(&self) -> Vec<PathBuf> {
-        self.decoder.clone().into_iter().chain(self.of_root(CFG_ARGS)).collect()
+    /// Returns the files that a renderer opens in addition to the point cloud file.
+    fn other_files(&self) -> Vec<PathBuf> {
+        self.decoder.clone().into_iter().chain(self.root_file(CFG_ARGS)).collect()
     }
 }
 
-/// What of `cfg_args` matters here.
+/// Values of `cfg_args` that are used.
 #[derive(Debug, Clone, Default)]
 struct SpacetimeConfig {
     source_path: Option<String>,
     rgb_function: Option<String>,
-    /// Frames from 0 to 1.
+    /// Number of frames in the time span from 0 to 1.
     duration: Option<usize>,
 }
 
 impl SpacetimeConfig {
+    /// Reads the `Namespace(…)` of `cfg_args`.
     fn read(path: &Path) -> Result<SpacetimeConfig> {
         let text = read_text(path, 1 << 20)?;
         let arguments = parse_call(&text, "Namespace").map_err(|error| error.in_file(path, &text))?;
@@ -131,83 +140,94 @@ impl SpacetimeConfig {
     }
 }
 
-/// An open model.
+/// Open SpacetimeGaussians model.
 #[derive(Debug)]
 struct SpacetimeGaussians {
     files: Files,
-    cloud: Cloud,
+    cloud: PointCloudFile,
     model: MotionModelFrames<Spacetime>,
     configuration: SpacetimeConfig,
-    act: Act,
+    activation: ColorActivation,
     notes: Vec<String>,
 }
 
 impl SpacetimeGaussians {
+    /// Opens the model folder or PLY at `path`.
     fn open(path: &Path, options: &OpenOptions) -> Result<SpacetimeGaussians> {
         let files = Files::find(path, options)?;
-        let cloud = Cloud::open(&files.cloud, &options.ply())?;
+        let cloud = PointCloudFile::open(&files.cloud, &options.ply())?;
         let configuration =
-            files.of_root(CFG_ARGS).map(|path| SpacetimeConfig::read(&path)).transpose()?.unwrap_or_default();
+            files.root_file(CFG_ARGS).map(|path| SpacetimeConfig::read(&path)).transpose()?.unwrap_or_default();
         let mut notes = Vec::new();
-        let act = match configuration.rgb_function.as_deref() {
-            _ if !cloud.is_full() => Act::None,
+        let activation = match configuration.rgb_function.as_deref() {
+            _ if !cloud.is_full() => ColorActivation::None,
             None => {
                 notes.push(
-                    "nothing says what the model does to colours last (rgbfunction of cfg_args): sandwich".to_owned(),
+                    "cfg_args does not give rgbfunction, the last step of the model's colors: sandwich is assumed"
+                        .to_owned(),
                 );
-                Act::Sigmoid
+                ColorActivation::Sigmoid
             }
-            Some(name) => Act::named(name).ok_or_else(|| {
-                let expected = "sandwich, sandwichnoact or sandwichnoactss, of a model with nine features";
+            Some(name) => ColorActivation::named(name).ok_or_else(|| {
+                let expected = "sandwich, sandwichnoact or sandwichnoactss, for a model with nine features";
                 Error::input(&path.join(CFG_ARGS), "key rgbfunction", expected, quoted(name).to_string())
             })?,
         };
         let decoder = match (cloud.is_full(), &files.decoder) {
-            (true, Some(path)) => Some(ColorDecoder::new(&read_state_dict(path, options.memory)?, act, path)?),
+            (true, Some(path)) => Some(ColorDecoder::new(&read_state_dict(path, options.memory)?, activation, path)?),
             (true, None) if files.folder.is_some() => {
                 let path = files.cloud.with_file_name(DECODER);
-                return Err(Error::input(&path, "", "the network of a model with nine features", "no such file")
-                    .hint("training saves it beside point_cloud.ply; copy it too"));
+                return Err(Error::input(
+                    &path,
+                    "",
+                    "the decoder network of a model with nine features",
+                    "no such file",
+                )
+                .hint("training saves it beside point_cloud.ply; copy it too"));
             }
             _ => None,
         };
         if cloud.is_full() {
-            let cheap = "the colour that the first three of nine features have by themselves";
+            let color_source = "the color that the first three of nine features give without the decoder network";
             notes.push(match decoder {
                 Some(_) => format!(
-                    "what is scored, merged, refined and written as frames is by {cheap}; pictures of render, evaluate, report \
-                     and video, those that choose between merging and pruning, and what is compared with photographs are by all \
-                     nine and the network that reads them"
+                    "scores, merging, refinement and exported frames use {color_source}; render, evaluate, report, \
+                     video, the choice between merging and pruning, and comparisons with photographs use all nine \
+                     features and the network"
                 ),
-                None => format!("pictures are by {cheap}: the network that reads all of them is not beside the PLY"),
+                None => format!("renders use {color_source}: the network is not beside the PLY"),
             });
         }
-        let raw = cloud.raw(act)?;
-        notes.extend(dark(&raw));
+        let raw = cloud.raw(activation)?;
+        notes.extend(negative_color_note(&raw));
         let model = MotionModelFrames::new(Spacetime { is_full: cloud.is_full(), decoder }, raw, 0);
-        Ok(SpacetimeGaussians { files, cloud, model, configuration, act, notes })
+        Ok(SpacetimeGaussians { files, cloud, model, configuration, activation, notes })
     }
 
-    /// Writes the model folder of what is left.
+    /// Writes the model folder of the compressed model.
     fn write_folder(&self, reduction: &CompressedModel, path: &Path) -> Result<()> {
         let number = self.files.folder.as_ref().map_or(0, |(_, number)| *number);
-        let folder = path.join(CLOUDS).join(format!("iteration_{number}"));
+        let folder = path.join(POINT_CLOUD_FOLDER).join(format!("iteration_{number}"));
         fs::create_dir_all(&folder).map_err(Error::io("create", &folder))?;
-        self.cloud.write(reduction, &folder.join(CLOUD))?;
+        self.cloud.write(reduction, &folder.join(POINT_CLOUD_FILE))?;
         if let Some(decoder) = &self.files.decoder {
             copy(decoder, &folder.join(DECODER))?;
         }
-        let of_root = [CFG_ARGS, CAMERAS].into_iter().filter_map(|name| Some((self.files.of_root(name)?, name)));
-        of_root.into_iter().try_for_each(|(from, name)| copy(&from, &path.join(name)))
+        let from_root = [CFG_ARGS, CAMERAS].into_iter().filter_map(|name| Some((self.files.root_file(name)?, name)));
+        from_root.into_iter().try_for_each(|(from, name)| copy(&from, &path.join(name)))
     }
 }
 
-/// How many Gaussians have a color that the authors' renderer adds and that others cut.
-fn dark(raw: &Raw) -> Option<String> {
-    let is_dark = |row: usize| raw.gaussians.sh.row::<3>(row).iter().any(|&harmonic| color(harmonic) < 0.0);
-    let count = (0..raw.len()).filter(|&row| is_dark(row)).count();
+/// Returns a note with the number of Gaussians whose color is negative: the authors' renderer adds such colors, others
+/// clamp them to 0.
+fn negative_color_note(raw: &Raw) -> Option<String> {
+    let is_negative = |row: usize| raw.gaussians.sh.row::<3>(row).iter().any(|&harmonic| color(harmonic) < 0.0);
+    let count = (0..raw.len()).filter(|&row| is_negative(row)).count();
     (count > 0).then(|| {
-        format!("{count} Gaussians have a colour below 0, which darkens in the authors' renderer and is 0 in others and here")
+        format!(
+            "{count} Gaussians have a color below 0: it darkens renders of the authors' renderer; other renderers \
+                 and this program clamp it to 0"
+        )
     })
 }
 
@@ -223,7 +243,7 @@ impl InputModel for SpacetimeGaussians {
     fn digest(&self) -> Result<String> {
         let mut hash = Xxh3::new();
         hash_file(&self.files.cloud, &mut hash)?;
-        self.files.rest().iter().try_for_each(|path| hash_file(path, &mut hash))?;
+        self.files.other_files().iter().try_for_each(|path| hash_file(path, &mut hash))?;
         Ok(format!("{:032x}", hash.digest128()))
     }
 
@@ -232,16 +252,16 @@ impl InputModel for SpacetimeGaussians {
     }
 
     fn size(&self) -> Result<Size> {
-        let rest = self.files.rest();
-        let (cloud, rest) = (bytes_of([&*self.files.cloud])?, bytes_of(rest.iter().map(PathBuf::as_path))?);
+        let other = self.files.other_files();
+        let (cloud, rest) = (bytes_of([&*self.files.cloud])?, bytes_of(other.iter().map(PathBuf::as_path))?);
         Ok(Size { cloud, rest, ..Size::default() })
     }
 
     fn size_written(&self, kind: OutputKind, path: &Path) -> Result<Size> {
         match kind {
             OutputKind::Model => Files::find(path, &OpenOptions::default()).and_then(|files| {
-                let rest = files.rest();
-                let (cloud, rest) = (bytes_of([&*files.cloud])?, bytes_of(rest.iter().map(PathBuf::as_path))?);
+                let other = files.other_files();
+                let (cloud, rest) = (bytes_of([&*files.cloud])?, bytes_of(other.iter().map(PathBuf::as_path))?);
                 Ok(Size { cloud, rest, ..Size::default() })
             }),
             OutputKind::Ply | OutputKind::Splatv => Ok(Size { cloud: bytes_of([path])?, ..Size::default() }),
@@ -278,7 +298,7 @@ impl InputModel for SpacetimeGaussians {
         self.configuration.duration
     }
 
-    /// Whatever `white_background` of `cfg_args` says.
+    /// Returns black: training ignores `white_background` of `cfg_args`.
     fn background(&self) -> Option<[f32; 3]> {
         Some([0.0; 3])
     }
@@ -298,7 +318,7 @@ impl InputModel for SpacetimeGaussians {
 
     fn solve(&self, clusters: &[Cluster], reference: Reference, rule: &MergeParams) -> Result<Proxies> {
         solve(&self.model, clusters, reference, rule, |clusters| {
-            proxies::propose(&self.model, clusters, rule, self.act)
+            proxies::propose(&self.model, clusters, rule, self.activation)
         })
     }
 
@@ -318,15 +338,15 @@ impl InputModel for SpacetimeGaussians {
             OutputKind::Model => self.write_folder(reduction, path)?,
             OutputKind::Ply => self.cloud.write(reduction, path)?,
             OutputKind::Splatv => {
-                let raw = left(self.model.raw(), reduction);
-                // Those that did not change, as they stand: there and back a last digit can be lost.
+                let raw = compressed_raw(self.model.raw(), reduction);
+                // Keep the stored color where it did not change: converting it to SH and back can lose the last digit.
                 let (own, colors) = (&self.model.raw().gaussians.sh, self.cloud.colors()?);
                 let known = |i: usize| {
                     let id = reduction.kept[i] as usize;
                     let is_own = raw.gaussians.sh.row::<3>(i) == own.row::<3>(id);
                     is_own.then(|| colors.each_ref().map(|plane| plane[id]))
                 };
-                splatv::write(&raw, known, self.files.of_root(CAMERAS).as_deref(), path)?;
+                splatv::write(&raw, known, self.files.root_file(CAMERAS).as_deref(), path)?;
             }
             OutputKind::Archive => return Err(Error::usage(NO_ARCHIVE)),
             _ => return write_sequence(&*self.reduced(reduction)?, kind, path, limits.frames_held, events),

@@ -1,48 +1,48 @@
-//! How a Gaussian moves: a cubic path, a quaternion that is linear in time, a window.
+//! Motion of a Gaussian: a cubic path, a quaternion that is linear in time, and a temporal window.
 //!
-//! With dt = t − center: x = p₀ + p₁·dt + p₂·dt² + p₃·dt³; q = rotation + dt·omega, of any length; the opacity is multiplied
-//! by exp(−(dt/e^log_width)²). Source: Li et al., "Spacetime Gaussian Feature Splatting", 2024, and its public code, which has no
-//! factor ½ in that exponent. All in f64.
+//! With dt = t − center: x = p₀ + p₁·dt + p₂·dt² + p₃·dt³; q = rotation + dt·omega, of any length; the opacity is
+//! multiplied by exp(−(dt/e^log_width)²). Source: Li et al., "Spacetime Gaussian Feature Splatting", 2024, and its
+//! public code, which has no factor ½ in that exponent. All computations are in f64.
 
 use crate::fit::polynomial;
 
-/// The motion of a Gaussian.
+/// Motion and temporal window of a Gaussian.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct SpacetimeMotion {
-    /// Unit of time.
+    /// Center of the window, in the model's time unit.
     pub(super) center: f64,
-    /// Natural log of √2 × the standard deviation in time.
+    /// Natural logarithm of √2 × the standard deviation in time.
     pub(super) log_width: f64,
     /// Coefficients of 1, dt, dt², dt³.
     pub(super) path: [[f64; 3]; 4],
-    /// wxyz at the center, of any length.
+    /// Quaternion wxyz at the center, of any length.
     pub(super) rotation: [f64; 4],
-    /// Its change per unit of time.
+    /// Change of the quaternion per unit of time.
     pub(super) omega: [f64; 4],
 }
 
 impl SpacetimeMotion {
-    /// Where it is at `time`.
+    /// Returns the position at `time`.
     pub(super) fn position(&self, time: f64) -> [f64; 3] {
         let (dt, [p0, p1, p2, p3]) = (time - self.center, self.path);
         std::array::from_fn(|c| p0[c] + dt * (p1[c] + dt * (p2[c] + dt * p3[c])))
     }
 
-    /// How it is turned at `time`, wxyz of any length.
+    /// Returns the quaternion at `time`, wxyz of any length.
     pub(super) fn rotation(&self, time: f64) -> [f64; 4] {
         let dt = time - self.center;
         std::array::from_fn(|c| self.rotation[c] + dt * self.omega[c])
     }
 
-    /// What its opacity is multiplied by at `time`.
+    /// Returns the factor of the opacity at `time`.
     pub(super) fn window(&self, time: f64) -> f64 {
         let dt = (time - self.center) / self.log_width.exp();
         (-dt * dt).exp()
     }
 
-    /// The same motion, of another window, told from `center`: positions are those that they were to rounding, and so are
-    /// rotations, but that `rotation` has length 1 where it has any.
-    pub(super) fn about(&self, center: f64) -> SpacetimeMotion {
+    /// Returns the same motion expressed around another `center`, with the window moved there. Positions agree up to
+    /// rounding. So do the directions of quaternions; `rotation` is normalized if it is not zero.
+    pub(super) fn recentered(&self, center: f64) -> SpacetimeMotion {
         let (by, [_, p1, p2, p3]) = (center - self.center, self.path);
         let path = [
             self.position(center),
@@ -50,7 +50,7 @@ impl SpacetimeMotion {
             std::array::from_fn(|c| p2[c] + by * 3.0 * p3[c]),
             p3,
         ];
-        // The state depends on the ratio of both alone.
+        // The state depends only on the ratio of the two.
         let rotation = self.rotation(center);
         let length = dot(&rotation, &rotation).sqrt();
         let length = if length.is_normal() { length } else { 1.0 };
@@ -59,7 +59,7 @@ impl SpacetimeMotion {
     }
 }
 
-/// Product of two quaternions, wxyz.
+/// Returns the product of two quaternions, wxyz.
 pub(super) fn product(a: [f64; 4], b: [f64; 4]) -> [f64; 4] {
     let ([a, x, y, z], [b, u, v, w]) = (a, b);
     [
@@ -70,13 +70,15 @@ pub(super) fn product(a: [f64; 4], b: [f64; 4]) -> [f64; 4] {
     ]
 }
 
+/// Returns the scalar product of two vectors.
 pub(super) fn dot<const N: usize>(a: &[f64; N], b: &[f64; N]) -> f64 {
     a.iter().zip(b).map(|(a, b)| a * b).sum()
 }
 
-/// Center and log width of the window of several, by weights and theirs: the second moments in time of their sum.
+/// Returns the center and log width of the window that has the same first and second moments in time as the weighted
+/// sum of the members' windows.
 pub(super) fn merged_window(members: &[(f64, SpacetimeMotion)]) -> (f64, f64) {
-    // Areas in time count; the longest has 1, so that none overflows.
+    // Windows count by their area in time, relative to the widest one, so that no area overflows.
     let longest = members.iter().fold(f64::NEG_INFINITY, |most, (_, motion)| most.max(motion.log_width));
     let area = |(weight, motion): &(f64, SpacetimeMotion)| weight * (motion.log_width - longest).exp();
     let total: f64 = members.iter().map(area).sum();
@@ -91,8 +93,8 @@ pub(super) fn merged_window(members: &[(f64, SpacetimeMotion)]) -> (f64, f64) {
     (center, longest + 0.5 * squared.ln())
 }
 
-/// The weighted mean of motions that are told from one center: at every time its state is the weighted mean of theirs,
-/// quaternions in the sign of the heaviest one's.
+/// Returns the weighted mean of motions that have the same center. Its state at any time is the weighted mean of their
+/// states, with quaternions in the sign of the heaviest member. `None` without members.
 pub(super) fn mean(members: &[(f64, SpacetimeMotion)]) -> Option<SpacetimeMotion> {
     let heaviest = members.iter().copied().reduce(|a, b| if b.0 > a.0 { b } else { a })?.1;
     let (mut path, mut rotation, mut omega) = ([[0.0; 3]; 4], [0.0; 4], [0.0; 4]);
@@ -109,43 +111,45 @@ pub(super) fn mean(members: &[(f64, SpacetimeMotion)]) -> Option<SpacetimeMotion
     Some(SpacetimeMotion { path, rotation, omega, ..heaviest })
 }
 
-/// A state that a motion should be near to.
+/// State that a fitted motion should approximate.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct TargetState {
     pub(super) time: f64,
     pub(super) weight: f64,
     pub(super) position: [f64; 3],
-    /// In the sign of those before it.
+    /// Quaternion wxyz, with its sign chosen by the caller.
     pub(super) rotation: [f64; 4],
 }
 
-/// The motion that is nearest to the `wanted` states in least squares, told from `about`'s center; `about` where nothing says
-/// anything else. A ridge holds what the times do not determine.
+/// Returns the least-squares fit to the states `targets`, with the center of `initial`; returns `initial` if there are none.
+/// A ridge term regularizes coefficients that the times do not determine.
 ///
-/// Lengths of time are in units of the window: coefficients then weigh alike, so that one ridge serves all.
-pub(super) fn fitted(about: &SpacetimeMotion, wanted: &[TargetState]) -> SpacetimeMotion {
-    let unit = about.log_width.exp().clamp(1e-6, 1e6);
-    let ridge = if wanted.len() < 4 { 1e-3 } else { 1e-6 };
-    // What is still missing of each: nothing moves where `about` is right already.
-    let missing = |of: &TargetState| {
-        let [x, at] = [of.position, about.position(of.time)];
-        let [q, turned] = [of.rotation, about.rotation(of.time)];
+/// Time is measured in window widths. Coefficients then have comparable magnitudes, so one ridge suits all.
+pub(super) fn fitted(initial: &SpacetimeMotion, targets: &[TargetState]) -> SpacetimeMotion {
+    let unit = initial.log_width.exp().clamp(1e-6, 1e6);
+    let ridge = if targets.len() < 4 { 1e-3 } else { 1e-6 };
+    // Fit the residuals, so that nothing changes where `initial` is already right.
+    let residual = |target: &TargetState| {
+        let [x, at] = [target.position, initial.position(target.time)];
+        let [q, rotated] = [target.rotation, initial.rotation(target.time)];
         (
-            (of.time - about.center) / unit,
+            (target.time - initial.center) / unit,
             std::array::from_fn(|c| x[c] - at[c]),
-            std::array::from_fn(|c| q[c] - turned[c]),
+            std::array::from_fn(|c| q[c] - rotated[c]),
         )
     };
-    let path: [[f64; 3]; 4] = polynomial(wanted.iter().map(|of| (missing(of).0, missing(of).1, of.weight)), ridge);
-    let turn: [[f64; 4]; 2] = polynomial(wanted.iter().map(|of| (missing(of).0, missing(of).2, of.weight)), ridge);
-    let mut found = *about;
+    let path: [[f64; 3]; 4] =
+        polynomial(targets.iter().map(|target| (residual(target).0, residual(target).1, target.weight)), ridge);
+    let turn: [[f64; 4]; 2] =
+        polynomial(targets.iter().map(|target| (residual(target).0, residual(target).2, target.weight)), ridge);
+    let mut found = *initial;
     for (k, (to, more)) in found.path.iter_mut().zip(path).enumerate() {
         (0..3).for_each(|c| to[c] += more[c] / unit.powi(k as i32));
     }
-    let [turned, turning] = turn;
+    let [rotated, rotating] = turn;
     (0..4).for_each(|c| {
-        found.rotation[c] += turned[c];
-        found.omega[c] += turning[c] / unit;
+        found.rotation[c] += rotated[c];
+        found.omega[c] += rotating[c] / unit;
     });
     found
 }
@@ -163,7 +167,7 @@ mod tests {
                 center,
                 log_width,
                 path: std::array::from_fn(|k| std::array::from_fn(|c| path[3 * k + c])),
-                // Away from no direction at all.
+                // Keep quaternions away from zero length.
                 rotation: std::array::from_fn(|c| turn[c] + if c == 0 { 3.0 } else { 0.0 }),
                 omega: std::array::from_fn(|c| turn[4 + c]),
             }
@@ -175,59 +179,59 @@ mod tests {
         q.map(|x| x / length)
     }
 
-    fn furthest<const N: usize>(a: [f64; N], b: [f64; N]) -> f64 {
+    fn largest_difference<const N: usize>(a: [f64; N], b: [f64; N]) -> f64 {
         a.iter().zip(b).fold(0.0, |most, (a, b)| most.max((a - b).abs()))
     }
 
     proptest! {
         #[test]
-        fn told_from_another_center_a_motion_is_the_same(motion in motion(), center in -0.5..1.5f64) {
-            let about = motion.about(center);
-            prop_assert_eq!(about.center, center);
-            prop_assert!((dot(&about.rotation, &about.rotation) - 1.0).abs() < 1e-12);
+        fn recentered_motion_is_unchanged(motion in motion(), center in -0.5..1.5f64) {
+            let recentered = motion.recentered(center);
+            prop_assert_eq!(recentered.center, center);
+            prop_assert!((dot(&recentered.rotation, &recentered.rotation) - 1.0).abs() < 1e-12);
             for k in 0..=10 {
                 let time = f64::from(k) / 10.0;
                 let size = 1.0 + motion.position(time).iter().fold(0.0f64, |most, x| most.max(x.abs()));
-                let off = furthest(motion.position(time), about.position(time)) / size;
+                let off = largest_difference(motion.position(time), recentered.position(time)) / size;
                 prop_assert!(off < 1e-12, "{} at {}", off, time);
-                let off = furthest(unit(motion.rotation(time)), unit(about.rotation(time)));
+                let off = largest_difference(unit(motion.rotation(time)), unit(recentered.rotation(time)));
                 prop_assert!(off < 1e-12, "{} at {}", off, time);
             }
         }
 
         #[test]
-        fn the_mean_of_motions_is_the_mean_of_their_states_at_every_time(
+        fn mean_motion_has_the_mean_state_at_every_time(
             some in prop::collection::vec((0.1..1.0f64, motion()), 1..5),
             flip in 0..4usize,
         ) {
             let total: f64 = some.iter().map(|member| member.0).sum();
             let center = merged_window(&some).0;
-            let mut about: Vec<(f64, SpacetimeMotion)> =
-                some.iter().map(|(weight, motion)| (weight / total, motion.about(center))).collect();
-            let expected = mean(&about).unwrap();
-            // The same turns under the other sign.
-            let other = flip % about.len();
-            let flipped = &mut about[other].1;
+            let mut recentered: Vec<(f64, SpacetimeMotion)> =
+                some.iter().map(|(weight, motion)| (weight / total, motion.recentered(center))).collect();
+            let expected = mean(&recentered).unwrap();
+            // Negate the quaternions of one member; its rotations stay the same.
+            let other = flip % recentered.len();
+            let flipped = &mut recentered[other].1;
             (flipped.rotation, flipped.omega) = (flipped.rotation.map(|x| -x), flipped.omega.map(|x| -x));
-            let found = mean(&about).unwrap();
+            let found = mean(&recentered).unwrap();
             for k in 0..=4 {
                 let time = f64::from(k) / 4.0;
-                let of = |c: usize| some.iter().map(|(w, motion)| w / total * motion.position(time)[c]).sum::<f64>();
-                let size = 1.0 + (0..3).fold(0.0f64, |most, c| most.max(of(c).abs()));
-                prop_assert!(furthest(found.position(time), std::array::from_fn(of)) / size < 1e-11);
+                let mean_coordinate = |c: usize| some.iter().map(|(w, motion)| w / total * motion.position(time)[c]).sum::<f64>();
+                let size = 1.0 + (0..3).fold(0.0f64, |most, c| most.max(mean_coordinate(c).abs()));
+                prop_assert!(largest_difference(found.position(time), std::array::from_fn(mean_coordinate)) / size < 1e-11);
                 let off = 1.0 - dot(&unit(found.rotation(time)), &unit(expected.rotation(time))).abs();
                 prop_assert!(off < 1e-12, "{}", off);
             }
         }
 
         #[test]
-        fn windows_have_the_second_moments_of_the_sum_of_theirs(
+        fn merged_window_keeps_the_second_moment(
             some in prop::collection::vec((0.1..1.0f64, motion()), 1..5),
         ) {
             let (center, log_width) = merged_window(&some);
-            // By sums over time, of windows as they are.
+            // Compute the moments by summing the windows over time.
             let widest = some.iter().fold(0.0f64, |most, (_, motion)| most.max(motion.log_width.exp()));
-            // As far as the furthest is, and the widest reaches.
+            // Cover the most distant center and the widest window.
             let (mut sums, step) = ([0.0; 3], (8.0 * widest + 2.0) / 20000.0);
             for k in -20000..=20000 {
                 let time = center + f64::from(k) * step;
@@ -244,30 +248,31 @@ mod tests {
         }
 
         #[test]
-        fn a_path_is_fitted_to_states_that_follow_one(about in motion(), motion in motion()) {
-            let about = SpacetimeMotion { log_width: 0.0, ..about };
-            let motion = SpacetimeMotion { log_width: 0.0, ..motion.about(about.center) };
+        fn fit_recovers_a_cubic_path(initial in motion(), motion in motion()) {
+            let initial = SpacetimeMotion { log_width: 0.0, ..initial };
+            let motion = SpacetimeMotion { log_width: 0.0, ..motion.recentered(initial.center) };
             let times = (0..20).map(|k| f64::from(k) / 20.0);
             let state = |time| {
                 TargetState { time, weight: 1.0 + time, position: motion.position(time), rotation: motion.rotation(time) }
             };
-            let wanted: Vec<TargetState> = times.map(state).collect();
-            let found = fitted(&about, &wanted);
-            for TargetState { time, position, rotation, .. } in wanted {
-                // The ridge takes a millionth, of powers that are hard to tell from one another here.
-                prop_assert!(furthest(found.position(time), position) < 0.05, "{:?} {:?}", found.position(time), position);
-                prop_assert!(furthest(found.rotation(time), rotation) < 1e-4);
+            let targets: Vec<TargetState> = times.map(state).collect();
+            let found = fitted(&initial, &targets);
+            for TargetState { time, position, rotation, .. } in targets {
+                // The ridge of 10⁻⁶ matters for powers of time that are nearly collinear here.
+                let at = found.position(time);
+                prop_assert!(largest_difference(at, position) < 0.05, "{:?} {:?}", at, position);
+                prop_assert!(largest_difference(found.rotation(time), rotation) < 1e-4);
             }
-            // Nothing that is wanted changes nothing.
-            prop_assert_eq!(fitted(&about, &[]), about);
+            // Without target states the result is `initial`.
+            prop_assert_eq!(fitted(&initial, &[]), initial);
         }
     }
 
     #[test]
-    fn products_of_quaternions_are_those_of_their_rotations() {
+    fn quaternion_product_agrees_with_glam() {
         let q = |[w, x, y, z]: [f64; 4]| glam::DQuat::from_xyzw(x, y, z, w);
         let (a, b) = ([0.3, -1.0, 2.0, 0.5], [-0.7, 0.2, 0.1, 4.0]);
         let expected = q(a) * q(b);
-        assert!(furthest(product(a, b), [expected.w, expected.x, expected.y, expected.z]) < 1e-14);
+        assert!(largest_difference(product(a, b), [expected.w, expected.x, expected.y, expected.z]) < 1e-14);
     }
 }

@@ -1,15 +1,16 @@
-//! Proxies in the family's own parameters.
+//! Proxies with raw parameters of SpacetimeGaussians.
 //!
-//! Members are told from the center of the proxy's window, exactly; weighted means of their coefficients then give the
-//! weighted mean of their states at every time. Where their windows differ, so that who is there changes with time, the path
-//! is the one nearest to the weighted mean of those that are. Size and shape: second moments over the window, in axes that turn
-//! with the proxy. Opacity: the amplitude of the window nearest to the opacity of the members' moment match.
+//! Members are re-expressed around the center of the proxy's window, which is exact. The weighted mean of their
+//! coefficients then gives the weighted mean of their states at every time. If their windows differ, so that different
+//! members are visible at different times, the path is a least-squares fit to the weighted mean of the visible members.
+//! Size and shape are second moments over the window, in axes that rotate with the proxy. Opacity is the amplitude of
+//! the window that best fits the opacity of the members' moment match.
 
 use glam::{DQuat, DVec3};
 use rayon::prelude::*;
 
-use super::decoder::Act;
-use super::law::{FEATURES, FULL_WIDTH, Spacetime, WIDTH};
+use super::decoder::ColorActivation;
+use super::frame_state::{FEATURES, FULL_WIDTH, Spacetime, WIDTH};
 use super::motion::{SpacetimeMotion, TargetState, dot, fitted, mean, merged_window, product};
 use crate::compressed_model::Cluster;
 use crate::error::Result;
@@ -20,45 +21,49 @@ use crate::models::motion_model::{MotionModel, MotionModelFrames};
 use crate::recipe::MergeParams;
 use crate::source::FrameSource;
 
-/// Windows differ where one is wider by this factor than another, or off its proxy's center by half its width.
-const MOST_WIDER: f64 = 1.5;
-/// Part of its full height below which a window holds nothing that counts.
-const OPEN: f64 = 0.05;
-/// Times at which shape and opacity are compared, at most.
+/// Windows are treated as different if one is wider than another by more than this factor, or off the proxy's center by
+/// more than half of its width.
+const MAX_WIDTH_RATIO: f64 = 1.5;
+/// Fraction of its maximum below which a window is ignored.
+const MIN_WINDOW: f64 = 0.05;
+/// Maximum number of times at which shape and opacity are compared.
 const SAMPLED_TIMES: usize = 12;
-/// Opacities of proxies stay within [this, 1 − this].
+/// Margin of proxy opacities from 0 and 1.
 const OPACITY_MARGIN: f64 = 1e-6;
 
-/// A row for each of `clusters`; `act` makes colors of the full model's first features.
+/// Computes one proxy for each of `clusters`. `activation` turns the first features of the full model into colors.
 ///
 /// # Errors
-/// States that cannot be evaluated.
+/// Fails if states cannot be evaluated.
 pub(super) fn propose(
     model: &MotionModelFrames<Spacetime>,
     clusters: &[Cluster],
     rule: &MergeParams,
-    act: Act,
+    activation: ColorActivation,
 ) -> Result<Raw> {
     let leaders: Vec<u32> = clusters.iter().map(|cluster| cluster.leader).collect();
     let mut raw = model.raw().pick(&leaders);
-    let made: Vec<Raw> = clusters.par_iter().map(|cluster| proxy(model, cluster, rule, act)).collect::<Result<_>>()?;
+    let made: Vec<Raw> =
+        clusters.par_iter().map(|cluster| proxy_parameters(model, cluster, rule, activation)).collect::<Result<_>>()?;
     made.iter().enumerate().for_each(|(row, made)| raw.set_row(row, made, 0));
     Ok(raw)
 }
 
-/// The members of a cluster, with all that is asked of them again and again.
+/// Members of a cluster, with values that are used repeatedly.
 struct ClusterMembers<'a> {
     model: &'a MotionModelFrames<Spacetime>,
     raw: Raw,
     prepared: <Spacetime as MotionModel>::Prepared,
-    /// Weights, and motions as they are.
+    /// Weight and motion of each member.
     motions: Vec<(f64, SpacetimeMotion)>,
-    /// Rows and weights.
+    /// Row in `raw` and weight of each member.
     rows: Vec<(u32, f64)>,
+    /// Row of the leader in `raw`.
     leader: u32,
 }
 
 impl ClusterMembers<'_> {
+    /// Collects the members of `cluster`.
     fn new<'a>(model: &'a MotionModelFrames<Spacetime>, cluster: &Cluster) -> ClusterMembers<'a> {
         let ids: Vec<u32> = cluster.members.iter().map(|&(id, _)| id).collect();
         let raw = model.raw().pick(&ids);
@@ -66,38 +71,46 @@ impl ClusterMembers<'_> {
         let motions =
             rows.iter().map(|&(row, weight)| (weight, SpacetimeMotion::from_raw(&raw, row as usize))).collect();
         let leader = ids.iter().position(|&id| id == cluster.leader).unwrap_or(0) as u32;
-        ClusterMembers { prepared: model.law().prepare(&raw), model, raw, motions, rows, leader }
+        ClusterMembers { prepared: model.motion_model().prepare(&raw), model, raw, motions, rows, leader }
     }
 
+    /// Returns the states of all members at `time`.
     fn state(&self, time: f64) -> Result<Gaussians> {
         let mut state = Gaussians::zeros(self.raw.len(), self.raw.gaussians.sh_degree());
-        self.model.law().state(time, &self.raw, &self.prepared, Columns::all(), &mut state)?;
+        self.model.motion_model().state(time, &self.raw, &self.prepared, Columns::all(), &mut state)?;
         Ok(state)
     }
 
-    /// Times of frames at which `of` is open, evenly spread if they are many; its center where there are none.
-    fn times(&self, of: &SpacetimeMotion) -> Vec<f64> {
+    /// Returns up to [`SAMPLED_TIMES`] frame times at which the window of `motion` counts, evenly spread; its center if
+    /// there are none.
+    fn times(&self, motion: &SpacetimeMotion) -> Vec<f64> {
         let times = &self.model.info().times;
-        let open: Vec<f64> = times.iter().copied().filter(|&time| of.window(time) >= OPEN).collect();
+        let open: Vec<f64> = times.iter().copied().filter(|&time| motion.window(time) >= MIN_WINDOW).collect();
         let count = open.len().min(SAMPLED_TIMES);
         match count {
-            0 => vec![of.center],
+            0 => vec![motion.center],
             1 => open,
             _ => (0..count).map(|k| open[k * (open.len() - 1) / (count - 1)]).collect(),
         }
     }
 }
 
-fn proxy(model: &MotionModelFrames<Spacetime>, cluster: &Cluster, rule: &MergeParams, act: Act) -> Result<Raw> {
+/// Computes the raw parameters of the proxy of `cluster`, in one row.
+fn proxy_parameters(
+    model: &MotionModelFrames<Spacetime>,
+    cluster: &Cluster,
+    rule: &MergeParams,
+    activation: ColorActivation,
+) -> Result<Raw> {
     let members = ClusterMembers::new(model, cluster);
     let (center, log_width) = merged_window(&members.motions);
-    let about: Vec<(f64, SpacetimeMotion)> =
-        members.motions.iter().map(|(weight, motion)| (*weight, motion.about(center))).collect();
+    let recentered: Vec<(f64, SpacetimeMotion)> =
+        members.motions.iter().map(|(weight, motion)| (*weight, motion.recentered(center))).collect();
     let mut out = members.raw.pick(&[members.leader]);
-    let Some(mean) = mean(&about) else { return Ok(out) };
+    let Some(mean) = mean(&recentered) else { return Ok(out) };
     let mut motion = SpacetimeMotion { center, log_width, ..mean };
-    if differ(&members.motions, &motion) {
-        motion = fitted(&motion, &wanted(&members, &about, &motion));
+    if windows_differ(&members.motions, &motion) {
+        motion = fitted(&motion, &target_states(&members, &recentered, &motion));
     }
     let times = members.times(&motion);
     let states: Vec<Gaussians> = times.iter().map(|&time| members.state(time)).collect::<Result<_>>()?;
@@ -110,38 +123,43 @@ fn proxy(model: &MotionModelFrames<Spacetime>, cluster: &Cluster, rule: &MergePa
         let plane = members.raw.gaussians.sh.plane(c);
         out.gaussians.sh.plane_mut(c)[0] = average(&members, plane) as f32;
     }
-    if model.law().is_full {
+    if model.motion_model().is_full {
         for plane in WIDTH..FULL_WIDTH {
             out.own.plane_mut(plane)[0] = average(&members, members.raw.own.plane(plane)) as f32;
         }
         for c in 0..3 {
             let feature = f64::from(out.own.plane(FEATURES + c)[0]);
-            out.gaussians.sh.plane_mut(c)[0] = harmonic(act.apply(feature));
+            out.gaussians.sh.plane_mut(c)[0] = harmonic(activation.apply(feature));
         }
     }
     Ok(out)
 }
 
-/// Weighted mean; alike values stay as they are.
+/// Returns the weighted mean of a plane over the members. Equal values are returned exactly.
 fn average(members: &ClusterMembers<'_>, plane: &[f32]) -> f64 {
     let base = f64::from(plane[members.leader as usize]);
     base + members.rows.iter().map(|&(row, weight)| weight * (f64::from(plane[row as usize]) - base)).sum::<f64>()
 }
 
-/// Whether windows differ so much that who is there changes with time.
-fn differ(members: &[(f64, SpacetimeMotion)], proxy: &SpacetimeMotion) -> bool {
+/// Returns whether the windows differ so much that different members are visible at different times.
+fn windows_differ(members: &[(f64, SpacetimeMotion)], proxy: &SpacetimeMotion) -> bool {
     members.iter().any(|(_, member)| {
-        let wider = (member.log_width - proxy.log_width).abs() > MOST_WIDER.ln();
+        let wider = (member.log_width - proxy.log_width).abs() > MAX_WIDTH_RATIO.ln();
         wider || (member.center - proxy.center).abs() > 0.5 * proxy.log_width.exp()
     })
 }
 
-/// States that a motion should be near to, quaternions in the sign of the mean's; weights change as the members' windows do.
-fn wanted(members: &ClusterMembers<'_>, about: &[(f64, SpacetimeMotion)], mean: &SpacetimeMotion) -> Vec<TargetState> {
+/// Returns the states that the proxy should approximate at each frame: the mean of the members, weighted by their
+/// windows. Quaternions have the sign nearest to `mean`.
+fn target_states(
+    members: &ClusterMembers<'_>,
+    recentered: &[(f64, SpacetimeMotion)],
+    mean: &SpacetimeMotion,
+) -> Vec<TargetState> {
     let of_time = |&time: &f64| {
         let (mut total, mut position, mut rotation) = (0.0, [0.0; 3], [0.0; 4]);
         let near = mean.rotation(time);
-        for ((weight, motion), (_, member)) in about.iter().zip(&members.motions) {
+        for ((weight, motion), (_, member)) in recentered.iter().zip(&members.motions) {
             let weight = weight * member.window(time);
             let (x, q) = (motion.position(time), motion.rotation(time));
             let sign = if dot(&q, &near) < 0.0 { -weight } else { weight };
@@ -159,7 +177,7 @@ fn wanted(members: &ClusterMembers<'_>, about: &[(f64, SpacetimeMotion)], mean: 
     members.model.info().times.iter().filter_map(of_time).collect()
 }
 
-/// Natural logs of the proxy's scales, and its axes turned to go with them.
+/// Returns the natural logarithms of the proxy's scales and rotates its axes accordingly.
 fn shape(members: &ClusterMembers<'_>, states: &[Gaussians], times: &[f64], motion: &mut SpacetimeMotion) -> [f64; 3] {
     let mut parts = Vec::with_capacity(members.rows.len() * times.len());
     for (state, &time) in states.iter().zip(times) {
@@ -181,18 +199,19 @@ fn shape(members: &ClusterMembers<'_>, states: &[Gaussians], times: &[f64], moti
     parts.iter_mut().for_each(|part| part.weight /= total);
     let found = align_axes(&moments(&parts, Some(DVec3::ZERO)), DQuat::IDENTITY);
     let turn = [found.rotation.w, found.rotation.x, found.rotation.y, found.rotation.z];
-    // A product is linear in either factor: a quaternion that is linear in time stays so.
+    // A quaternion product is linear in either factor, so the quaternion stays linear in time.
     (motion.rotation, motion.omega) = (product(motion.rotation, turn), product(motion.omega, turn));
     found.scales.to_array().map(|scale| scale.max(1e-7).ln())
 }
 
-/// Unit; the identity where there is no direction.
+/// Returns the normalized quaternion; the identity if it has no direction.
 fn quaternion([w, x, y, z]: [f64; 4]) -> DQuat {
     let found = DQuat::from_xyzw(x, y, z, w).normalize();
     if found.is_finite() { found } else { DQuat::IDENTITY }
 }
 
-/// The logit of what the window is multiplied by.
+/// Returns the logit of the amplitude that the window is multiplied by: the least-squares fit to the opacities of the
+/// moment match.
 fn amplitude(
     members: &ClusterMembers<'_>,
     states: &[Gaussians],

@@ -1,6 +1,6 @@
-//! `.splatv` as an input, and as a result of the lite model.
+//! `.splatv` as an input, and as an output of the lite model.
 //!
-//! The result of one keeps the words of what stays. Rows that no player draws are left out; an infinite width is a window
+//! Unchanged Gaussians keep their stored words. Rows that no player draws are left out. An infinite width is a window
 //! that is 1 at every time ([`rows`](crate::files::splatv::rows)).
 
 use std::fs;
@@ -9,8 +9,8 @@ use std::path::Path;
 use xxhash_rust::xxh3::Xxh3;
 
 use super::common::{check_kind, residence};
-use super::decoder::Act;
-use super::law::{CENTRE, LOG_WIDTH, MOTION, OMEGA, Spacetime, WIDTH};
+use super::decoder::ColorActivation;
+use super::frame_state::{CENTER, LOG_WIDTH, MOTION, OMEGA, Spacetime, WIDTH};
 use super::proxies;
 use crate::compressed_model::{Cluster, CompressedModel, Proxies, Reference};
 use crate::error::{Error, Result};
@@ -25,8 +25,8 @@ use crate::files::splatv::{MAGIC, Splatv, SplatvGaussian};
 use crate::limits::Limits;
 use crate::model::{Column, Columns, Gaussians, Raw, color, harmonic, logit, opacity};
 use crate::models::input_model::{InputModel, MemoryProfile, ModelFormat, OpenOptions, Timing};
-use crate::models::motion_model::window::MOST;
-use crate::models::motion_model::{MotionModelFrames, left, solve};
+use crate::models::motion_model::window::MAX_LOGIT;
+use crate::models::motion_model::{MotionModelFrames, compressed_raw, solve};
 use crate::models::size::{Size, bytes_below, bytes_of};
 use crate::models::trajectories::write_sequence;
 use crate::outputs::kind::OutputKind;
@@ -34,15 +34,15 @@ use crate::progress::Events;
 use crate::recipe::MergeParams;
 use crate::source::FrameSource;
 
-/// Maximum number of bytes of a list of cameras that a result gets: some seven thousand cameras.
+/// Maximum bytes of a camera list that is copied to the output: about seven thousand cameras.
 const MAX_LISTED: u64 = 4 << 20;
-/// Scales and widths are no less: their logs are finite.
-const LEAST_LENGTH: f64 = 1e-7;
-/// Natural log of the width of a window without an end: finite, so that no inf·0 arises, and so wide that the window
-/// exp(−(dt/width)²) is exactly 1 in f64 for |dt| below 10⁹.
+/// Minimum scale and width, so that their logarithms are finite.
+const MIN_LENGTH: f64 = 1e-7;
+/// Natural logarithm of the width of an unbounded window. It is finite, so that no inf·0 arises, and so wide that the
+/// window exp(−(dt/width)²) is exactly 1 in f64 for |dt| below 10⁹.
 const UNBOUNDED_LOG_WIDTH: f32 = 40.0;
 
-/// A `.splatv`.
+/// Compressed SpacetimeGaussians lite model for web players (`.splatv`).
 pub(in super::super) const SPLATV: ModelFormat = ModelFormat {
     recognizes: |found| found.is_file_of(&MAGIC.to_le_bytes(), "splatv"),
     open: |path, options| {
@@ -51,20 +51,22 @@ pub(in super::super) const SPLATV: ModelFormat = ModelFormat {
     },
 };
 
-/// An open file.
+/// Open `.splatv` file.
 #[derive(Debug)]
 struct SplatvModel {
     file: Splatv,
-    /// Row of each Gaussian, where some rows were left out.
+    /// Row in the file of each Gaussian; `None` if no row was left out.
     rows: Option<Vec<u32>>,
+    /// Rows that were repaired or left out.
     defects: Defects,
     model: MotionModelFrames<Spacetime>,
 }
 
 impl SplatvModel {
+    /// Reads the file at `path` and leaves out rows that no player draws.
     fn open(path: &Path, options: &OpenOptions) -> Result<SplatvModel> {
         let file = Splatv::open(path)?;
-        // Parameters and the number of the row.
+        // Parameters and the row number.
         let values = (Columns::all().width(0) + WIDTH + 1) as u64;
         options.memory.check(path, "its texture", "the Gaussians of the file", 4 * values * file.count() as u64)?;
         let zero_rotation = options.conventions.zero_rotation.unwrap_or_default();
@@ -72,7 +74,7 @@ impl SplatvModel {
         let count = file.count() - defects.dropped;
         let mut raw = Raw { gaussians: Gaussians::zeros(count, 0), own: Column::zeros(WIDTH, count) };
         for i in 0..count {
-            set(&mut raw, i, &SplatvGaussian::of_words(&file.words(file_row(rows.as_deref(), i))));
+            set_from_row(&mut raw, i, &SplatvGaussian::of_words(&file.words(file_row(rows.as_deref(), i))));
         }
         let model = MotionModelFrames::new(Spacetime { is_full: false, decoder: None }, raw, 0);
         Ok(SplatvModel { file, rows, defects, model })
@@ -84,24 +86,24 @@ fn file_row(rows: Option<&[u32]>, i: usize) -> usize {
     rows.map_or(i, |rows| rows[i] as usize)
 }
 
-/// Makes Gaussian `i` what `row` is.
-fn set(raw: &mut Raw, i: usize, row: &SplatvGaussian) {
-    let log = |length: f32| f64::from(length).max(LEAST_LENGTH).ln() as f32;
+/// Sets Gaussian `i` to the values of `row`.
+fn set_from_row(raw: &mut Raw, i: usize, row: &SplatvGaussian) {
+    let log = |length: f32| f64::from(length).max(MIN_LENGTH).ln() as f32;
     raw.gaussians.position.set_row(i, row.position);
     raw.gaussians.rotation.set_row(i, if is_unturned(row) { [1.0, 0.0, 0.0, 0.0] } else { row.rotation });
-    // Players square scales: the sign is nothing.
+    // Players square the scales, so the sign has no effect.
     raw.gaussians.log_scale.set_row(i, row.scale.map(|scale| log(scale.abs())));
-    raw.gaussians.opacity_logit.set_row(i, [logit(row.opacity).clamp(-MOST, MOST) as f32]);
+    raw.gaussians.opacity_logit.set_row(i, [logit(row.opacity).clamp(-MAX_LOGIT, MAX_LOGIT) as f32]);
     raw.gaussians.sh.set_row(i, row.rgb.map(harmonic));
     let mut own = |plane: usize, value: f32| raw.own.plane_mut(plane)[i] = value;
-    own(CENTRE, row.center);
+    own(CENTER, row.center);
     own(LOG_WIDTH, if row.width.is_finite() { log(row.width) } else { UNBOUNDED_LOG_WIDTH });
     row.motion.into_iter().enumerate().for_each(|(k, x)| own(MOTION + k, x));
     row.omega.into_iter().enumerate().for_each(|(k, x)| own(OMEGA + k, x));
 }
 
-/// What Gaussian `i` is as a row.
-fn row(raw: &Raw, i: usize) -> SplatvGaussian {
+/// Returns Gaussian `i` as a row of a `.splatv`.
+fn to_row(raw: &Raw, i: usize) -> SplatvGaussian {
     let own = |plane: usize| raw.own.plane(plane)[i];
     SplatvGaussian {
         position: raw.gaussians.position.row(i),
@@ -111,32 +113,35 @@ fn row(raw: &Raw, i: usize) -> SplatvGaussian {
         scale: raw.gaussians.log_scale.row::<3>(i).map(|log| f64::from(log).exp() as f32),
         rgb: raw.gaussians.sh.row::<3>(i).map(color),
         opacity: opacity(raw.gaussians.opacity_logit.row::<1>(i)[0]),
-        center: own(CENTRE),
+        center: own(CENTER),
         width: f64::from(own(LOG_WIDTH)).exp() as f32,
     }
 }
 
-/// Writes `raw` to `path`, in the colors that `known` has of it, with the cameras that the file `cameras` lists as 3DGS does,
-/// else one that sees most of it.
+/// Writes `raw` to `path`. `known` returns the exact color of a Gaussian if it has one. The cameras are those of the
+/// 3DGS file `cameras`, or else one camera that sees most of the Gaussians.
+///
+/// # Errors
+/// Fails if half precision cannot hold the values or a write fails.
 pub(super) fn write(
     raw: &Raw,
     known: impl Fn(usize) -> Option<[f32; 3]>,
     cameras: Option<&Path>,
     path: &Path,
 ) -> Result<()> {
-    // Of many cameras none is better than another one.
+    // A list above the limit is not used: no subset of its cameras would be better than another.
     let is_small = |path: &&Path| fs::metadata(path).is_ok_and(|found| found.len() <= MAX_LISTED);
     let listed = cameras.filter(is_small).map(|path| read_json(path, MAX_LISTED)).transpose()?;
     let listed = listed.filter(|cameras| !cameras[0]["rotation"].is_null());
     let cameras = listed.unwrap_or_else(|| seen_whole(&raw.gaussians.position));
-    let row_of = |i: usize| {
-        let row = row(raw, i);
+    let output_row = |i: usize| {
+        let row = to_row(raw, i);
         SplatvGaussian { rgb: known(i).map_or(row.rgb, |rgb| rgb.map(f64::from)), ..row }
     };
     let mut accuracy = Accuracy::new(&raw.gaussians.position);
-    (0..raw.len()).for_each(|i| measure(&row_of(i), i, &mut accuracy));
+    (0..raw.len()).for_each(|i| measure(&output_row(i), i, &mut accuracy));
     accuracy.check("a .splatv")?;
-    write_file(path, raw.len(), (0..raw.len()).map(|i| words(&row_of(i))), &cameras)
+    write_file(path, raw.len(), (0..raw.len()).map(|i| words(&output_row(i))), &cameras)
 }
 
 impl InputModel for SplatvModel {
@@ -203,7 +208,8 @@ impl InputModel for SplatvModel {
     fn check_output(&self, kind: OutputKind, _: &Path) -> Result<()> {
         match kind {
             OutputKind::Model | OutputKind::Ply => Err(Error::usage(
-                "a .splatv has halves of what a trained model has\n  write a .splatv, a .gseq or --as ply-sequence",
+                "a .splatv has less precision than a trained model and cannot be written as one\n  write a .splatv, a \
+                 .gseq or --as ply-sequence",
             )),
             _ => check_kind(kind, false),
         }
@@ -211,7 +217,7 @@ impl InputModel for SplatvModel {
 
     fn solve(&self, clusters: &[Cluster], reference: Reference, rule: &MergeParams) -> Result<Proxies> {
         solve(&self.model, clusters, reference, rule, |clusters| {
-            proxies::propose(&self.model, clusters, rule, Act::None)
+            proxies::propose(&self.model, clusters, rule, ColorActivation::None)
         })
     }
 
@@ -231,10 +237,10 @@ impl InputModel for SplatvModel {
             return write_sequence(&*self.reduced(reduction)?, kind, path, limits.frames_held, events);
         }
         self.file.check()?;
-        let raw = left(self.model.raw(), reduction);
+        let raw = compressed_raw(self.model.raw(), reduction);
         let unchanged = self.model.raw().pick(&reduction.kept);
         let words_of = |i: usize| {
-            let (now, before) = (row(&raw, i), row(&unchanged, i));
+            let (now, before) = (to_row(&raw, i), to_row(&unchanged, i));
             if now != before {
                 return words(&now);
             }
@@ -243,8 +249,8 @@ impl InputModel for SplatvModel {
             stored
         };
         let mut accuracy = Accuracy::new(&raw.gaussians.position);
-        let changed = |&i: &usize| row(&raw, i) != row(&unchanged, i);
-        (0..raw.len()).filter(changed).for_each(|i| measure(&row(&raw, i), i, &mut accuracy));
+        let changed = |&i: &usize| to_row(&raw, i) != to_row(&unchanged, i);
+        (0..raw.len()).filter(changed).for_each(|i| measure(&to_row(&raw, i), i, &mut accuracy));
         accuracy.check("a .splatv")?;
         write_file(path, raw.len(), (0..raw.len()).map(words_of), self.file.cameras())?;
         Ok(Vec::new())

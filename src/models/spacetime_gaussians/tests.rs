@@ -12,7 +12,7 @@ use crate::recipe::Recipe;
 
 const COUNT: usize = 7;
 
-/// Properties in the order in which training writes them.
+/// Returns the names of the properties in the order in which training writes them.
 fn properties(is_full: bool) -> Vec<String> {
     let numbered = |name: &str, count: usize| (0..count).map(|k| format!("{name}_{k}")).collect::<Vec<_>>();
     let mut names: Vec<String> =
@@ -24,7 +24,7 @@ fn properties(is_full: bool) -> Vec<String> {
     names
 }
 
-/// Values of Gaussian `i`, by property.
+/// Returns the value of a property of Gaussian `i`.
 fn value(name: &str, i: usize) -> f32 {
     let noise = |step: f32| {
         ((i as f32 + 1.0) * step + name.len() as f32 * 0.31 + name.as_bytes()[name.len() - 1] as f32 * 0.17).fract()
@@ -34,7 +34,7 @@ fn value(name: &str, i: usize) -> f32 {
         "trbf_scale" => -1.0 + 0.2 * i as f32,
         "nx" => 0.0,
         "opacity" => i as f32 - 3.0,
-        // Never without a direction.
+        // The quaternion always has a direction.
         "rot_0" => 1.5 + noise(0.2),
         _ if name.starts_with("scale") => -4.0 + noise(0.618_034),
         _ => 2.0 * noise(0.618_034) - 0.5,
@@ -58,22 +58,22 @@ fn write_decoder(path: &Path, tensors: &Tensors) {
     write_state_dict(path, &stored.collect::<Vec<_>>()).unwrap();
 }
 
-const ARGUMENTS: &str =
+const CFG_ARGS_TEXT: &str =
     "Namespace(model='ours', duration=50, white_background=True, source_path='data/x', rgbfunction='sandwich')";
 
-/// A folder as training leaves it.
+/// Writes a model folder as training does, with two iterations.
 fn folder(is_full: bool) -> tempfile::TempDir {
     let root = tempfile::tempdir().unwrap();
     for number in [7, 300] {
         let folder = root.path().join(format!("point_cloud/iteration_{number}"));
         fs::create_dir_all(&folder).unwrap();
         let count = if number == 300 { COUNT } else { 2 };
-        fs::write(folder.join(CLOUD), ply(&properties(is_full), count, value)).unwrap();
+        fs::write(folder.join(POINT_CLOUD_FILE), ply(&properties(is_full), count, value)).unwrap();
         if is_full {
             write_decoder(&folder.join(DECODER), &decoder::tests::weights());
         }
     }
-    fs::write(root.path().join(CFG_ARGS), ARGUMENTS).unwrap();
+    fs::write(root.path().join(CFG_ARGS), CFG_ARGS_TEXT).unwrap();
     fs::write(root.path().join(CAMERAS), r#"[{"id": 4, "rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}]"#).unwrap();
     root
 }
@@ -84,11 +84,11 @@ fn open(path: &Path) -> Result<Box<dyn InputModel>> {
 
 const TIMES: [f64; 4] = [0.0, 0.25, 0.5, 0.9];
 
-fn opened(path: &Path) -> Box<dyn InputModel> {
+fn open_with_frames(path: &Path) -> Box<dyn InputModel> {
     open(path).unwrap().with_times(TIMES.to_vec()).unwrap()
 }
 
-fn said(path: &Path) -> String {
+fn refusal(path: &Path) -> String {
     open(path).err().expect("it must be refused").to_string()
 }
 
@@ -106,10 +106,10 @@ fn assert_near(found: &[Gaussians], expected: &[Gaussians], tolerance: f32) {
 }
 
 #[test]
-fn states_are_those_of_the_formulas_in_either_variant() {
+fn states_follow_the_formulas_in_both_variants() {
     for is_full in [false, true] {
         let root = folder(is_full);
-        let model = opened(root.path());
+        let model = open_with_frames(root.path());
         assert_eq!(model.kind().contains("full"), is_full);
         assert_eq!(
             (model.source().info().count, model.clock(), model.background()),
@@ -117,22 +117,22 @@ fn states_are_those_of_the_formulas_in_either_variant() {
         );
         for (state, time) in states(model.source()).iter().zip(TIMES) {
             for i in 0..COUNT {
-                let of = |name: &str| f64::from(value(name, i));
-                let dt = time - of("trbf_center");
+                let stored = |name: &str| f64::from(value(name, i));
+                let dt = time - stored("trbf_center");
                 for (c, axis) in ["x", "y", "z"].iter().enumerate() {
-                    let term = |k: usize| of(&format!("motion_{}", 3 * k + c)) * dt.powi(k as i32 + 1);
-                    let expected = of(axis) + term(0) + term(1) + term(2);
+                    let term = |k: usize| stored(&format!("motion_{}", 3 * k + c)) * dt.powi(k as i32 + 1);
+                    let expected = stored(axis) + term(0) + term(1) + term(2);
                     assert!((f64::from(state.position.plane(c)[i]) - expected).abs() < 1e-6);
                     assert_eq!(state.log_scale.plane(c)[i], value(&format!("scale_{c}"), i));
-                    let feature = of(&format!("f_dc_{c}"));
+                    let feature = stored(&format!("f_dc_{c}"));
                     let expected = if is_full { 1.0 / (1.0 + (-feature).exp()) } else { feature };
                     assert!((crate::model::color(state.sh.plane(c)[i]) - expected).abs() < 1e-6);
                 }
                 for c in 0..4 {
-                    let expected = of(&format!("rot_{c}")) + dt * of(&format!("omega_{c}"));
+                    let expected = stored(&format!("rot_{c}")) + dt * stored(&format!("omega_{c}"));
                     assert!((f64::from(state.rotation.plane(c)[i]) - expected).abs() < 1e-6);
                 }
-                let alpha = (-(dt / of("trbf_scale").exp()).powi(2)).exp() / (1.0 + (-of("opacity")).exp());
+                let alpha = (-(dt / stored("trbf_scale").exp()).powi(2)).exp() / (1.0 + (-stored("opacity")).exp());
                 let expected = (alpha / (1.0 - alpha)).ln().clamp(-40.0, 40.0);
                 let found = f64::from(state.opacity_logit.plane(0)[i]);
                 assert!((found - expected).abs() < 1e-5 * (1.0 + expected.abs()), "{found} for {expected}");
@@ -142,7 +142,7 @@ fn states_are_those_of_the_formulas_in_either_variant() {
 }
 
 #[test]
-fn logits_stay_finite_however_closed_or_solid_a_window_is() {
+fn logits_stay_finite_for_extreme_windows() {
     let root = folder(false);
     let names = properties(false);
     let path = root.path().join("point_cloud/iteration_300/point_cloud.ply");
@@ -155,7 +155,7 @@ fn logits_stay_finite_however_closed_or_solid_a_window_is() {
         _ => value(name, i),
     };
     fs::write(path, ply(&names, COUNT, extreme)).unwrap();
-    for state in states(opened(root.path()).source()) {
+    for state in states(open_with_frames(root.path()).source()) {
         let logits = state.opacity_logit.plane(0);
         assert!(logits.iter().all(|logit| logit.abs() <= 40.0), "{logits:?}");
         assert_eq!((logits[3], logits[4]), (-40.0, -40.0));
@@ -163,9 +163,9 @@ fn logits_stay_finite_however_closed_or_solid_a_window_is() {
 }
 
 #[test]
-fn opacities_change_with_what_is_stored_as_the_jacobian_says() {
+fn opacity_jacobian_agrees_with_finite_differences() {
     let root = folder(false);
-    let model = opened(root.path());
+    let model = open_with_frames(root.path());
     let deformation = model.source().deformation().unwrap();
     assert_eq!(deformation.movable(), Columns::all());
     let step = 1e-2;
@@ -187,27 +187,27 @@ fn opacities_change_with_what_is_stored_as_the_jacobian_says() {
         }
     }
     let full = folder(true);
-    let full = opened(full.path());
+    let full = open_with_frames(full.path());
     assert!(!full.source().deformation().unwrap().movable().contains(Columns::SH));
 }
 
 #[test]
-fn what_stays_of_a_folder_keeps_its_bytes() {
+fn kept_rows_of_a_folder_keep_their_bytes() {
     for is_full in [false, true] {
         let root = folder(is_full);
-        // A folder inside of it is no folder of frames.
+        // A folder inside a model folder is not taken for a folder of frames.
         for inner in ["point_cloud", "point_cloud/iteration_300"] {
-            let message = said(&root.path().join(inner));
+            let message = refusal(&root.path().join(inner));
             assert!(message.contains("give the folder above"), "{message}");
         }
-        let model = opened(root.path());
+        let model = open_with_frames(root.path());
         let rule = Recipe::preset("default").unwrap().merge;
         let result = tempfile::tempdir().unwrap();
         let reduction = CompressedModel::pruned(vec![1, 4, 5], &rule);
         model.write(&reduction, OutputKind::Model, result.path(), &Limits::NONE, &Events::IGNORED).unwrap();
         let kept = |name: &str, i: usize| value(name, [1, 4, 5][i]);
         let iteration = result.path().join("point_cloud/iteration_300");
-        assert_eq!(fs::read(iteration.join(CLOUD)).unwrap(), ply(&properties(is_full), 3, kept));
+        assert_eq!(fs::read(iteration.join(POINT_CLOUD_FILE)).unwrap(), ply(&properties(is_full), 3, kept));
         for name in [CFG_ARGS, CAMERAS] {
             assert_eq!(fs::read(result.path().join(name)).unwrap(), fs::read(root.path().join(name)).unwrap());
         }
@@ -215,22 +215,22 @@ fn what_stays_of_a_folder_keeps_its_bytes() {
         assert_eq!(fs::read(iteration.join(DECODER)).ok(), fs::read(decoder).ok());
         assert_eq!(fs::read(iteration.join(DECODER)).is_ok(), is_full);
         let expected: Vec<Gaussians> = states(model.source()).iter().map(|state| state.pick(&[1, 4, 5])).collect();
-        assert_eq!(states(opened(result.path()).source()), expected);
+        assert_eq!(states(open_with_frames(result.path()).source()), expected);
         let size = model.size_written(OutputKind::Model, result.path()).unwrap();
         assert_eq!(size, open(result.path()).unwrap().size().unwrap());
         assert!(size.whole() < model.bytes().unwrap() && size.rest > 0);
-        // The PLY alone, which a viewer takes.
+        // The PLY alone, as viewers open it.
         let alone = result.path().join("alone.ply");
         model.write(&reduction, OutputKind::Ply, &alone, &Limits::NONE, &Events::IGNORED).unwrap();
-        assert_eq!(fs::read(&alone).unwrap(), fs::read(iteration.join(CLOUD)).unwrap());
-        let alone = opened(&alone);
+        assert_eq!(fs::read(&alone).unwrap(), fs::read(iteration.join(POINT_CLOUD_FILE)).unwrap());
+        let alone = open_with_frames(&alone);
         assert_eq!((alone.own_output(), alone.kind()), (OutputKind::Ply, model.kind()));
         assert_eq!(alone.check_output(OutputKind::Splatv, Path::new("x.splatv")).is_err(), is_full);
         assert!(alone.check_output(OutputKind::Model, Path::new("x")).is_err());
     }
 }
 
-/// Three left, one of them a proxy, two of them changed.
+/// Returns a compressed model of three Gaussians: one is a proxy, two have parameter deltas.
 fn reduction(model: &dyn InputModel) -> CompressedModel {
     let rule = MergeParams { max_drift: 1e6, ..Recipe::preset("default").unwrap().merge };
     let cluster = Cluster { output: 1, leader: 3, members: vec![(2, 0.25), (3, 0.75)] };
@@ -255,19 +255,19 @@ fn reduction(model: &dyn InputModel) -> CompressedModel {
 }
 
 #[test]
-fn merged_and_changed_ones_read_back_as_they_were_shown() {
+fn written_proxies_and_deltas_read_back() {
     for is_full in [false, true] {
         let root = folder(is_full);
-        let model = opened(root.path());
+        let model = open_with_frames(root.path());
         let reduction = reduction(&*model);
         let shown = states(&*model.reduced(&reduction).unwrap());
         let result = tempfile::tempdir().unwrap();
         model.write(&reduction, OutputKind::Model, result.path(), &Limits::NONE, &Events::IGNORED).unwrap();
-        let read = opened(result.path());
+        let read = open_with_frames(result.path());
         assert_near(&states(read.source()), &shown, 2e-6);
-        let file = fs::read(result.path().join("point_cloud/iteration_300").join(CLOUD)).unwrap();
+        let file = fs::read(result.path().join("point_cloud/iteration_300").join(POINT_CLOUD_FILE)).unwrap();
         assert!(!String::from_utf8_lossy(&file).contains("f_rest"));
-        // Nobody else's values changed, and of those that did no others.
+        // Values of other Gaussians did not change, and neither did other values of the changed ones.
         let row = 4 * properties(is_full).len();
         let values = |i: usize| file[file.len() - (3 - i) * row..][..row].to_vec();
         let original = ply(&properties(is_full), COUNT, value);
@@ -277,17 +277,17 @@ fn merged_and_changed_ones_read_back_as_they_were_shown() {
 }
 
 #[test]
-fn a_proxy_of_equals_is_their_mean_at_every_frame_and_of_copies_the_same_one() {
+fn proxy_of_similar_members_is_their_mean_at_every_frame() {
     let root = folder(false);
     let path = root.path().join("point_cloud/iteration_300/point_cloud.ply");
-    // 0 and 1 alike but for where they are and move; 2 and 3 copies.
+    // Gaussians 0 and 1 differ only in position and motion; 2 and 3 are copies.
     let alike = |name: &str, i: usize| match name {
         "x" | "motion_0" | "motion_4" => value(name, i.min(2)),
         _ if i < 2 => value(name, 0),
         _ => value(name, i.clamp(3, 4)),
     };
     fs::write(path, ply(&properties(false), COUNT, alike)).unwrap();
-    let model = opened(root.path());
+    let model = open_with_frames(root.path());
     let rule = MergeParams { max_drift: 1e-3, ..Recipe::preset("default").unwrap().merge };
     let clusters = [
         Cluster { output: 0, leader: 0, members: vec![(0, 0.5), (1, 0.5)] },
@@ -302,7 +302,7 @@ fn a_proxy_of_equals_is_their_mean_at_every_frame_and_of_copies_the_same_one() {
             let plane = all.position.plane(c);
             assert!((found.position.plane(c)[0] - 0.5 * (plane[0] + plane[1])).abs() < 1e-5);
             assert!((found.position.plane(c)[1] - plane[2]).abs() < 1e-5);
-            // Longer where they are apart.
+            // A proxy of members that are apart is longer, so only the copies are compared.
             assert!((found.log_scale.plane(c)[1] - all.log_scale.plane(c)[2]).abs() < 1e-5);
         }
         let unit = |state: &Gaussians, i: usize| {
@@ -318,19 +318,19 @@ fn a_proxy_of_equals_is_their_mean_at_every_frame_and_of_copies_the_same_one() {
 }
 
 #[test]
-fn a_lite_model_as_a_splatv_moves_as_it_did_and_what_stays_of_that_keeps_its_words() {
+fn splatv_of_a_lite_model_keeps_motion_and_stored_words() {
     let root = folder(false);
-    let model = opened(root.path());
+    let model = open_with_frames(root.path());
     let rule = Recipe::preset("default").unwrap().merge;
     let all = CompressedModel::pruned((0..COUNT as u32).collect(), &rule);
     let path = root.path().join("all.splatv");
     model.write(&all, OutputKind::Splatv, &path, &Limits::NONE, &Events::IGNORED).unwrap();
-    let read = opened(&path);
+    let read = open_with_frames(&path);
     assert_eq!(
         (read.kind(), read.source().info().count, read.own_output()),
         ("splaTV model", COUNT, OutputKind::Splatv)
     );
-    // Colors and opacities are bytes there, and colors below 0 or above 1 none.
+    // Colors and opacities are stored as bytes, and colors outside 0 … 1 are clamped, so they are not compared.
     for (found, expected) in states(read.source()).iter().zip(states(model.source())) {
         let pairs = |column: Columns| {
             found.column(column).planes().iter().zip(expected.column(column).planes()).collect::<Vec<_>>()
@@ -355,21 +355,21 @@ fn a_lite_model_as_a_splatv_moves_as_it_did_and_what_stays_of_that_keeps_its_wor
     assert_eq!(moved.words(0), file.words(2));
     let (to, from) = (SplatvGaussian::of_words(&moved.words(1)), SplatvGaussian::of_words(&file.words(5)));
     assert_eq!(to, SplatvGaussian { position: [from.position[0] + 1.0, from.position[1], from.position[2]], ..from });
-    // Without cameras of its own there is one that a viewer can start at.
+    // Without cameras of the model, the file gets one that a viewer can start at.
     fs::remove_file(root.path().join(CAMERAS)).unwrap();
-    opened(root.path()).write(&all, OutputKind::Splatv, &kept, &Limits::NONE, &Events::IGNORED).unwrap();
+    open_with_frames(root.path()).write(&all, OutputKind::Splatv, &kept, &Limits::NONE, &Events::IGNORED).unwrap();
     assert_eq!(Splatv::open(&kept).unwrap().cameras()[0]["rotation"].as_array().map(Vec::len), Some(3));
 }
 
 #[test]
-fn properties_that_are_missing_or_too_many_and_values_that_are_none_are_named() {
+fn wrong_properties_and_values_are_named() {
     let root = tempfile::tempdir().unwrap();
     let path = root.path().join("model.ply");
     let refused = |change: &dyn Fn(&mut Vec<String>)| {
         let mut names = properties(true);
         change(&mut names);
         fs::write(&path, ply(&names, 3, value)).unwrap();
-        said(&path)
+        refusal(&path)
     };
     let without = |name: &'static str| refused(&move |names| names.retain(|found| found != name));
     for (name, expected) in [
@@ -394,36 +394,37 @@ fn properties_that_are_missing_or_too_many_and_values_that_are_none_are_named() 
     {
         fs::write(&path, ply(&properties(true), 3, |of, i| if (of, i) == (name, 1) { wrong } else { value(of, i) }))
             .unwrap();
-        let message = said(&path);
+        let message = refusal(&path);
         assert!(message.contains(&format!("Gaussian 1, {name}")) && message.contains("finite"), "{message}");
     }
-    // Without a folder nothing says what the network is, and the model opens; none has no frames to show.
+    // Without a folder, nothing names the last function of the network and the model opens with a note. A model without
+    // Gaussians opens too.
     fs::write(&path, ply(&properties(true), 3, value)).unwrap();
     assert!(open(&path).unwrap().notes().iter().any(|note| note.contains("sandwich")));
     fs::write(&path, ply(&properties(false), 0, value)).unwrap();
-    assert_eq!(opened(&path).source().info().count, 0);
+    assert_eq!(open_with_frames(&path).source().info().count, 0);
 }
 
 #[test]
-fn files_that_are_cut_or_wrong_are_refused_and_leave_nothing() {
+fn truncated_and_invalid_files_are_refused() {
     let root = folder(true);
     let iteration = root.path().join("point_cloud/iteration_300");
     let whole = |name: &str| fs::read(iteration.join(name)).unwrap();
-    let (cloud, network) = (whole(CLOUD), whole(DECODER));
+    let (cloud, network) = (whole(POINT_CLOUD_FILE), whole(DECODER));
     let start = cloud.windows(10).position(|bytes| bytes == b"end_header").unwrap();
     for length in (start..cloud.len()).step_by(13) {
-        fs::write(iteration.join(CLOUD), &cloud[..length]).unwrap();
-        let message = said(root.path());
+        fs::write(iteration.join(POINT_CLOUD_FILE), &cloud[..length]).unwrap();
+        let message = refusal(root.path());
         assert!(message.contains("point_cloud.ply"), "{length}: {message}");
     }
-    fs::write(iteration.join(CLOUD), &cloud).unwrap();
+    fs::write(iteration.join(POINT_CLOUD_FILE), &cloud).unwrap();
     for length in (0..network.len()).step_by(7) {
         fs::write(iteration.join(DECODER), &network[..length]).unwrap();
-        let message = said(root.path());
+        let message = refusal(root.path());
         assert!(message.contains("point_cloud.pt"), "{length}: {message}");
     }
     fs::remove_file(iteration.join(DECODER)).unwrap();
-    let missing = said(root.path());
+    let missing = refusal(root.path());
     assert!(missing.contains("point_cloud.pt") && missing.contains("no such file"), "{missing}");
     fs::write(iteration.join(DECODER), &network).unwrap();
     for (arguments, expected) in [
@@ -433,7 +434,7 @@ fn files_that_are_cut_or_wrong_are_refused_and_leave_nothing() {
         ("Namespace(rgbfunction='sand", "cfg_args"),
     ] {
         fs::write(root.path().join(CFG_ARGS), arguments).unwrap();
-        let message = said(root.path());
+        let message = refusal(root.path());
         assert!(message.contains(expected), "{message}");
     }
 }

@@ -1,10 +1,11 @@
-//! Stage `archive`: on which grids the values of an archive lie.
+//! Stage `archive`: chooses the quantization steps of the values of an archive.
 //!
-//! Noise adds up: each attribute and tensor, a group, put on its grid alone adds a squared error to the pictures that
-//! goes with the square of its step, and takes bits that go down by about one a value with every octave of it. Bits are
-//! fewest for an error where every group's error goes by how many bits an octave saves there (reverse water-filling;
-//! Cover & Thomas, "Elements of Information Theory", 10.3.3). Both are measured, the errors on pictures; then all steps
-//! together are as coarse as the pictures of the archive itself allow.
+//! Quantization noise adds up. A group of values, an attribute or a tensor, that alone is quantized adds a squared
+//! error to renders proportional to the square of its step; the bits per value fall by about one for each octave of the
+//! step. For a given total error the bits are fewest if the error of every group is proportional to the bits that one
+//! octave saves there (reverse water-filling; Cover & Thomas, "Elements of Information Theory", 10.3.3). The stage
+//! measures both, the errors on renders. Then it makes all steps together as coarse as renders of the archive itself
+//! allow.
 
 use std::collections::BTreeMap;
 
@@ -22,25 +23,27 @@ use crate::pipeline::planning::Planning;
 use crate::pipeline::request::Goal;
 use crate::pipeline::stage::{Archived, EstimateInput, Phase, RunState, Stage, StageList};
 use crate::pipeline::stages::reference_views::{
-    ADDED, ArchiveTarget, BYTES_ADDED, BYTES_HALVINGS, HALVINGS, LEFT_BY_SEARCH, PIXEL, QualityTarget, ROUNDS,
-    ReferenceViews, balanced, bisected, check_met, measurable, pictures,
+    ARCHIVE_HEADROOM, ArchiveTarget, BALANCING_ROUNDS, BYTES_OCTAVE_HALVINGS, BYTES_OCTAVE_RANGE, BYTES_PER_PIXEL,
+    OCTAVE_HALVINGS, OCTAVE_RANGE, QualityTarget, ReferenceViews, bisect, check_measurable, check_met, pictures,
+    step_change,
 };
 use crate::pipeline::summary::ArchiveSummary;
 use crate::render;
 use crate::scene::Scene;
 
-/// What the stage is called.
+/// Name of the stage.
 const NAME: &str = "archive";
-/// Steps are at most so many deviations of their values: beyond that nothing is left of these.
-const COARSEST: f64 = 4.0;
-/// Octaves by which grids that no picture was looked at for are taken to be coarser in the end: with this the count that
-/// fits leaves .5 and 1.2 dB to the grids of two trained models.
-const GUESSED: f64 = 3.3;
+/// Maximum step in standard deviations of a group's values; a coarser one would erase the values.
+const MAX_STEP: f64 = 4.0;
+/// Octaves added to the initial steps to estimate the size of an archive without rendering. With this value, the number
+/// of Gaussians that fits leaves 0.5 and 1.2 dB for quantization on two trained models.
+const ESTIMATE_OCTAVES: f64 = 3.3;
 
-/// The making of an archive.
+/// Stage that makes an archive.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ArchiveStage {
-    /// PSNR of its pictures against those of the result before, dB; none: by what it costs against the original's.
+    /// Required PSNR of its renders against the result before quantization, dB. `None`: derived from the loss against
+    /// the original.
     pub psnr: Option<f64>,
 }
 
@@ -66,8 +69,8 @@ impl Stage for ArchiveStage {
         if let Some(goal) = &mut run.goal {
             (goal.searched, goal.held) = (goal.searched - archive.loss, goal.held - archive.loss);
             run.journal.notes.push(format!(
-                "{LEFT_BY_SEARCH} dB of what was searched for were left for the archive, which takes {:.2}: at least {} dB \
-                 asked for, {:.2} dB by the pictures searched on, {:.2} dB by those held back",
+                "archive: quantization costs {:.2} dB of the {ARCHIVE_HEADROOM} dB that the search reserved for it; at \
+                 least {} dB PSNR requested, {:.2} dB on the views of the search, {:.2} dB on the other views",
                 archive.loss, goal.asked, goal.searched, goal.held
             ));
         }
@@ -76,7 +79,7 @@ impl Stage for ArchiveStage {
     }
 }
 
-/// A group of values with one step.
+/// Group of values with one quantization step.
 #[derive(Debug, Clone)]
 enum ValueGroup {
     Attribute(usize),
@@ -91,8 +94,9 @@ impl ValueGroup {
         }
     }
 
-    /// Steps that a deviation of its values is at first, finer than most end: where measuring begins.
-    fn first(&self) -> f64 {
+    /// Returns the initial number of steps per standard deviation of the values. These steps are finer than most final
+    /// ones.
+    fn initial_steps(&self) -> f64 {
         match self {
             ValueGroup::Attribute(0) => 512.0,
             ValueGroup::Attribute(_) => 24.0,
@@ -103,12 +107,12 @@ impl ValueGroup {
 }
 
 impl ArchiveStage {
-    /// What is left, its pictures, the archive and what it decodes to.
+    /// Returns the estimate: the result, its renders, the archive and the decoded archive.
     pub fn need(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
         let whole = work.state(Columns::all());
         let count = pictures(work.pixels);
-        // Of some forty groups in every round, and of all together.
-        let looked = count as f64 * (2.0 * HALVINGS as f64 + ROUNDS as f64 * 40.0);
+        // About forty groups are quantized in every round, and all together in each halving.
+        let looked = count as f64 * (2.0 * OCTAVE_HALVINGS as f64 + BALANCING_ROUNDS as f64 * 40.0);
         ResourceEstimate {
             stage: NAME,
             reads: 1.0,
@@ -121,40 +125,41 @@ impl ArchiveStage {
                 ("contents", 4 * whole),
             ],
             fixed: vec![
-                ("pictures", PIXEL * (2 * count + work.threads) * work.pixels),
+                ("pictures", BYTES_PER_PIXEL * (2 * count + work.threads) * work.pixels),
                 ("strips", work.threads * render::STRIP_BYTES as u64),
                 ("fields", 4 * work.input.fixed),
-                // Of frames a few blocks.
-                ("blocks", bounds::storing(work).iter().map(|part| part.1).sum()),
+                // Archives of frames also encode a few blocks.
+                ("blocks", bounds::storing_memory(work).iter().map(|part| part.1).sum()),
             ],
         }
     }
 
-    /// Makes of `reduction` what it is `asked` for.
+    /// Makes an archive of `compressed` that meets `asked`.
     ///
     /// # Errors
-    /// An input that no archive holds, values or pictures that are not finite, frames that cannot be read, too few bytes.
+    /// Fails if the input cannot be archived, if values or renders are not finite, if frames cannot be read, or if the
+    /// byte limit is too low.
     pub fn archive(
         &self,
         scene: &Scene,
-        reduction: &CompressedModel,
+        compressed: &CompressedModel,
         asked: ArchiveTarget,
         journal: &mut Journal,
     ) -> Result<(Archived, ArchiveSummary)> {
-        let key = scene.work.key(&(self.psnr, asked, reduction));
-        let (archived, AsToml(summary)) = journal.kept_stage(NAME, reduction.len(), scene, key, |_| {
+        let key = scene.work.key(&(self.psnr, asked, compressed));
+        let (archived, AsToml(summary)) = journal.kept_stage(NAME, compressed.len(), scene, key, |_| {
             let (archived, summary) = match scene.input.archives_frames() {
                 true => {
-                    let left = scene.input.reduced(reduction)?;
+                    let left = scene.input.reduced(compressed)?;
                     let (bounds, summary) = bounds::find(scene, &*left, self.psnr, asked)?;
                     (Archived::Frames(bounds), summary)
                 }
                 false => {
-                    let (encoded, summary) = self.make(scene, reduction, asked)?;
+                    let (encoded, summary) = self.make(scene, compressed, asked)?;
                     (Archived::Content(encoded), summary)
                 }
             };
-            Ok(((archived, AsToml(summary)), reduction.len()))
+            Ok(((archived, AsToml(summary)), compressed.len()))
         })?;
         Ok((archived, summary))
     }
@@ -162,80 +167,81 @@ impl ArchiveStage {
     fn make(
         &self,
         scene: &Scene,
-        reduction: &CompressedModel,
+        compressed: &CompressedModel,
         asked: ArchiveTarget,
     ) -> Result<(Encoded, ArchiveSummary)> {
-        let mut content = scene.input.content(reduction)?;
-        let looks = ReferenceViews::new(scene, &*scene.input.decode_frames(&content)?)?;
+        let mut content = scene.input.content(compressed)?;
+        let reference_views = ReferenceViews::new(scene, &*scene.input.decode_frames(&content)?)?;
         let original = ReferenceViews::new(scene, scene.source())?;
-        let level = measurable(looks.psnr(scene.source())?)?;
-        let aim = QualityTarget::new(self.psnr, asked, level);
-        let asked = aim.close(level);
+        let level = check_measurable(reference_views.psnr(scene.source())?)?;
+        let quality_target = QualityTarget::new(self.psnr, asked, level);
+        let asked = quality_target.required_psnr(level);
         let mut grids = Grids::from_content(&content);
         let mut measured = Vec::new();
-        for _ in 0..ROUNDS {
-            measured = grids.balance(scene, &looks, &mut content, 10f64.powf(-0.1 * asked))?;
+        for _ in 0..BALANCING_ROUNDS {
+            measured = grids.balance(scene, &reference_views, &mut content, 10f64.powf(-0.1 * asked))?;
         }
         let encoded = |added: f64| archive::encode(&content, &grids.steps(added));
-        let looked_at = |encoded: Encoded| -> Result<(Encoded, [f64; 2])> {
+        let measure_views = |encoded: Encoded| -> Result<(Encoded, [f64; 2])> {
             let (decoded, _) = archive::decode(&encoded.bytes, &scene.path, ReadLimit::NONE)?;
             let shown = scene.input.decode_frames(&decoded)?;
-            Ok((encoded, [looks.psnr(&*shown)?, level - original.psnr(&*shown)?]))
+            Ok((encoded, [reference_views.psnr(&*shown)?, level - original.psnr(&*shown)?]))
         };
-        let (encoded, [psnr, loss]) = match aim {
+        let (encoded, [psnr, loss]) = match quality_target {
             QualityTarget::Bytes(most) => {
-                // The finest that fits.
+                // Take the finest steps that fit.
                 let fits = |finer: f64| Ok(Some(encoded(-finer)?).filter(|found| found.bytes.len() as u64 <= most));
-                looked_at(match bisected(BYTES_ADDED.map(|added| -added), BYTES_HALVINGS, fits)? {
+                measure_views(match bisect(BYTES_OCTAVE_RANGE.map(|added| -added), BYTES_OCTAVE_HALVINGS, fits)? {
                     Some(best) => best,
-                    None => coarsest(encoded(BYTES_ADDED[0])?, most, reduction.len())?,
+                    None => check_coarsest(encoded(BYTES_OCTAVE_RANGE[0])?, most, compressed.len())?,
                 })?
             }
             QualityTarget::Close(_) | QualityTarget::Loss(_) => {
-                let best = bisected(ADDED, HALVINGS, |added| {
-                    Ok(Some(looked_at(encoded(added)?)?).filter(|&(_, found)| aim.does(found, asked)))
+                let best = bisect(OCTAVE_RANGE, OCTAVE_HALVINGS, |added| {
+                    Ok(Some(measure_views(encoded(added)?)?)
+                        .filter(|&(_, found)| quality_target.is_met_by(found, asked)))
                 })?;
-                best.map_or_else(|| looked_at(encoded(ADDED[0])?), Ok)?
+                best.map_or_else(|| measure_views(encoded(OCTAVE_RANGE[0])?), Ok)?
             }
         };
-        check_met(aim, asked, psnr)?;
+        check_met(quality_target, asked, psnr)?;
         let (parts, bits) = (encoded.parts, encoded.bits.clone());
         Ok((encoded, ArchiveSummary { asked, psnr, level, loss, parts: Some(parts), bounds: None, bits, measured }))
     }
 }
 
-/// Bytes of an archive of `reduction`, about: on grids, or within bounds, as they are before any picture is looked at.
+/// Returns the estimated bytes of an archive of `compressed`, with steps or bounds that do not depend on renders.
 ///
 /// # Errors
-/// An input that no archive holds, values that are not finite.
-pub fn bytes(scene: &Scene, reduction: &CompressedModel) -> Result<u64> {
+/// Fails if the input cannot be archived or values are not finite.
+pub fn bytes(scene: &Scene, compressed: &CompressedModel) -> Result<u64> {
     if scene.input.archives_frames() {
-        return bounds::bytes(scene, &*scene.input.reduced(reduction)?);
+        return bounds::bytes(scene, &*scene.input.reduced(compressed)?);
     }
-    let content = scene.input.content(reduction)?;
-    Ok(archive::encode(&content, &Grids::from_content(&content).steps(GUESSED))?.bytes.len() as u64)
+    let content = scene.input.content(compressed)?;
+    Ok(archive::encode(&content, &Grids::from_content(&content).steps(ESTIMATE_OCTAVES))?.bytes.len() as u64)
 }
 
-/// The coarsest archive of `gaussians` Gaussians, if it has no more than `most` bytes.
-fn coarsest(encoded: Encoded, most: u64, gaussians: usize) -> Result<Encoded> {
+/// Returns the coarsest archive of `gaussians` Gaussians if it has at most `most` bytes, otherwise an error.
+fn check_coarsest(encoded: Encoded, most: u64, gaussians: usize) -> Result<Encoded> {
     let least = encoded.bytes.len();
     if least as u64 > most {
         return Err(Error::usage(format!(
-            "--target-size: an archive of {gaussians} Gaussians has {least} bytes on the coarsest grids; expected at least \
-             that, found {most}"
+            "--size: expected at least {least} bytes, the size of an archive of {gaussians} Gaussians with the \
+             coarsest quantization, found {most}"
         )));
     }
     Ok(encoded)
 }
 
-/// The grids of all groups of a content.
+/// Quantization steps of all groups of a content.
 struct Grids {
     groups: Vec<ValueGroup>,
-    /// Standard deviation of each group's values.
+    /// Standard deviation of the values of each group.
     deviations: Vec<f64>,
-    /// Log2 of each group's step.
+    /// Log2 of the step of each group.
     octaves: Vec<f64>,
-    /// What is added to steps within each tensor, by name.
+    /// Offsets of the steps within each tensor, by name of the tensor.
     offsets: BTreeMap<String, Vec<i8>>,
 }
 
@@ -243,19 +249,19 @@ impl Grids {
     fn from_content(content: &Content) -> Grids {
         let groups = groups(content);
         let deviations: Vec<f64> = groups.iter().map(|group| deviation(content, group)).collect();
-        let first = |(group, deviation): (&ValueGroup, &f64)| (deviation / group.first()).log2();
+        let first = |(group, deviation): (&ValueGroup, &f64)| (deviation / group.initial_steps()).log2();
         let octaves = groups.iter().zip(&deviations).map(first).collect();
         let space = archive::space(content);
         let offsets = archive::offsets(&content.field, &content.tensors, &content.cloud.position, space, content.times);
         Grids { groups, deviations, octaves, offsets }
     }
 
-    /// The steps, all so many octaves coarser.
+    /// Returns the steps, all coarser by `added` octaves.
     fn steps(&self, added: f64) -> Steps {
         let mut steps = Steps::default();
         for (group, octave) in self.groups.iter().zip(&self.octaves) {
             match group {
-                ValueGroup::Attribute(k) => steps.cloud[*k] = eighths(octave + added),
+                ValueGroup::Attribute(k) => steps.cloud[*k] = nearest_step(octave + added),
                 ValueGroup::Tensor(name) => _ = steps.field.0.insert(name.clone(), self.tensor(name, octave + added)),
             }
         }
@@ -263,23 +269,25 @@ impl Grids {
     }
 
     fn tensor(&self, name: &str, octave: f64) -> TensorSteps {
-        TensorSteps { step: eighths(octave), channels: self.offsets.get(name).cloned().unwrap_or_default() }
+        TensorSteps { step: nearest_step(octave), channels: self.offsets.get(name).cloned().unwrap_or_default() }
     }
 
-    /// Measures every group's squared error and bits, and has the errors go by what an octave saves, `error` all together.
-    /// Gives what was measured: name, log2 of the step, error, bits.
+    /// Measures the squared error and the bits of every group. Sets the steps so that the error of each group is
+    /// proportional to the bits that one octave saves, with a total error of `error`. Returns the measurements: name,
+    /// log2 of the step, error, bits.
     fn balance(
         &mut self,
         scene: &Scene,
-        looks: &ReferenceViews<'_>,
+        reference_views: &ReferenceViews<'_>,
         content: &mut Content,
         error: f64,
     ) -> Result<Vec<(String, f64, f64, f64)>> {
-        let errors = self.errors(scene, looks, content)?;
+        let errors = self.errors(scene, reference_views, content)?;
         let fine = archive::encode(content, &self.steps(0.0))?.bits;
         let coarse = archive::encode(content, &self.steps(0.5))?.bits;
-        let bits = |of: &BTreeMap<String, f64>, group: &ValueGroup| of.get(group.name()).copied().unwrap_or(0.0);
-        // Never nothing: a group that has no bits left could become coarser without end.
+        let bits =
+            |by_name: &BTreeMap<String, f64>, group: &ValueGroup| by_name.get(group.name()).copied().unwrap_or(0.0);
+        // At least 1: a group without bits left could become coarser without end.
         let saved = |group: &ValueGroup| {
             (2.0 * (bits(&fine, group) - bits(&coarse, group))).max(1.0 + 0.05 * bits(&fine, group))
         };
@@ -288,24 +296,24 @@ impl Grids {
         let mut measured = Vec::with_capacity(self.groups.len());
         for (g, group) in self.groups.iter().enumerate() {
             measured.push((group.name().to_owned(), self.octaves[g], errors[g], bits(&fine, group)));
-            let by = balanced(error * saved[g] / all, errors[g]);
-            let coarsest = (COARSEST * self.deviations[g]).log2();
+            let by = step_change(error * saved[g] / all, errors[g]);
+            let coarsest = (MAX_STEP * self.deviations[g]).log2();
             self.octaves[g] = (self.octaves[g] + by).min(coarsest);
         }
         Ok(measured)
     }
 
-    /// Squared errors of pictures where one group lies on its grid and all others do not. `content` is as it was after.
-    fn errors(&self, scene: &Scene, looks: &ReferenceViews<'_>, content: &mut Content) -> Result<Vec<f64>> {
+    /// Returns the squared errors of renders with one group quantized and all others exact. Leaves `content` unchanged.
+    fn errors(&self, scene: &Scene, reference_views: &ReferenceViews<'_>, content: &mut Content) -> Result<Vec<f64>> {
         let space = archive::space(content);
         let one = |(group, &octave): (&ValueGroup, &f64)| -> Result<f64> {
             match group {
                 ValueGroup::Attribute(k) => {
                     let before = content.cloud.clone();
                     let mut steps = [0; ATTRIBUTES.len()];
-                    steps[*k] = eighths(octave);
+                    steps[*k] = nearest_step(octave);
                     archive::round_cloud(&mut content.cloud, &steps, &[*k]);
-                    let found = looks.error(&*scene.input.decode_frames(content)?);
+                    let found = reference_views.error(&*scene.input.decode_frames(content)?);
                     content.cloud = before;
                     found
                 }
@@ -314,7 +322,7 @@ impl Grids {
                     let steps = self.tensor(name, octave);
                     let rounded = archive::rounded(&before, role, &steps, &content.cloud.position, space);
                     content.tensors.insert(name.clone(), rounded);
-                    let found = looks.error(&*scene.input.decode_frames(content)?);
+                    let found = reference_views.error(&*scene.input.decode_frames(content)?);
                     content.tensors.insert(name.clone(), before);
                     found
                 }
@@ -333,9 +341,9 @@ fn groups(content: &Content) -> Vec<ValueGroup> {
         .collect()
 }
 
-/// Standard deviation of a group's values.
+/// Returns the standard deviation of the values of a group, at least 1e-9.
 fn deviation(content: &Content, group: &ValueGroup) -> f64 {
-    let of = |values: &mut dyn Iterator<Item = f32>| {
+    let deviation = |values: &mut dyn Iterator<Item = f32>| {
         let (mut count, mut sum, mut squares) = (0.0, 0.0, 0.0);
         values.for_each(|value| {
             let value = f64::from(value);
@@ -346,13 +354,13 @@ fn deviation(content: &Content, group: &ValueGroup) -> f64 {
         (squares / f64::max(count, 1.0) - (sum / f64::max(count, 1.0)).powi(2)).max(0.0).sqrt()
     };
     let found = match group {
-        ValueGroup::Tensor(name) => of(&mut content.tensors[name].data.iter().copied()),
-        ValueGroup::Attribute(k) => of(&mut archive::attribute(&content.cloud, *k)),
+        ValueGroup::Tensor(name) => deviation(&mut content.tensors[name].data.iter().copied()),
+        ValueGroup::Attribute(k) => deviation(&mut archive::attribute(&content.cloud, *k)),
     };
     found.max(1e-9)
 }
 
-/// The grid whose step is nearest.
-fn eighths(octave: f64) -> i32 {
+/// Returns the nearest step on the grid of eighths of octaves.
+fn nearest_step(octave: f64) -> i32 {
     ((8.0 * octave).round() as i32).clamp(*STEPS.start(), *STEPS.end())
 }

@@ -1,8 +1,8 @@
-//! Stage `bands`: the lowest SH degree of what is left with which pictures change next to nothing.
+//! Stage `bands`: drops SH degrees of the result as long as renders hardly change.
 //!
-//! Memory: a state of the original and two of what is left, and three pictures.
+//! Memory: one state of the original, two of the result, and three rendered views.
 
-use super::field::{PICTURES, least};
+use super::field::{COMPARED_VIEWS, least};
 use crate::compressed_model::CompressedModel;
 use crate::error::Result;
 use crate::journal::Journal;
@@ -22,32 +22,33 @@ use crate::render::{self, render};
 use crate::scene::Scene;
 use crate::source::FrameSource;
 
-/// What the stage is called.
+/// Name of the stage.
 const NAME: &str = "bands";
 
-/// What is left out where bands have to stay.
-const WHAT: &str = "fewer bands of spherical harmonics";
+/// Name of the omitted work if all SH degrees have to stay.
+const DROPPED_DEGREES: &str = "lower SH degree";
 
-/// The highest SH degree of a result of `scene`, asked to have harmonics up to `degree`.
+/// Returns the highest SH degree of a result of `scene` if the user asks for degrees up to `degree`.
 pub(crate) fn highest(scene: &Scene, degree: usize, journal: &mut Journal) -> usize {
     let all = scene.source().info().sh_degree;
     match scene.input.needs_all_bands() {
         _ if degree >= all => all,
         Some(why) => {
-            journal.leave_out(WHAT, why);
+            journal.leave_out(DROPPED_DEGREES, why);
             all
         }
         None => {
-            journal.notes.push(format!("harmonics above degree {degree} of {all} go, as asked for"));
+            journal.notes.push(format!("SH coefficients above degree {degree} of {all} are dropped, as requested"));
             degree
         }
     }
 }
 
-/// The bands of spherical harmonics of a result.
+/// Stage that chooses the SH degree of a result.
 #[derive(Debug, Clone)]
 pub(crate) struct ShDegreeStage {
-    /// How much closer pictures stay to those with all bands than to the original's, dB.
+    /// Required margin, dB: renders with the lower SH degree must be this much closer to those with all degrees than
+    /// those are to renders of the original.
     pub margin: f64,
 }
 
@@ -60,13 +61,13 @@ pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
 
 impl Stage for ShDegreeStage {
     fn estimates(&self, EstimateInput { work, limits, left, .. }: EstimateInput<'_>) -> Vec<ResourceEstimate> {
-        // Of degree 0 there is no band to drop.
+        // There is nothing to drop at degree 0.
         (work.sh_degree > 0).then(|| self.need(work, limits, left)).into_iter().collect()
     }
 
     fn run(&self, run: &mut RunState<'_>) -> Result<()> {
         let scene = run.scene;
-        // A degree that was chosen is one that pictures need.
+        // An SH degree that was chosen for a byte limit or by the user stays.
         if run.template.sh_degree < scene.source().info().sh_degree {
             return Ok(());
         }
@@ -74,20 +75,21 @@ impl Stage for ShDegreeStage {
         let (count, key) = (result.len(), scene.work.key(&(self.margin, &result)));
         run.result = run
             .journal
-            .kept_stage(NAME, count, scene, key, |journal| Ok((self.drop_some(scene, result, journal)?, count)))?;
+            .kept_stage(NAME, count, scene, key, |journal| Ok((self.lower_degree(scene, result, journal)?, count)))?;
         Ok(())
     }
 }
 
 impl ShDegreeStage {
-    /// The stage, of a run whose output may have fewer. An archive has no bytes for bands that nobody sees.
+    /// Returns the stage if the output may have a lower SH degree. An archive spends no bytes on coefficients that
+    /// nobody sees, so it needs no such stage.
     pub(crate) fn from_request(request: &Request, kind: OutputKind) -> Option<ShDegreeStage> {
         let bands = &request.recipe.bands;
         let drops = kind != OutputKind::Archive && bands.bands == WhichBands::Needed;
         drops.then_some(ShDegreeStage { margin: bands.bands_margin })
     }
 
-    /// Three states, and pictures of them. A part `left` of the Gaussians stays.
+    /// Returns the estimate: three states and renders of them. The fraction `left` of the Gaussians stays.
     pub(crate) fn need(&self, work: &Workload, limits: &Limits, left: f64) -> ResourceEstimate {
         let (whole, reader, held) = (work.state(Columns::all()), work.input.reader, work.held(limits, Columns::all()));
         let per_gaussian = vec![
@@ -98,7 +100,7 @@ impl ShDegreeStage {
             ("held", held + of_left(left, held)),
             ("pictures", PICTURE_ON_ALL_THREADS),
         ];
-        let pictures = if work.sh_degree > 0 { (PICTURES as u64).min(work.pictures) } else { 0 };
+        let pictures = if work.sh_degree > 0 { (COMPARED_VIEWS as u64).min(work.pictures) } else { 0 };
         ResourceEstimate {
             stage: NAME,
             seconds: work.reading(work.count(), 2.0 * pictures as f64)
@@ -110,27 +112,34 @@ impl ShDegreeStage {
         }
     }
 
-    /// Returns `reduction` with the lowest SH degree that shows in pictures no more than it may.
+    /// Returns `compressed` with the lowest SH degree at which renders change no more than allowed.
     ///
     /// # Errors
-    /// Frames that cannot be read.
-    fn drop_some(&self, scene: &Scene, reduction: CompressedModel, journal: &mut Journal) -> Result<CompressedModel> {
+    /// Fails if frames cannot be read.
+    fn lower_degree(
+        &self,
+        scene: &Scene,
+        compressed: CompressedModel,
+        journal: &mut Journal,
+    ) -> Result<CompressedModel> {
         let all = scene.source().info().sh_degree;
-        let pictures = spread(&scene.schedule, PICTURES, 1);
+        let pictures = spread(&scene.schedule, COMPARED_VIEWS, 1);
         let stay = match scene.input.needs_all_bands() {
-            _ if all == 0 => Some("colours are of degree 0"),
-            None if reduction.is_empty() || pictures.is_empty() => Some("there is nothing to be seen"),
+            _ if all == 0 => Some("colors have SH degree 0"),
+            None if compressed.is_empty() || pictures.is_empty() => {
+                Some("there are no Gaussians or no views to compare")
+            }
             why => why,
         };
         if let Some(why) = stay {
-            journal.leave_out(WHAT, why);
-            return Ok(reduction);
+            journal.leave_out(DROPPED_DEGREES, why);
+            return Ok(compressed);
         }
-        let source = scene.input.reduced(&reduction)?;
+        let source = scene.input.reduced(&compressed)?;
         let (mut found, mut tried, mut sh_degree) = ([0.0; 2], Vec::new(), all);
-        // What a degree lacks every lower one lacks too.
+        // A lower degree is not tried after one that fails.
         while sh_degree > 0 && tried.len() == all - sh_degree {
-            let [result, apart] = without_bands(scene, &*source, sh_degree - 1, &pictures)?;
+            let [result, apart] = quality_without_degrees(scene, &*source, sh_degree - 1, &pictures)?;
             found = [result, least(result, self.margin)];
             tried.push((sh_degree - 1, apart));
             sh_degree -= usize::from(apart >= found[1]);
@@ -139,16 +148,21 @@ impl ShDegreeStage {
         let [result, least] = found;
         let found = BandsSummary { sh_degree, pictures: pictures.len(), tried, result, least };
         if sh_degree == all {
-            journal.leave_out(WHAT, found.why());
+            journal.leave_out(DROPPED_DEGREES, found.why());
         }
         journal.bands = Some(found);
-        Ok(CompressedModel { sh_degree, ..reduction })
+        Ok(CompressedModel { sh_degree, ..compressed })
     }
 }
 
-/// Mean PSNR over `pictures` of `result` against the original, and of `result` with harmonics up to `degree` against itself
-/// with all, dB.
-fn without_bands(scene: &Scene, result: &dyn FrameSource, degree: usize, pictures: &[Picture]) -> Result<[f64; 2]> {
+/// Returns two mean PSNRs over `pictures`, dB: `result` against the original, and `result` with SH coefficients up to
+/// `degree` against `result` with all.
+fn quality_without_degrees(
+    scene: &Scene,
+    result: &dyn FrameSource,
+    degree: usize,
+    pictures: &[Picture],
+) -> Result<[f64; 2]> {
     let progress = scene.events.task(NAME, "pictures", pictures.len() as u64);
     let mut sums = [0.0; 2];
     let subjects = [Subject::all(scene.source()), Subject::all(result)];

@@ -1,10 +1,10 @@
-//! Within which bounds the values of an archive of frames lie, which is a container (`format/SPEC.md`).
+//! Error bounds of the values in an archive of frames. Such an archive is a container (`format/SPEC.md`).
 //!
-//! A column that is off by at most its bound adds a squared error to the pictures that goes with the square of the bound, and
-//! an octave of it saves a bit of every value that says anything new. As with the grids of a model's archive bits are fewest
-//! for an error where every column's goes by how many bits an octave saves: both are measured, errors on pictures of values
-//! rounded to twice their bound, bits on some blocks as they are encoded. Then all bounds together are as wide as pictures
-//! allow.
+//! An attribute with an error bound adds a squared error to renders proportional to the square of the bound; one octave
+//! of the bound saves one bit of every value that carries information. As for the steps of a model's archive, the bits
+//! are fewest for a given total error if the error of each attribute is proportional to the bits that one octave saves.
+//! Both are measured: errors on renders of values rounded to multiples of twice the bound, bits by encoding some
+//! blocks. Then all bounds together are made as wide as renders allow.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -16,89 +16,92 @@ use crate::model::{Columns, Gaussians, SequenceInfo};
 use crate::outputs::bounds::Bounds;
 use crate::outputs::container::{BOUNDED_FRAME_BLOCK, GAUSSIAN_BLOCK, Packing, column_bytes, write_container};
 use crate::pipeline::stages::reference_views::{
-    ADDED, ArchiveTarget, BYTES_ADDED, BYTES_HALVINGS, HALVINGS, QualityTarget, ROUNDS, ReferenceViews, balanced,
-    bisected, check_met, measurable,
+    ArchiveTarget, BALANCING_ROUNDS, BYTES_OCTAVE_HALVINGS, BYTES_OCTAVE_RANGE, OCTAVE_HALVINGS, OCTAVE_RANGE,
+    QualityTarget, ReferenceViews, bisect, check_measurable, check_met, step_change,
 };
 use crate::pipeline::summary::ArchiveSummary;
 use crate::scene::{Scene, first_box};
 use crate::source::{BlockReader, FrameSource, Ids, ReadPlan, Reads};
 
-/// zstd's level.
+/// Compression level of zstd.
 const LEVEL: i32 = 15;
-/// Bounds that measuring begins with, finer than most end, in the columns' units, of positions in extents of the scene.
-const FIRST: [f64; 5] = [1e-4, 2e-3, 5e-3, 1e-2, 5e-3];
-/// Bounds are at most so many of these: of a wider one nothing is left that moves or shines.
-const WIDEST: f64 = 64.0;
-/// Blocks of Gaussians whose bits are counted.
-const BLOCKS: usize = 4;
-/// How much wider bounds that no picture was looked at for are taken to be in the end, octaves.
-const GUESSED: f64 = 2.0;
+/// Initial bounds, finer than most final ones, in the units of the attributes; for positions, fractions of the scene
+/// extent.
+const INITIAL_BOUNDS: [f64; 5] = [1e-4, 2e-3, 5e-3, 1e-2, 5e-3];
+/// Maximum factor on the initial bounds; with wider bounds no motion and no color would remain.
+const MAX_WIDENING: f64 = 64.0;
+/// Number of blocks of Gaussians whose bits are counted.
+const COUNTED_BLOCKS: usize = 4;
+/// Octaves added to the initial bounds to estimate the size of an archive without rendering.
+const ESTIMATE_OCTAVES: f64 = 2.0;
 
-/// How a container within `bounds` is stored.
+/// Returns the storage options of a container within `bounds`.
 pub(crate) fn packing(bounds: Bounds) -> Packing {
     Packing::within(bounds, LEVEL)
 }
 
-/// What it takes to store frames of such an input within bounds; nothing of a model or a cloud, whose archive is another.
-pub(crate) fn storing(work: &Workload) -> Vec<MemoryPart> {
+/// Returns the memory for storing the frames of an input within bounds. Empty for models and point clouds, which have
+/// another kind of archive.
+pub(crate) fn storing_memory(work: &Workload) -> Vec<MemoryPart> {
     if work.input.reduced > 0 || work.frames == 1 {
         return Vec::new();
     }
     [work.writing_together(BOUNDED_FRAME_BLOCK), vec![work.compressing(LEVEL, BOUNDED_FRAME_BLOCK)]].concat()
 }
 
-/// The bounds within which `source`, a result of `scene`, is what it is `asked` for, or `psnr` close.
+/// Finds error bounds with which `source`, a result of `scene`, meets `asked`, or has the PSNR `psnr` against itself.
 ///
 /// # Errors
-/// Frames that cannot be read; pictures that are not finite; too few bytes.
+/// Fails if frames cannot be read, if renders are not finite, or if the byte limit is too low.
 pub(crate) fn find(
     scene: &Scene,
     source: &dyn FrameSource,
     psnr: Option<f64>,
     asked: ArchiveTarget,
 ) -> Result<(Bounds, ArchiveSummary)> {
-    let (looks, original) = (ReferenceViews::new(scene, source)?, ReferenceViews::new(scene, scene.source())?);
-    let level = measurable(looks.psnr(scene.source())?)?;
-    let aim = QualityTarget::new(psnr, asked, level);
-    let asked = aim.close(level);
-    let first = first(source)?;
-    let mut widths = first;
+    let (reference_views, original) =
+        (ReferenceViews::new(scene, source)?, ReferenceViews::new(scene, scene.source())?);
+    let level = check_measurable(reference_views.psnr(scene.source())?)?;
+    let quality_target = QualityTarget::new(psnr, asked, level);
+    let asked = quality_target.required_psnr(level);
+    let initial_bounds = initial_bounds(source)?;
+    let mut widths = initial_bounds;
     let mut measured = Vec::new();
-    for _ in 0..ROUNDS {
+    for _ in 0..BALANCING_ROUNDS {
         let error = 10f64.powf(-0.1 * asked);
-        let errors = errors(&looks, source, &widths)?;
-        let [fine, wide] = [0.0, 0.5].map(|octaves| bits(source, wider(&widths, octaves)));
+        let errors = errors(&reference_views, source, &widths)?;
+        let [fine, wide] = [0.0, 0.5].map(|octaves| bits(source, widened(&widths, octaves)));
         let (fine, wide) = (fine?, wide?);
         let saved: Vec<f64> = (0..5).map(|k| (2.0 * (fine[k] - wide[k])).max(1.0 + 0.05 * fine[k])).collect();
         let all: f64 = saved.iter().sum();
         measured.clear();
         for (k, column) in Columns::all().iter().enumerate() {
             measured.push((column.name().to_owned(), (2.0 * widths[k]).log2(), errors[k], fine[k]));
-            let by = balanced(error * saved[k] / all, errors[k]);
-            widths[k] = (widths[k] * by.exp2()).min(WIDEST * first[k]);
+            let by = step_change(error * saved[k] / all, errors[k]);
+            widths[k] = (widths[k] * by.exp2()).min(MAX_WIDENING * initial_bounds[k]);
         }
     }
-    let looked_at = |widths: [f64; 5]| -> Result<([f64; 5], [f64; 2])> {
+    let measure_views = |widths: [f64; 5]| -> Result<([f64; 5], [f64; 2])> {
         let shown = Rounded { source, bounds: Bounds::new(widths) };
-        Ok((widths, [looks.psnr(&shown)?, level - original.psnr(&shown)?]))
+        Ok((widths, [reference_views.psnr(&shown)?, level - original.psnr(&shown)?]))
     };
-    let (widths, [psnr, loss]) = match aim {
+    let (widths, [psnr, loss]) = match quality_target {
         QualityTarget::Bytes(most) => {
-            // The finest that fits.
-            let size = |widths| stored(scene, source, widths);
+            // Take the finest bounds that fit.
+            let size = |widths| stored_bytes(scene, source, widths);
             let fits = |finer: f64| {
-                let found = wider(&widths, -finer);
+                let found = widened(&widths, -finer);
                 Ok((size(found)? <= most).then_some(found))
             };
-            looked_at(match bisected(BYTES_ADDED.map(|added| -added), BYTES_HALVINGS, fits)? {
+            measure_views(match bisect(BYTES_OCTAVE_RANGE.map(|added| -added), BYTES_OCTAVE_HALVINGS, fits)? {
                 Some(best) => best,
                 None => {
-                    let widest = wider(&widths, BYTES_ADDED[0]);
+                    let widest = widened(&widths, BYTES_OCTAVE_RANGE[0]);
                     let least = size(widest)?;
                     if least > most {
                         return Err(Error::usage(format!(
-                            "--target-size: an archive of {} Gaussians has {least} bytes within the widest bounds; \
-                             expected at least that, found {most}",
+                            "--size: expected at least {least} bytes, the size of an archive of {} Gaussians \
+                             with the widest error bounds, found {most}",
                             source.info().count
                         )));
                     }
@@ -107,13 +110,14 @@ pub(crate) fn find(
             })?
         }
         QualityTarget::Close(_) | QualityTarget::Loss(_) => {
-            let best = bisected(ADDED, HALVINGS, |added| {
-                Ok(Some(looked_at(wider(&widths, added))?).filter(|&(_, found)| aim.does(found, asked)))
+            let best = bisect(OCTAVE_RANGE, OCTAVE_HALVINGS, |added| {
+                Ok(Some(measure_views(widened(&widths, added))?)
+                    .filter(|&(_, found)| quality_target.is_met_by(found, asked)))
             })?;
-            best.map_or_else(|| looked_at(wider(&widths, ADDED[0])), Ok)?
+            best.map_or_else(|| measure_views(widened(&widths, OCTAVE_RANGE[0])), Ok)?
         }
     };
-    check_met(aim, asked, psnr)?;
+    check_met(quality_target, asked, psnr)?;
     let names = Columns::all().iter().map(|column| column.name().to_owned());
     let bounds = names.zip(widths).collect();
     let bits = BTreeMap::new();
@@ -121,54 +125,54 @@ pub(crate) fn find(
     Ok((Bounds::new(widths), summary))
 }
 
-/// Bytes of an archive of `source`, about: within bounds as they are before any picture is looked at.
+/// Returns the estimated bytes of an archive of `source`, with bounds that do not depend on renders.
 ///
 /// # Errors
-/// Frames that cannot be read; a failed write.
+/// Fails if frames cannot be read or a write fails.
 pub(crate) fn bytes(scene: &Scene, source: &dyn FrameSource) -> Result<u64> {
-    stored(scene, source, wider(&first(source)?, GUESSED))
+    stored_bytes(scene, source, widened(&initial_bounds(source)?, ESTIMATE_OCTAVES))
 }
 
-/// Writes `source` within such bounds to a scratch file; gives its bytes.
-fn stored(scene: &Scene, source: &dyn FrameSource, widths: [f64; 5]) -> Result<u64> {
+/// Writes `source` within bounds of the given widths to a scratch file. Returns its bytes.
+fn stored_bytes(scene: &Scene, source: &dyn FrameSource, widths: [f64; 5]) -> Result<u64> {
     let folder = ScratchFolder::new(&scene.scratch)?;
     let path = folder.path().join("result");
     write_container(source, &path, packing(Bounds::new(widths)), BTreeMap::new(), |_| ())?;
     Ok(fs::metadata(&path).map_err(Error::io("read", &path))?.len())
 }
 
-/// [`FIRST`] of a scene.
-fn first(source: &dyn FrameSource) -> Result<[f64; 5]> {
+/// Returns the initial bounds [`INITIAL_BOUNDS`] in the units of a scene.
+fn initial_bounds(source: &dyn FrameSource) -> Result<[f64; 5]> {
     let extent = first_box(source)?.map_or(1.0, |found| found.extent());
-    let [position, others @ ..] = FIRST;
+    let [position, others @ ..] = INITIAL_BOUNDS;
     let [rotation, log_scale, opacity, sh] = others;
     let extent = if extent.is_finite() && extent > 0.0 { extent } else { 1.0 };
     Ok([position * extent, rotation, log_scale, opacity, sh])
 }
 
-fn wider(widths: &[f64; 5], octaves: f64) -> [f64; 5] {
+fn widened(widths: &[f64; 5], octaves: f64) -> [f64; 5] {
     widths.map(|width| width * octaves.exp2())
 }
 
-/// Squared errors of pictures where one column is off and all others are not.
-fn errors(looks: &ReferenceViews<'_>, source: &dyn FrameSource, widths: &[f64; 5]) -> Result<Vec<f64>> {
+/// Returns the squared errors of renders with one attribute rounded and all others exact.
+fn errors(reference_views: &ReferenceViews<'_>, source: &dyn FrameSource, widths: &[f64; 5]) -> Result<Vec<f64>> {
     let alone = |k: usize| std::array::from_fn(|other| if other == k { widths[k] } else { 0.0 });
-    (0..5).map(|k| looks.error(&Rounded { source, bounds: Bounds::new(alone(k)) })).collect()
+    (0..5).map(|k| reference_views.error(&Rounded { source, bounds: Bounds::new(alone(k)) })).collect()
 }
 
-/// Bits of every column in some blocks of Gaussians, over the frames in the middle.
+/// Returns the bits of every attribute in some blocks of Gaussians, over one block of frames in the middle.
 fn bits(source: &dyn FrameSource, widths: [f64; 5]) -> Result<Vec<f64>> {
     let (info, packing) = (source.info(), packing(Bounds::new(widths)));
     let blocks = info.count.div_ceil(GAUSSIAN_BLOCK);
-    let looked_at = blocks.min(BLOCKS);
-    let spread: Vec<usize> = (0..looked_at).map(|k| (2 * k + 1) * blocks / (2 * looked_at)).collect();
+    let counted = blocks.min(COUNTED_BLOCKS);
+    let spread: Vec<usize> = (0..counted).map(|k| (2 * k + 1) * blocks / (2 * counted)).collect();
     let frames = info.times.len().min(packing.frame_block());
     let start = (info.times.len() - frames) / 2;
     let bytes = column_bytes(source, &spread, start..start + frames, &packing)?;
     Ok(bytes.into_iter().map(|bytes| 8.0 * bytes as f64).collect())
 }
 
-/// A source whose values are rounded to multiples of twice their bounds.
+/// Frame source whose values are rounded to multiples of twice their bounds.
 struct Rounded<'a> {
     source: &'a dyn FrameSource,
     bounds: Bounds,

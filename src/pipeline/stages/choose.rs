@@ -1,9 +1,9 @@
-//! Stage `choose`: letting pictures choose whether to merge or to prune to one count, rendered beside the original.
+//! Stage `choose`: compares merging with pruning to the same count by renders, and keeps the better result.
 //!
-//! Merging pays on some scenes only (method.md, section 6.1).
-//! Memory: two states of one frame, the original's and an alternative's, and [`AT_ONCE`] pictures.
+//! Merging improves quality on some scenes only (method.md, section 6.1). Memory: two states of one frame, of the
+//! original and of an alternative, and [`VIEWS_PER_BATCH`] rendered views.
 
-use super::merge::Outcome;
+use super::merge::MergeOutcome;
 use crate::compressed_model::CompressedModel;
 use crate::error::Result;
 use crate::journal::Journal;
@@ -20,23 +20,23 @@ use crate::pruning::score::{Scored, scored_memory};
 use crate::render::{self, Image};
 use crate::scene::Scene;
 
-/// What the stage is called.
+/// Name of the stage.
 const NAME: &str = "choose";
 
-/// Scoring pictures that are compared: their mean PSNR differs from that of all by less than the
-/// alternatives usually do from one another.
-const PICTURES: usize = 24;
+/// Number of scored views that are compared. The mean PSNR over them differs from that over all views by less than the
+/// alternatives usually differ from one another.
+const COMPARED_VIEWS: usize = 24;
 
-/// Pictures of a frame that are compared at a time.
-const AT_ONCE: usize = 4;
+/// Number of views of a frame that are rendered at a time.
+const VIEWS_PER_BATCH: usize = 4;
 
-/// Per Gaussian what is known of clusters, twice while alternatives are compared, and what reading members takes.
+/// Bytes per Gaussian for clusters, twice while alternatives are compared, and for reading members.
 pub(crate) const CLUSTERED: u64 = 125;
 
-/// The choice of a run.
+/// Stage that chooses between merging and pruning.
 #[derive(Debug, Clone)]
 pub(crate) struct Choose {
-    /// Whether the size of the output is asked for.
+    /// Whether the number of Gaussians in the output was requested.
     pub has_target: bool,
 }
 
@@ -54,19 +54,20 @@ impl Stage for Choose {
 
     fn run(&self, run: &mut RunState<'_>) -> Result<()> {
         let (scored, ranking) = (run.scored()?, run.ranking()?);
-        let merged = Outcome { reduction: run.take_result(), summary: run.merge.take() };
+        let merged = MergeOutcome { compressed: run.take_result(), summary: run.merge.take() };
         let found = self.choose(run.scene, &scored, &ranking, merged, &mut run.journal)?;
-        run.result = CompressedModel { sh_degree: run.template.sh_degree, ..found.reduction };
+        run.result = CompressedModel { sh_degree: run.template.sh_degree, ..found.compressed };
         run.merge = found.summary;
         Ok(())
     }
 }
 
 impl Choose {
-    /// Both alternatives, two states of a frame, and pictures. A part `left` of the Gaussians stays.
+    /// Returns the estimate: both alternatives, two states of a frame, and rendered views. The fraction `left` of the
+    /// Gaussians stays.
     pub(crate) fn need(&self, work: &Workload, limits: &Limits, left: f64) -> ResourceEstimate {
         let whole = work.state(Columns::all());
-        // Merged trajectories are read of all that merge.
+        // The trajectories of proxies are computed from all members.
         let merging = if work.input.reduced > 0 { left } else { 1.0 };
         let (reader, held) = (work.input.reader, work.held(limits, Columns::all()));
         let per_gaussian = vec![
@@ -78,10 +79,10 @@ impl Choose {
             ("held", held + of_left(merging, held)),
             ("pictures", PICTURE_ON_ALL_THREADS),
         ];
-        let together = AT_ONCE.min(limits.pictures_together) as u64;
+        let together = VIEWS_PER_BATCH.min(limits.pictures_together) as u64;
         let pictures = render::STRIP_BYTES as u64 + 12 * work.pixels * (1 + together);
-        let frames = (PICTURES as u64).min(work.pictures);
-        // The original, and two of about half as many Gaussians.
+        let frames = (COMPARED_VIEWS as u64).min(work.pictures);
+        // The original, and two alternatives of about half as many Gaussians.
         let made = work.picturing(frames as f64, 2.0 * work.count(), RENDER)
             + work.picturing(2.0 * frames as f64, 0.0, RENDER);
         ResourceEstimate {
@@ -93,56 +94,56 @@ impl Choose {
         }
     }
 
-    /// Compares `merged` with the first Gaussians of the ranking, as many as it has, by mean PSNR against the original on
-    /// scoring pictures; keeps the better, of equals the one without merging. Where merging loses and no target asks for
-    /// that count, the run's own number of survivors stays.
+    /// Compares `merged` with the same number of Gaussians from the top of the ranking, by mean PSNR against the
+    /// original on scored views. Returns the better result; in a tie the one without merging. If merging loses and no
+    /// target requires this count, the result has as many survivors as selection kept.
     ///
     /// # Errors
-    /// Frames that cannot be read.
+    /// Fails if frames cannot be read.
     pub(crate) fn choose(
         &self,
         scene: &Scene,
         scored: &Scored,
-        ranked: &Ranking,
-        merged: Outcome,
+        ranking: &Ranking,
+        merged: MergeOutcome,
         journal: &mut Journal,
-    ) -> Result<Outcome> {
-        let reduction = &merged.reduction;
-        let count = reduction.len();
-        if reduction.clusters.is_empty() {
+    ) -> Result<MergeOutcome> {
+        let compressed = &merged.compressed;
+        let count = compressed.len();
+        if compressed.clusters.is_empty() {
             return Ok(merged);
         }
-        let pruned = ranked.take(count);
-        let pictures = spread(&scene.schedule, PICTURES, VIEWS_AT_ONCE);
-        let key = scene.work.key(&(&pruned, reduction, &pictures));
+        let pruned = ranking.take(count);
+        let pictures = spread(&scene.schedule, COMPARED_VIEWS, VIEWS_AT_ONCE);
+        let key = scene.work.key(&(&pruned, compressed, &pictures));
         let [without, with]: [f64; 2] = journal
-            .kept_stage(NAME, count, scene, key, |_| Ok((mean_psnr(scene, &pruned, reduction, &pictures)?, count)))?;
+            .kept_stage(NAME, count, scene, key, |_| Ok((mean_psnr(scene, &pruned, compressed, &pictures)?, count)))?;
         if with > without {
             return Ok(merged);
         }
         let why = format!(
-            "at the same {count} Gaussians scoring pictures keep {} without it, {with:.2} with it",
+            "PSNR on scored views at the same {count} Gaussians: {} without merging, {with:.2} dB with merging",
             decibels_text(without, 2)
         );
         scene.events.send(Message::Discarded { stage: "merging", why: &why });
         journal.leave_out("merging", why);
-        let kept = if self.has_target { pruned } else { ranked.take(scored.selection.counts.kept) };
-        Ok(Outcome { reduction: CompressedModel::pruned(kept, &reduction.rule), summary: None })
+        let kept = if self.has_target { pruned } else { ranking.take(scored.selection.counts.kept) };
+        Ok(MergeOutcome { compressed: CompressedModel::pruned(kept, &compressed.rule), summary: None })
     }
 }
 
-/// Mean PSNR of the Gaussians `pruned` and of `merged` against the original over `pictures`, dB.
+/// Returns the mean PSNR over `pictures` of the Gaussians `pruned` and of `merged`, each against the original, dB.
 fn mean_psnr(scene: &Scene, pruned: &[u32], merged: &CompressedModel, pictures: &[Picture]) -> Result<[f64; 2]> {
     let result = scene.input.reduced(merged)?;
     let progress = scene.events.task(NAME, "pictures", pictures.len() as u64);
     let mut sums = [0.0; 2];
-    let pictures_together = AT_ONCE.min(scene.limits.pictures_together);
+    let pictures_together = VIEWS_PER_BATCH.min(scene.limits.pictures_together);
     let batch = Batch { pictures: pictures_together, ..Batch::of_frame(&scene.limits) };
     let subjects = [Subject::all(scene.source()), Subject::all(&*result)];
     show(subjects, &scene.schedule.cameras, pictures, batch, |views| {
         let picture = |subject: usize, view: &ViewStates<'_, 2>| view.render(subject, scene.background);
         let expected: Vec<Image> = views.iter().map(|view| picture(0, view)).collect();
-        // All of one frame.
+        // All views of a batch show one frame.
         let state = views[0].states[0].pick(pruned);
         let features = views[0].features(0).map(|features| features.pick(pruned));
         for (view, expected) in views.iter().zip(&expected) {
@@ -163,53 +164,53 @@ mod tests {
     use crate::pruning::score::UserOverrides;
     use crate::recipe::Recipe;
 
-    /// Mean PSNR over the pictures that decide.
-    fn quality(scene: &Scene, reduction: &CompressedModel) -> f64 {
-        mean_psnr(scene, &[], reduction, &spread(&scene.schedule, PICTURES, VIEWS_AT_ONCE)).unwrap()[1]
+    /// Returns the mean PSNR over the views by which the stage chooses.
+    fn quality(scene: &Scene, compressed: &CompressedModel) -> f64 {
+        mean_psnr(scene, &[], compressed, &spread(&scene.schedule, COMPARED_VIEWS, VIEWS_AT_ONCE)).unwrap()[1]
     }
 
-    /// What merging leaves of a scene, and what is chosen then.
+    /// Returns the merged model of a scene, the result of the choice, and the journal.
     fn chosen(
         scene: &Scene,
         scored: &Scored,
         recipe: &Recipe,
         target: Option<usize>,
-    ) -> (CompressedModel, Outcome, Journal) {
+    ) -> (CompressedModel, MergeOutcome, Journal) {
         let merge = MergeStage { recipe: recipe.merge.clone(), scan: recipe.scan.clone(), prunes: true, target };
-        let (ranked, mut journal) = (scored.ranked(), Journal::default());
-        let survivors = target.map_or(scored.selection.counts.kept, |_| ranked.order().len());
-        let merged = merge.merge(scene, scored, &ranked, survivors, &mut journal).unwrap();
-        let before = merged.reduction.clone();
+        let (ranking, mut journal) = (scored.ranked(), Journal::default());
+        let survivors = target.map_or(scored.selection.counts.kept, |_| ranking.order().len());
+        let merged = merge.merge(scene, scored, &ranking, survivors, &mut journal).unwrap();
+        let before = merged.compressed.clone();
         let chosen =
-            Choose { has_target: target.is_some() }.choose(scene, scored, &ranked, merged, &mut journal).unwrap();
+            Choose { has_target: target.is_some() }.choose(scene, scored, &ranking, merged, &mut journal).unwrap();
         (before, chosen, journal)
     }
 
     #[test]
-    fn what_is_chosen_has_the_same_count_and_is_never_worse_than_any_alternative() {
+    fn choice_has_same_count_and_best_quality() {
         let folder = tempfile::tempdir().unwrap();
         let scene = scene(folder.path());
         let recipe = Recipe::preset("default").unwrap();
         let scored = score_scene(&scene, &recipe, &UserOverrides::default());
         for target in [150, 600, 1200] {
             let (merged, chosen, journal) = chosen(&scene, &scored, &recipe, Some(target));
-            assert_eq!(chosen.reduction.len(), target);
-            let got = quality(&scene, &chosen.reduction);
+            assert_eq!(chosen.compressed.len(), target);
+            let got = quality(&scene, &chosen.compressed);
             let own = CompressedModel::pruned(scored.ranked().take(target), &recipe.merge);
             for other in [&merged, &own] {
                 let expected = quality(&scene, other);
                 assert!(got >= expected, "{target}: got {got} dB, an alternative has {expected}");
             }
-            let lost = !merged.clusters.is_empty() && chosen.reduction.clusters.is_empty();
+            let lost = !merged.clusters.is_empty() && chosen.compressed.clusters.is_empty();
             assert_eq!(journal.left_out.iter().any(|left| left.what == "merging"), lost);
         }
     }
 
     #[test]
-    fn without_a_target_merging_that_does_not_pay_leaves_every_survivor_of_pruning() {
+    fn losing_merge_without_target_keeps_all_survivors() {
         let folder = tempfile::tempdir().unwrap();
         let scene = scene(folder.path());
-        // Nothing is pruned, so that what is never seen is there to be dropped instead of merging the rest.
+        // Nothing is pruned, so that dropping invisible Gaussians competes with merging.
         let mut recipe = Recipe::preset("default").unwrap();
         recipe.select.tau_static = 0.0;
         recipe.merge.max_color_difference = f64::INFINITY;
@@ -217,6 +218,6 @@ mod tests {
         let survivors = scored.selection.counts.kept;
         let (merged, chosen, journal) = chosen(&scene, &scored, &recipe, None);
         assert!(merged.len() < survivors, "nothing merged");
-        assert_eq!((chosen.reduction.len(), journal.left_out.len()), (survivors, 1));
+        assert_eq!((chosen.compressed.len(), journal.left_out.len()), (survivors, 1));
     }
 }

@@ -1,10 +1,11 @@
-//! Stage `degree`: the SH degree at which so many bytes show most.
+//! Stage `degree`: finds the SH degree that gives the best quality within a byte limit.
 //!
-//! A Gaussian of degree 3 takes as many bytes as three and a half of degree 0, and which of them pictures gain more by
-//! depends on the scene. So as many of each degree as fit are refined in a part of the steps, from the highest degree down
-//! until pictures kept apart are no closer; the best of them is refined in all.
+//! A Gaussian of degree 3 takes as many bytes as three and a half of degree 0. Whether more Gaussians or more SH
+//! coefficients give better renders depends on the scene. For each degree, from the highest down, as many Gaussians as
+//! fit are refined in a fraction of the steps, until the quality on validation views no longer grows. The best degree
+//! is then refined in full.
 //!
-//! Memory: that of refining.
+//! Memory: that of refinement.
 
 use crate::compressed_model::CompressedModel;
 use crate::error::Result;
@@ -19,23 +20,23 @@ use crate::refinement::RefineStage;
 use crate::refinement::targets::Targets;
 use crate::scene::Scene;
 
-/// What the stage is called.
+/// Name of the stage.
 const NAME: &str = "degree";
-/// Part of the steps that tells which degree is best.
-const STEPS: f64 = 0.2;
+/// Fraction of the optimization steps with which a degree is tried.
+const TRIAL_STEPS: f64 = 0.2;
 
-/// The choice of a run.
+/// Stage that chooses the SH degree.
 #[derive(Debug, Clone)]
 pub(crate) struct Degree {
-    /// How a degree is tried.
+    /// Refinement with which a degree is tried.
     refine: RefineStage,
 }
 
-/// Adds the stage to a run that is asked for so many bytes, refines, and may drop bands.
+/// Adds the stage to a run with a byte limit that refines and may lower the SH degree.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     if let Some(refine) = planning.refine.as_ref().filter(|_| planning.chooses_degree()) {
         stages.set_open_ended();
-        stages.add(Phase::Rank, Degree { refine: refine.in_part(STEPS) });
+        stages.add(Phase::Rank, Degree { refine: refine.in_part(TRIAL_STEPS) });
     }
 }
 
@@ -56,34 +57,35 @@ impl Stage for Degree {
 }
 
 impl Degree {
-    /// What refining needs, once for every degree.
+    /// Returns the estimate: one refinement for every degree.
     pub(crate) fn need(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
         let need = self.refine.need(work, limits);
         let degrees = 1.0 + work.sh_degree as f64;
         ResourceEstimate { stage: NAME, seconds: degrees * need.seconds, reads: degrees * need.reads, ..need }
     }
 
-    /// That of `fits`, of falling degrees, which is best in the manner of `like`.
+    /// Returns the entry of `fits`, sorted by decreasing SH degree, with the best validation PSNR. `template` gives all
+    /// other settings of the model.
     ///
     /// # Errors
-    /// Frames that cannot be read; a scratch file that cannot be written.
+    /// Fails if frames cannot be read or a scratch file cannot be written.
     fn best(
         &self,
         scene: &Scene,
         scored: &Scored,
         ranked: &Ranking,
-        like: &CompressedModel,
+        template: &CompressedModel,
         fits: &[ByteLimitFit],
         journal: &mut Journal,
     ) -> Result<ByteLimitFit> {
         let all = scored.count();
-        let key = scene.work.key(&(self.refine.key(), ranked, like, fits));
+        let key = scene.work.key(&(self.refine.key(), ranked, template, fits));
         journal.kept_stage(NAME, all, scene, key, |journal| {
             let targets = Targets::new(scene, self.refine.pictures)?;
             let mut tried: Vec<(ByteLimitFit, f64)> = Vec::new();
             for &fit in fits {
                 let first = self.refine.first(fit.gaussians, all).min(ranked.order().len());
-                let start = CompressedModel { sh_degree: fit.sh_degree, ..like.with(ranked.take(first)) };
+                let start = CompressedModel { sh_degree: fit.sh_degree, ..template.with(ranked.take(first)) };
                 let psnr = self.refine.closeness(NAME, scene, scored, &targets, &start, fit.gaussians)?;
                 let is_no_better = tried.last().is_some_and(|before| psnr <= before.1);
                 tried.push((fit, psnr));
@@ -91,16 +93,17 @@ impl Degree {
                     break;
                 }
             }
-            // Of equal ones the one with more bands.
+            // In a tie the higher degree wins.
             let best = tried.iter().rev().max_by(|a, b| a.1.total_cmp(&b.1)).map_or(fits[0], |best| best.0);
-            let of = |(fit, psnr): &(ByteLimitFit, f64)| {
+            let line = |(fit, psnr): &(ByteLimitFit, f64)| {
                 let psnr = if psnr.is_nan() { "no number".to_owned() } else { format!("{psnr:.2}") };
-                format!("{} of degree {} {psnr}", fit.gaussians, fit.sh_degree)
+                format!("{} Gaussians of degree {}: {psnr}", fit.gaussians, fit.sh_degree)
             };
-            let (count, tried) = (targets.parted(false).apart.len(), tried.iter().map(of).collect::<Vec<_>>().join(", "));
+            let tried = tried.iter().map(line).collect::<Vec<_>>().join(", ");
+            let count = targets.parted(false).apart.len();
             journal.notes.push(format!(
-                "of the Gaussians that fit, those of SH degree {} show most: {count} pictures kept apart keep, dB, with {tried}, \
-                 refined in a fifth of the steps",
+                "SH degree {} gives the best quality within the byte limit; PSNR on {count} validation views after a \
+                 fifth of the optimization steps, dB: {tried}",
                 best.sh_degree
             ));
             Ok((best, best.gaussians))

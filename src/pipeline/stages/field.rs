@@ -1,6 +1,6 @@
-//! Stage `field`: half precision for the field of what is left, where pictures say that next to nothing is lost by it.
+//! Stage `field`: stores the deformation field of the result in half precision if renders hardly change by it.
 //!
-//! Memory: two states of one frame, and two pictures.
+//! Memory: two states of one frame, and two rendered views.
 
 use crate::compressed_model::CompressedModel;
 use crate::error::Result;
@@ -22,15 +22,16 @@ use crate::render::{self, render};
 use crate::scene::Scene;
 use crate::source::FrameSource;
 
-/// What the stage is called.
+/// Name of the stage.
 const NAME: &str = "field";
-/// Scoring pictures that are compared.
-pub(crate) const PICTURES: usize = 12;
+/// Number of scored views that are compared.
+pub(crate) const COMPARED_VIEWS: usize = 12;
 
-/// The precision of a result's field.
+/// Stage that chooses the precision of the field of a result.
 #[derive(Debug, Clone)]
 pub(crate) struct FieldPrecisionStage {
-    /// How much closer pictures stay to those of the exact field than to the original's, dB.
+    /// Required margin, dB: renders with the half-precision field must be this much closer to those with the exact
+    /// field than those are to renders of the original.
     pub margin: f64,
 }
 
@@ -57,14 +58,15 @@ impl Stage for FieldPrecisionStage {
 }
 
 impl FieldPrecisionStage {
-    /// The stage, of a run that writes a model and whose field may change.
+    /// Returns the stage if the run writes a model and the recipe allows half precision.
     pub(crate) fn from_request(request: &Request, kind: OutputKind) -> Option<FieldPrecisionStage> {
         let field = &request.recipe.field;
         (kind == OutputKind::Model && field.field == Precision::Half)
             .then_some(FieldPrecisionStage { margin: field.field_margin })
     }
 
-    /// Two states, pictures, and the field once more. A part `left` of the Gaussians stays.
+    /// Returns the estimate: two states, rendered views, and a second copy of the field. The fraction `left` of the
+    /// Gaussians stays.
     pub(crate) fn need(&self, work: &Workload, limits: &Limits, left: f64) -> ResourceEstimate {
         let whole = work.state(Columns::all());
         let per_gaussian = vec![
@@ -74,7 +76,7 @@ impl FieldPrecisionStage {
             ("readers", work.input.reader + of_left(left, work.input.reader)),
             ("pictures", PICTURE_ON_ALL_THREADS),
         ];
-        let pictures = (PICTURES as u64).min(work.pictures);
+        let pictures = (COMPARED_VIEWS as u64).min(work.pictures);
         ResourceEstimate {
             stage: NAME,
             seconds: work.reading(work.count(), 4.0 * pictures as f64)
@@ -90,23 +92,23 @@ impl FieldPrecisionStage {
         }
     }
 
-    /// Returns `reduction` with its field in half precision, if the input can have that and it shows in pictures no more
-    /// than it may.
+    /// Returns `compressed` with its field in half precision, if the input supports it and renders change no more than
+    /// allowed. Otherwise returns it unchanged and records why.
     ///
     /// # Errors
-    /// Frames that cannot be read.
-    fn round(&self, scene: &Scene, reduction: CompressedModel, journal: &mut Journal) -> Result<CompressedModel> {
+    /// Fails if frames cannot be read.
+    fn round(&self, scene: &Scene, compressed: CompressedModel, journal: &mut Journal) -> Result<CompressedModel> {
         if !scene.input.can_round_field()? {
-            return Ok(reduction);
+            return Ok(compressed);
         }
         let what = "half precision of the field";
-        let pictures = spread(&scene.schedule, PICTURES, 1);
-        if reduction.is_empty() || pictures.is_empty() {
-            journal.leave_out(what, "there is nothing to be seen");
-            return Ok(reduction);
+        let pictures = spread(&scene.schedule, COMPARED_VIEWS, 1);
+        if compressed.is_empty() || pictures.is_empty() {
+            journal.leave_out(what, "there are no Gaussians or no views to compare");
+            return Ok(compressed);
         }
-        let halved = CompressedModel { field: Precision::Half, ..reduction.clone() };
-        let [exact, half] = [&reduction, &halved].map(|of| scene.input.reduced(of));
+        let halved = CompressedModel { field: Precision::Half, ..compressed.clone() };
+        let [exact, half] = [&compressed, &halved].map(|model| scene.input.reduced(model));
         let (exact, half) = (exact?, half?);
         let rounding = closeness(scene, [&*exact, &*half], &pictures)?;
         let result = match rounding >= CLOSE_ENOUGH {
@@ -121,17 +123,17 @@ impl FieldPrecisionStage {
             journal.leave_out(what, found.why());
         }
         journal.field = Some(found);
-        Ok(if fits { halved } else { reduction })
+        Ok(if fits { halved } else { compressed })
     }
 }
 
-/// How close to pictures of a result those of a coarser one are to be, dB, so that next to nothing is lost: `margin` closer
-/// than the result's are to the original's (`result`).
+/// Returns the minimum PSNR, dB, between renders of a result and of its coarser version, for which the coarser version
+/// is accepted: `margin` more than `result`, the PSNR of the result against the original, at most [`CLOSE_ENOUGH`].
 pub(crate) fn least(result: f64, margin: f64) -> f64 {
     CLOSE_ENOUGH.min(result + margin)
 }
 
-/// Mean PSNR between two sources over `pictures`, dB.
+/// Returns the mean PSNR between renders of two sources over `pictures`, dB.
 fn closeness(scene: &Scene, [a, b]: [&dyn FrameSource; 2], pictures: &[Picture]) -> Result<f64> {
     let progress = scene.events.task(NAME, "pictures", pictures.len() as u64);
     let mut sum = 0.0;

@@ -1,4 +1,4 @@
-//! From frames to a selection: the stages `scan`, `visible` and `score`, which `score` and `report` run too.
+//! Stages `scan`, `visible` and `score`: from frames to a selection. The commands `score` and `report` run them, too.
 
 use std::sync::Arc;
 
@@ -29,14 +29,14 @@ pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     stages.add(Phase::Rank, Measure::from_planning(planning));
 }
 
-/// The stages that measure and score.
+/// Stages that measure and score.
 #[derive(Debug, Clone)]
 pub struct Measure {
-    /// Looks at every frame.
+    /// Scan of every frame.
     pub scan: ScanStage,
-    /// Looks at pictures, where C is measured by them.
+    /// Rendering of views, if the contribution C is measured on them.
     pub visible: Option<Visible>,
-    /// Scores and selects.
+    /// Scoring and selection.
     pub score: ScoreStage,
 }
 
@@ -46,7 +46,7 @@ impl Measure {
         Measure::new(&planning.request.recipe, planning.input.has_cameras, planning.user.clone())
     }
 
-    /// As `recipe` has it; `has_cameras`: the scene has cameras of its own.
+    /// Returns the stages for `recipe`. `has_cameras` tells whether the scene has cameras of its own.
     pub fn new(recipe: &Recipe, has_cameras: bool, user: UserOverrides) -> Measure {
         Measure {
             scan: ScanStage { recipe: recipe.scan.clone() },
@@ -61,17 +61,17 @@ impl Measure {
         }
     }
 
-    /// Returns what measuring and scoring take, but for what is `measured` already.
+    /// Returns the estimates of measuring and scoring, without statistics that are `measured` already.
     pub fn needs(&self, work: &Workload, limits: &Limits, measured: MeasuredOnArrival) -> Vec<ResourceEstimate> {
         let scan = (!measured.scanned).then(|| self.scan.need(work, limits));
         let visible = self.visible.as_ref().filter(|_| !measured.seen).map(|visible| visible.need(work, limits));
         [scan, visible, Some(self.score.need(work, limits))].into_iter().flatten().collect()
     }
 
-    /// Measures, unless the scene was measured as it arrived, and scores.
+    /// Measures the scene, unless this was done while it arrived, and scores its Gaussians.
     ///
     /// # Errors
-    /// Those of the stages.
+    /// Fails if a stage fails.
     pub fn measure(&self, scene: &Scene, arrived: Option<Measured>, journal: &mut Journal) -> Result<Scored> {
         scene.set_absent(&[]);
         let ScoreStage { snap_noise, non_finite, score, select, user, .. } = &self.score;
@@ -85,11 +85,11 @@ impl Measure {
         scored.within(&scene.limits, &scene.scratch)
     }
 
-    /// Scans all frames. If Gaussians that are not finite are to be dropped, they are absent from the scene from then on, and
-    /// it is scanned again without them.
+    /// Scans all frames. If the recipe drops Gaussians that are not finite, they are marked as absent from the scene,
+    /// and the scene is scanned again without them.
     ///
     /// # Errors
-    /// Frames that cannot be read, or whose times cannot be scanned.
+    /// Fails if frames cannot be read or their times cannot be scanned.
     pub fn scan(&self, scene: &Scene, journal: &mut Journal) -> Result<Scanned> {
         scene.set_absent(&[]);
         let scanned = self.scan.run(scene, journal)?;

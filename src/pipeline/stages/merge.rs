@@ -1,7 +1,7 @@
-//! Stage `merge`: which survivors become one, and what becomes of them.
+//! Stage `merge`: merges similar survivors into proxies.
 //!
-//! Memory, of every Gaussian that may survive [`BYTES_PER_SURVIVOR`], what [`crate::merging`] says of
-//! survivors and candidate pairs, and what [`crate::merging::motion_pass`] says of the pairs it measures together.
+//! Memory: [`BYTES_PER_SURVIVOR`] for every Gaussian that may survive, the memory of survivors and candidate pairs in
+//! [`crate::merging`], and of pairs that are measured together in [`crate::merging::motion_pass`].
 
 use std::borrow::Cow;
 use std::cell::RefCell;
@@ -38,53 +38,53 @@ use crate::recipe;
 use crate::scene::Scene;
 use crate::source::FrameSource;
 
-/// What the stage is called.
+/// Name of the stage.
 const NAME: &str = "merge";
 
-/// What pairs that are measured in parts are called in a work folder.
+/// Name of the measurement of pairs in the cache; it can be divided into shards.
 pub(crate) const PAIRS: &str = "pairs";
-/// Fewest pairs that are measured in parts.
-const DIVIDED: usize = 20_000;
+/// Minimum number of pairs whose measurement is divided.
+const MIN_DIVIDED_PAIRS: usize = 20_000;
 
-/// Memory of a Gaussian that may survive: its id, its state with base colors only, whether that is finite, and its class.
-/// Twice the ids while merging is tried on some of them.
+/// Bytes per Gaussian that may survive: id, state with base colors only, whether the state is finite, and merge class.
+/// Ids count twice because merging is tried on subsets.
 const BYTES_PER_SURVIVOR: usize = 2 * size_of::<u32>() + size_of::<[f32; 14]>() + size_of::<(bool, Option<u8>)>();
 
-/// Sets of survivors that are taken to be tried until merging leaves the target, to say how much is read: the bracket
-/// closes by the secant, mostly in fewer.
-const TRIALS: f64 = 16.0;
+/// Assumed number of merge trials until the target is met, for the estimate of reads. The secant search usually needs
+/// fewer.
+const USUAL_TRIALS: f64 = 16.0;
 
-/// Gaussians whose whole state is in memory at a time, while what merging does not read of it is dropped.
-const GATHERED: usize = 16 * BLOCK;
+/// Number of Gaussians whose full state is in memory at a time while attributes that merging does not use are dropped.
+const GATHER_CHUNK: usize = 16 * BLOCK;
 
-/// Seconds that a Gaussian takes: neighbors, tests and what comes of them (`benches/merge.rs`).
-const MERGING: f64 = 1e-5;
-/// Part of the Gaussians whose pairs are followed along the frames, about.
-const FOLLOWED: f64 = 0.3;
+/// Time per Gaussian, seconds: neighbors, tests and clusters (`benches/merge.rs`).
+const SECONDS_TO_MERGE: f64 = 1e-5;
+/// Approximate fraction of the Gaussians whose pairs are followed over the frames.
+const FOLLOWED_FRACTION: f64 = 0.3;
 
-/// The merging of a run.
+/// Stage that merges.
 #[derive(Debug, Clone)]
 pub(crate) struct MergeStage {
-    /// Tests, passes and how members make up a proxy.
+    /// Parameters of tests, passes and proxies.
     pub recipe: recipe::MergeParams,
-    /// What is life, and what is a step.
+    /// Parameters of the scan, which define life spans and steps.
     pub scan: recipe::ScanParams,
     /// Whether survivors may be pruned to reach the target.
     pub prunes: bool,
-    /// Exact size of the output.
+    /// Exact number of Gaussians in the output, if requested.
     pub target: Option<usize>,
 }
 
-/// A reduction, and what merging did to get there.
+/// Result of merging: the compressed model and the counts of the passes.
 #[derive(Serialize, Deserialize)]
-pub(crate) struct Outcome {
-    /// What is left.
-    pub reduction: CompressedModel,
+pub(crate) struct MergeOutcome {
+    /// Compressed model.
+    pub compressed: CompressedModel,
     /// Counts of every pass.
     pub summary: Option<MergeSummary>,
 }
 
-/// Adds the stage if survivors are merged; else records why they are not.
+/// Adds the stage if survivors are merged; otherwise records why they are not.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     let recipe = &planning.request.recipe;
     let stage = MergeStage {
@@ -102,8 +102,8 @@ pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     let why = match planning.request.only {
         Only::Prune => "--prune-only",
         _ if !has_passes => "the recipe has no merge pass",
-        _ if planning.request.goal.is_some() => "a quality or a size on disk is found by pruning",
-        _ => "refining what is left gains more at the same count (--no-refine merges)",
+        _ if planning.request.goal.is_some() => "a quality or a size on disk is reached by pruning alone",
+        _ => "refinement gives better quality at the same count (--no-refine merges instead)",
     };
     match has_passes {
         true => stages.leave_out_stage(what, why, move |work, limits| stage.need(work, limits)),
@@ -121,27 +121,27 @@ impl Stage for MergeStage {
     }
 
     fn shardable_units(&self, _: &Scene, _: &CountPlan) -> Vec<String> {
-        self.recipe.passes.iter().map(|_| format!("{PAIRS}: pairs of neighbours")).collect()
+        self.recipe.passes.iter().map(|_| format!("{PAIRS}: pairs of neighbors")).collect()
     }
 
     fn run(&self, run: &mut RunState<'_>) -> Result<()> {
         let (scored, ranking) = (run.scored()?, run.ranking()?);
         let found = self.merge(run.scene, &scored, &ranking, run.result.len(), &mut run.journal)?;
-        run.result = CompressedModel { sh_degree: run.template.sh_degree, ..found.reduction };
+        run.result = CompressedModel { sh_degree: run.template.sh_degree, ..found.compressed };
         run.merge = found.summary;
         Ok(())
     }
 }
 
 impl MergeStage {
-    /// What is known of pairs that are measured together and of all that may survive, and the proxies.
+    /// Returns the estimate: pairs that are measured together, all Gaussians that may survive, and the proxies.
     pub(crate) fn need(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
         let pairs = (merging::BYTES_PER_PAIR + motion_pass::BYTES_PER_PAIR) as u64;
-        // Of the colors the first band; of proxies at most one for every two, before a pass and after it, then with
-        // all colors.
+        // Only base colors are compared. There is at most one proxy for every two Gaussians, before and after a pass,
+        // and then once with all SH coefficients.
         let proxies = state_bytes(0, Columns::all()).max(work.state(Columns::all()).div_ceil(2));
         let per_gaussian = vec![
-            // C and Vis are read back.
+            // The importances C and Vis are read back from disk.
             ("importance", if limits.rows_aside { 16 } else { 0 }),
             ("pool", BYTES_PER_SURVIVOR as u64),
             ("proxies", proxies),
@@ -150,23 +150,25 @@ impl MergeStage {
             ("readers", work.input.reader),
             ("followed", motion_pass::bytes_per_gaussian(limits.frames_held) as u64),
         ];
-        // States once; every pass follows its pairs along all frames, of every set of survivors that is tried: first those
-        // that coincide, if any do.
-        let trials = if self.target.is_some() && self.prunes { TRIALS } else { 1.0 };
+        // States are read once. Every pass of every trial follows its pairs over all frames, twice: coinciding pairs
+        // are merged first, if there are any.
+        let trials = if self.target.is_some() && self.prunes { USUAL_TRIALS } else { 1.0 };
         let followed = 2.0 * trials * self.recipe.passes.len() as f64 * work.scattered_reads(work.frames, limits);
         ResourceEstimate {
             stage: NAME,
             reads: work.scattered_reads(1, limits) + followed,
-            seconds: MERGING * work.count() + FOLLOWED * work.reading(work.count(), work.frames as f64),
+            seconds: SECONDS_TO_MERGE * work.count()
+                + FOLLOWED_FRACTION * work.reading(work.count(), work.frames as f64),
             per_gaussian: [scored_memory(limits), per_gaussian].concat(),
             fixed: vec![("pairs", (limits.pairs_together as u64).saturating_mul(pairs)), work.arriving()],
         }
     }
 
-    /// Merges the first `survivors` of a ranking, or, to exactly the target, as many as it takes; solves the proxies.
+    /// Merges the first `survivors` of a ranking; with a target, as many of them as merge into exactly the target. Then
+    /// solves the parameters of the proxies.
     ///
     /// # Errors
-    /// Frames that cannot be read; a target that merging alone cannot reach.
+    /// Fails if frames cannot be read, or if merging alone cannot reach the target.
     pub(crate) fn merge(
         &self,
         scene: &Scene,
@@ -174,8 +176,8 @@ impl MergeStage {
         ranking: &Ranking,
         survivors: usize,
         journal: &mut Journal,
-    ) -> Result<Outcome> {
-        // Importances are read back from the disk only for it.
+    ) -> Result<MergeOutcome> {
+        // Importances may have to be read from disk, so they are read only if the cache needs a key.
         let importance = scene.work.keeps().then(|| scored.importance()).transpose()?;
         let key = scene.work.key(&(
             (&self.recipe, self.scan.alpha_min, self.scan.motion, self.prunes, self.target, survivors),
@@ -183,28 +185,28 @@ impl MergeStage {
         ));
         let run = |journal: &mut Journal| {
             journal.stage(NAME, survivors, scene.source(), |_| {
-                // Proxies belong to it, too.
+                // The progress task also covers the solution of the proxies.
                 let progress = scene.events.counting_task(NAME, "sets of survivors");
                 let mut trial = Trial::new(scene, scored, self, ranking.take(survivors), &progress)?;
                 let mut merged = match self.target {
                     None => trial.merge(&ranking.take(survivors), None)?,
                     Some(target) if !self.prunes => trial.merge_to(&ranking.take(survivors), target)?,
                     Some(target) => {
-                        let count = |m| Ok(trial.merge(&ranking.take(m), None)?.reduction.len());
+                        let count = |m| Ok(trial.merge(&ranking.take(m), None)?.compressed.len());
                         let m = bracket(target, survivors, count)?;
                         trial.merge_to(&ranking.take(m), target)?
                     }
                 };
                 drop(trial);
                 scene.work.not_divided(NAME)?;
-                let Outcome { reduction, summary } = &mut merged;
-                let proxies = scene.input.solve(&reduction.clusters, scored.reference, &self.recipe)?;
-                reduction.make(proxies);
+                let MergeOutcome { compressed, summary } = &mut merged;
+                let proxies = scene.input.solve(&compressed.clusters, scored.reference, &self.recipe)?;
+                compressed.make(proxies);
                 if let Some(summary) = summary {
-                    summary.deviation = reduction.proxies.deviation;
-                    summary.count(&reduction.clusters);
+                    summary.deviation = compressed.proxies.deviation;
+                    summary.count(&compressed.clusters);
                 }
-                let left = reduction.len();
+                let left = compressed.len();
                 Ok((merged, left))
             })
         };
@@ -212,10 +214,10 @@ impl MergeStage {
     }
 }
 
-/// The largest number m of survivors, up to `all`, that the search finds to merge into at most
-/// `target`; m = `target` always does. Counts grow with m but for small dips, so the bracket closes
-/// by the secant, and stops when what is missing is under a thousandth of the target: merging then
-/// ends early by that much.
+/// Returns the largest number m of survivors, up to `all`, that the search finds to merge into at most `target`
+/// Gaussians; m = `target` always does. `merged` returns the count after merging m survivors. Counts grow with m except
+/// for small dips, so the bracket is narrowed by the secant method. The search stops if less than a thousandth of the
+/// target is missing; merging then ends early by that many joins.
 fn bracket(target: usize, all: usize, mut merged: impl FnMut(usize) -> Result<usize>) -> Result<usize> {
     let (mut low, mut high) = (target, all);
     let mut high_count = merged(high)?;
@@ -225,7 +227,7 @@ fn bracket(target: usize, all: usize, mut merged: impl FnMut(usize) -> Result<us
     let mut low_count = merged(low)?;
     while high - low > 1 && target - low_count > target / 1000 {
         let slope = (target - low_count) as f64 / (high_count - low_count) as f64;
-        // Away from the ends, so that a curved count cannot stall the search.
+        // Stay away from the ends, so that a curved count cannot stall the search.
         let m = low + ((high - low) as f64 * slope.clamp(0.1, 0.9)) as usize;
         let m = m.clamp(low + 1, high - 1);
         let count = merged(m)?;
@@ -238,26 +240,26 @@ fn bracket(target: usize, all: usize, mut merged: impl FnMut(usize) -> Result<us
     Ok(low)
 }
 
-/// Everything merging reads, so that it can be tried on many sets of survivors.
+/// Input of merging in memory, so that merging can be tried on many sets of survivors.
 struct Trial<'a> {
     scored: &'a Scored,
-    /// The recipe's, with a noise floor no lower than that of the positions.
+    /// Merge parameters of the recipe, with a motion noise of at least the resolution of the positions.
     merge: recipe::MergeParams,
-    /// Ids whose states are known, increasing.
+    /// Increasing ids of the Gaussians whose states are in memory.
     pool: Vec<u32>,
-    /// Their states at the reference frame, of the harmonics the first band.
+    /// States of the pool at the reference frame, with base colors only.
     states: Gaussians,
-    /// With which others each may merge: those of its class; none: with nobody.
+    /// Merge class of each Gaussian of the pool; only Gaussians of one class may merge. `None`: never merges.
     classes: Vec<Option<u8>>,
-    /// C and Vis by id.
+    /// Importances C and Vis of all Gaussians, by id.
     importance: [Cow<'a, [f64]>; 2],
     meter: PairMeter<'a>,
     work: &'a Cache,
-    /// Pairs measured together.
+    /// Maximum number of pairs that are measured together.
     pairs_together: usize,
-    /// How pairs of the pool move: it does not depend on who else survives.
+    /// Motion likeness of pairs of the pool; it does not depend on the other survivors.
     known: KnownPairs,
-    /// Sets of survivors that were tried.
+    /// Progress of the trials: one unit per set of survivors.
     progress: &'a Progress,
 }
 
@@ -296,26 +298,27 @@ impl<'a> Trial<'a> {
         Ok(Trial { scored, merge, pool, states, classes, importance, meter, work, pairs_together, known, progress })
     }
 
-    /// Merges `survivors` to exactly `target`.
-    fn merge_to(&mut self, survivors: &[u32], target: usize) -> Result<Outcome> {
+    /// Merges `survivors` to exactly `target` Gaussians.
+    fn merge_to(&mut self, survivors: &[u32], target: usize) -> Result<MergeOutcome> {
         let merged = self.merge(survivors, Some(survivors.len() - target))?;
-        let left = merged.reduction.len();
+        let left = merged.compressed.len();
         if left > target {
             return Err(Error::usage(format!(
-                "a target of {target} Gaussians, but merging alone leaves {left} at the least\n  allow pruning, or looser merge passes"
+                "a target of {target} Gaussians, but merging alone leaves {left} at the least\n  \
+                 allow pruning, or looser merge passes"
             )));
         }
         Ok(merged)
     }
 
-    /// Merges `survivors` (increasing, all in the pool), stopping after `limit` joins.
-    fn merge(&mut self, survivors: &[u32], limit: Option<usize>) -> Result<Outcome> {
+    /// Merges `survivors` (increasing ids, all in the pool). Stops after `limit` joins.
+    fn merge(&mut self, survivors: &[u32], limit: Option<usize>) -> Result<MergeOutcome> {
         let Trial { scored, merge, pool, states, classes, importance, meter, work, pairs_together, known, progress } =
             self;
         let [coverage, visibility] = &*importance;
         let survivors = Survivors {
             states,
-            rows: &places_of(survivors, pool),
+            rows: &indices_in(survivors, pool),
             importance: Importance { ids: pool, coverage, visibility },
             classes,
             extent: scored.reference.extent,
@@ -338,7 +341,8 @@ impl<'a> Trial<'a> {
     }
 }
 
-/// How alike each of `pairs` moves, in some order. Many of them can be divided, by where they are.
+/// Returns the motion likeness of each of `pairs`, in any order. A large number of pairs is divided into shards by
+/// position.
 fn measure(
     work: &Cache,
     meter: &mut PairMeter<'_>,
@@ -347,10 +351,10 @@ fn measure(
     asked: &RequestedPairs<'_>,
     merge: &recipe::MergeParams,
 ) -> Result<Vec<Likeness>> {
-    if !work.keeps() || pairs.len() < DIVIDED {
+    if !work.keeps() || pairs.len() < MIN_DIVIDED_PAIRS {
         return meter.measure(pool, reference, pairs, asked.reach, asked.is_part);
     }
-    // Those of one place together, so that few parts read the same Gaussians.
+    // Sort pairs by position, so that few shards read the same Gaussians.
     let rows: Vec<u32> = (0..pool.len() as u32).collect();
     let order = voxel_order(&rows, |row| reference.row(row as usize), asked.reach);
     let mut place = rows;
@@ -360,7 +364,7 @@ fn measure(
     let (fresh, meter) = (meter.fresh(), RefCell::new(meter));
     let compute = |some: Range<usize>| match some.len() == pairs.len() {
         true => meter.borrow_mut().measure(pool, reference, pairs.clone(), asked.reach, asked.is_part),
-        // A part of them is read once and by itself.
+        // A shard is read once and shares no buffers with others.
         false => fresh.fresh().measure(pool, reference, pairs[some].to_vec(), asked.reach, false),
     };
     work.divided(PAIRS, key, pairs.len(), compute, |parts| {
@@ -372,8 +376,13 @@ fn measure(
     })
 }
 
-/// What `merged` leaves of `survivors`.
-fn outcome(survivors: &Survivors<'_>, merged: &Merged, reference_frame: usize, merge: &recipe::MergeParams) -> Outcome {
+/// Returns the compressed model and the counts for the groups in `merged`.
+fn outcome(
+    survivors: &Survivors<'_>,
+    merged: &Merged,
+    reference_frame: usize,
+    merge: &recipe::MergeParams,
+) -> MergeOutcome {
     let (groups, importance) = (&merged.groups, &survivors.importance);
     let id = |row: u32| importance.ids[row as usize];
     let clusters: Vec<Cluster> = groups
@@ -395,18 +404,21 @@ fn outcome(survivors: &Survivors<'_>, merged: &Merged, reference_frame: usize, m
     };
     summary.count(&clusters);
     let kept = groups.leaders().iter().map(|&row| id(row)).collect();
-    Outcome { reduction: CompressedModel { clusters, ..CompressedModel::pruned(kept, merge) }, summary: Some(summary) }
+    MergeOutcome {
+        compressed: CompressedModel { clusters, ..CompressedModel::pruned(kept, merge) },
+        summary: Some(summary),
+    }
 }
 
-/// States of the Gaussians `ids` (increasing) at `frame`, of the harmonics the first band; and whether the whole state
-/// is finite. Without frames all is zero.
+/// Returns the states of the Gaussians `ids` (increasing) at `frame` with base colors only, and whether each full state
+/// is finite. All values are zero if there are no frames.
 fn states_of(source: &dyn FrameSource, ids: &[u32], frame: usize) -> Result<(Gaussians, Vec<bool>)> {
     let mut states = Gaussians::zeros(ids.len(), 0);
     let mut finite = vec![true; ids.len()];
     if source.info().times.is_empty() {
         return Ok((states, finite));
     }
-    for (ids, start) in ids.chunks(GATHERED).zip((0..).step_by(GATHERED)) {
+    for (ids, start) in ids.chunks(GATHER_CHUNK).zip((0..).step_by(GATHER_CHUNK)) {
         let whole = gather(source, ids, frame, Columns::all())?;
         states.write_rows(start, &whole);
         for (row, finite) in finite[start..].iter_mut().take(ids.len()).enumerate() {
@@ -416,8 +428,8 @@ fn states_of(source: &dyn FrameSource, ids: &[u32], frame: usize) -> Result<(Gau
     Ok((states, finite))
 }
 
-/// Place of each of `ids` in `pool`, both increasing, the first part of the second.
-fn places_of(ids: &[u32], pool: &[u32]) -> Vec<u32> {
+/// Returns the index of each of `ids` in `pool`. Both are increasing, and `ids` is a subset of `pool`.
+fn indices_in(ids: &[u32], pool: &[u32]) -> Vec<u32> {
     let mut place = 0;
     ids.iter()
         .map(|&id| {
@@ -435,7 +447,7 @@ mod tests {
 
     #[test]
     fn bracket_finds_the_most_survivors_that_merge_into_the_target() {
-        // Merging halves what lies beyond the first hundred.
+        // Model of merging: half of the Gaussians beyond the first hundred disappear.
         for target in [1, 50, 100, 101, 400, 549, 550, 1000] {
             let count = |m: usize| m.min(100) + m.saturating_sub(100) / 2;
             let m = bracket(target, 1000, |m| Ok(count(m))).unwrap();
@@ -445,8 +457,8 @@ mod tests {
     }
 
     #[test]
-    fn places_follow_the_ids() {
-        assert_eq!(places_of(&[2, 5, 9], &[1, 2, 3, 5, 9]), [1, 3, 4]);
-        assert!(places_of(&[], &[4]).is_empty());
+    fn indices_follow_the_ids() {
+        assert_eq!(indices_in(&[2, 5, 9], &[1, 2, 3, 5, 9]), [1, 3, 4]);
+        assert!(indices_in(&[], &[4]).is_empty());
     }
 }

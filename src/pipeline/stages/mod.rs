@@ -1,4 +1,4 @@
-//! The stages of a run, a file each, in the order of [`STAGES`]. What they compute lies in the folders of its topic
+//! Stages of a run, one file each, in the order of [`STAGES`]. The computations are in the folders of their topics
 //! (`statistics`, `pruning`, `merging`, `refinement`, `archive`).
 
 pub mod archive;
@@ -21,10 +21,10 @@ pub mod write;
 use super::planning::Planning;
 use super::stage::StageList;
 
-/// Adds a stage to the list if the request needs it, or records why the run goes without it.
+/// Function that adds a stage to the list if the request needs it, or records why the run omits it.
 pub(super) type PlanStage = fn(&Planning<'_>, &mut StageList);
 
-/// Every stage in the order in which stages run.
+/// Planning functions of all stages, in the order in which stages run.
 pub(super) const STAGES: &[PlanStage] = &[
     measure::plan,
     size::plan_count,

@@ -1,4 +1,4 @@
-//! Stage `prune`: how many of the ranking survive, as far as that is known before anything merges.
+//! Stage `prune`: takes the survivors from the ranking, as far as their number is known before merging.
 
 use crate::error::{Error, Result};
 use crate::journal::Journal;
@@ -9,15 +9,15 @@ use crate::pruning::Ranking;
 use crate::pruning::score::Scored;
 use crate::scene::Scene;
 
-/// What the stage is called.
+/// Name of the stage.
 const NAME: &str = "prune";
 
-/// The pruning of a run.
+/// Stage that prunes.
 #[derive(Debug, Clone)]
 pub(crate) struct Prune {
-    /// Whether anybody is pruned who is not to be dropped.
+    /// Whether pruning is enabled; Gaussians that the user drops are removed in either case.
     pub prunes: bool,
-    /// Whether survivors merge afterwards.
+    /// Whether survivors are merged afterwards.
     pub merges: bool,
 }
 
@@ -37,7 +37,7 @@ impl Stage for Prune {
     fn run(&self, run: &mut RunState<'_>) -> Result<()> {
         let (scored, ranking) = (run.scored()?, run.ranking()?);
         let most = ranking.order().len();
-        // More may fit into a size on disk than may stay.
+        // A byte limit may have space for more Gaussians than may stay.
         let target = run.target.map(|target| if run.request.goal.is_some() { target.min(most) } else { target });
         run.wanted = self.survivors(run.scene, &scored, &ranking, target, &mut run.journal)?;
         let survivors = run.stages.counts.before_refinement(run.wanted, scored.count()).min(most);
@@ -47,11 +47,11 @@ impl Stage for Prune {
 }
 
 impl Prune {
-    /// Returns the number of survivors, exactly `target` where it is given. Of a run that merges down to a target all that may
-    /// survive do, for only merging tells how many are needed.
+    /// Returns the number of survivors, exactly `target` if it is given. If merging reduces them to the target, all
+    /// Gaussians that may stay survive here, because only merging can tell how many it needs.
     ///
     /// # Errors
-    /// A target that protected or dropped Gaussians rule out.
+    /// Fails if the numbers of protected or dropped Gaussians make the target impossible.
     pub(crate) fn survivors(
         &self,
         scene: &Scene,
@@ -96,7 +96,7 @@ mod tests {
     use crate::recipe::Recipe;
 
     #[test]
-    fn survivors_are_all_where_merging_decides_and_the_target_where_it_does_not() {
+    fn all_survive_if_merging_decides_else_the_target() {
         let folder = tempfile::tempdir().unwrap();
         let scene = scene(folder.path());
         let user = UserOverrides { keep: vec![1, 2], drop: vec![3], keep_box: None };

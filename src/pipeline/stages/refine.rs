@@ -1,4 +1,4 @@
-//! Stage `refine`: moves what is left toward the original's renders, and removes Gaussians between its steps.
+//! Stage `refine`: fits the survivors to renders of the original, and removes Gaussians in prune steps in between.
 
 use crate::error::Result;
 use crate::memory_plan::ResourceEstimate;
@@ -8,7 +8,7 @@ use crate::refinement::RefineStage;
 use crate::refinement::targets;
 use crate::scene::Scene;
 
-/// Adds the stage if the recipe refines and memory suffices; records what is left out for lack of memory.
+/// Adds the stage if the recipe refines and memory suffices; records the parts that are omitted for lack of memory.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     for (what, bytes) in planning.fallback.left_out() {
         let why = format!("memory: expected at least {}MiB for it (--memory)", bytes.div_ceil(1 << 20));
@@ -29,7 +29,8 @@ impl Stage for RefineStage {
         format!("refine: {steps} steps at the end, {cut_steps} before a prune step, toward {pictures} views")
     }
 
-    /// What is close enough already is not refined.
+    /// Returns whether at most the fraction `hardly_seen` of the Gaussians is removed: then the result may already be
+    /// close enough to the original.
     fn may_be_skipped(&self, input: EstimateInput<'_>, hardly_seen: f64) -> bool {
         input.left >= 1.0 - hardly_seen
     }
@@ -44,7 +45,7 @@ impl Stage for RefineStage {
         let start = run.take_result();
         run.result = match &mut run.prune_steps {
             None => self.run(run.scene, &scored, start, wanted, &mut run.journal)?,
-            // Of everything nothing is missing.
+            // A result with all Gaussians needs no refinement.
             Some(_) if wanted >= ranking.order().len() => start,
             Some(steps) => steps.refined(start, wanted, &mut run.journal)?,
         };

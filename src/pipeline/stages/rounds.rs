@@ -1,10 +1,9 @@
-//! Stage `rounds`: ranking by what the pictures would lose, scored anew as the model shrinks.
+//! Stage `rounds`: ranks by removal error in pruning rounds, measured anew as the model shrinks.
 //!
-//! One look at the whole model cannot rank for strong reductions: when a Gaussian goes, those behind it show
-//! and those that it made superfluous are needed. So each round looks at what is left, ranks it by
-//! [`RemovalError`](crate::render::RemovalError) and lets the worst go. Which Gaussians the next round sees
-//! does not depend on how many are wanted in the end: a smaller target keeps a subset of a larger one.
-//! Memory: see [`removal_error`].
+//! One measurement on the full model cannot rank for strong reductions: when a Gaussian is removed, the ones behind it
+//! become visible, and others that it made redundant are needed. So each round measures the survivors, ranks them by
+//! [`RemovalError`](crate::render::RemovalError) and removes the lowest. The survivors of a round do not depend on the
+//! final count, so a smaller target keeps a subset of a larger one. Memory: see [`removal_error`].
 
 use std::ops::Range;
 use std::sync::Arc;
@@ -27,30 +26,31 @@ use crate::pruning::score::{Scored, scored_memory};
 use crate::recipe;
 use crate::scene::Scene;
 
-/// What the stage is called.
+/// Name of the stage.
 const NAME: &str = "rounds";
 
-/// The rounds of a run.
+/// Stage that ranks in pruning rounds.
 #[derive(Debug, Clone)]
 pub(crate) struct Rounds {
-    /// Part of the Gaussians that a round leaves.
+    /// Fraction of the Gaussians that survives a round.
     pub fraction: f64,
-    /// Pictures that a round looks at, the same for a longer sequence.
+    /// Number of views by which Gaussians are ranked; does not grow with the number of frames.
     pub pictures: usize,
-    /// Turns that they take: a round looks at one part of so many, and goes by what the others showed in theirs.
+    /// Number of groups (turns) into which the views are divided. A round renders one group; for the others it uses the
+    /// errors that were measured in earlier rounds.
     pub turns: usize,
-    /// Contrast that every Gaussian is taken to have at least with what it hides.
+    /// Minimum contrast assumed between a Gaussian and the content behind it.
     pub contrast_floor: f64,
-    /// Part of the Gaussians that the last round is taken to leave at least, to say how many rounds there are at most.
+    /// Assumed smallest fraction of the Gaussians after the last round, which bounds the number of rounds in estimates.
     pub fewest: f64,
-    /// Part of them that it usually leaves, to say about how long rounds take.
+    /// Usual fraction of the Gaussians after the last round, for time estimates.
     pub usual: f64,
 }
 
-/// Where no size is asked for, rounds are taken to leave this part of the Gaussians at least.
-const FEWEST: f64 = 0.05;
-/// And usually this one.
-const USUAL: f64 = 0.5;
+/// Value of [`Rounds::fewest`] if no size is requested.
+const MIN_LEFT: f64 = 0.05;
+/// Value of [`Rounds::usual`] if no size is requested.
+const USUAL_LEFT: f64 = 0.5;
 
 /// Adds the stage if Gaussians are ranked by views.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
@@ -67,13 +67,13 @@ impl Stage for Rounds {
 
     fn parameters(&self) -> String {
         let (percent, Rounds { pictures, turns, .. }) = (100.0 * self.fraction, self);
-        format!("rounds: each leaves {percent:.0}% of the Gaussians, by a part of {turns} of {pictures} views")
+        format!("rounds: each keeps {percent:.0}% of the Gaussians, ranked on {pictures} views in {turns} groups")
     }
 
     fn shardable_units(&self, scene: &Scene, counts: &CountPlan) -> Vec<String> {
         let count = scene.source().info().count;
         let usual = (self.usual * count as f64).ceil() as usize;
-        self.divided(count, counts.after_ranking(usual, count))
+        self.shardable_rounds(count, counts.after_ranking(usual, count))
     }
 
     fn run(&self, run: &mut RunState<'_>) -> Result<()> {
@@ -88,8 +88,8 @@ impl Stage for Rounds {
 }
 
 impl Rounds {
-    /// The stage, unless `recipe` ranks once; `target`: the part of the Gaussians that is asked for. Takes visible
-    /// contributions.
+    /// Returns the stage, or `None` if `recipe` ranks only once. `target` is the requested fraction of the Gaussians.
+    /// The stage needs visible contributions.
     pub(crate) fn from_recipe(recipe: &recipe::Select, target: Option<f64>) -> Option<Rounds> {
         let recipe::Select {
             round_fraction: fraction,
@@ -98,11 +98,11 @@ impl Rounds {
             contrast_floor,
             ..
         } = *recipe;
-        let (fewest, usual) = (target.unwrap_or(FEWEST), target.unwrap_or(USUAL));
+        let (fewest, usual) = (target.unwrap_or(MIN_LEFT), target.unwrap_or(USUAL_LEFT));
         (fraction < 1.0).then_some(Rounds { fraction, pictures, turns, contrast_floor, fewest, usual })
     }
 
-    /// The ranking, and pictures of all that is left.
+    /// Returns the estimate: the ranking, and renders of all survivors.
     pub(crate) fn need(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
         let (looking, fixed) = work.looking(limits, Columns::all(), 8);
         let all = (self.pictures as u64).min(work.pictures);
@@ -115,28 +115,29 @@ impl Rounds {
             let pictures = all as f64 / if round == 0 { 1.0 } else { turns as f64 };
             work.reading(left, pictures.min(work.frames as f64)) + work.picturing(pictures, left, REMOVE)
         });
-        // The first round takes all turns, each of its own frames.
+        // The first round renders all groups, each with its own frames.
         let frames = all.min(work.frames).div_ceil(turns);
         let later = f64::from(self.rounds(self.fewest).saturating_sub(1));
         let reads = work.scattered_reads(frames * turns, limits) + later * work.scattered_reads(frames, limits);
         ResourceEstimate { stage: NAME, reads, seconds: seconds.sum(), per_gaussian, fixed }
     }
 
-    /// Returns the number of rounds after which at most a part `fewest` is left. At most 2207, for a recipe's fraction is
-    /// at most [`MOST_LEFT_BY_ROUND`](recipe::MOST_LEFT_BY_ROUND) and there are at most `u32::MAX` Gaussians.
+    /// Returns the number of rounds until at most the fraction `fewest` is left. It is at most 2207, because the
+    /// fraction of a recipe is at most [`MOST_LEFT_BY_ROUND`](recipe::MOST_LEFT_BY_ROUND) and there are at most
+    /// `u32::MAX` Gaussians.
     fn rounds(&self, fewest: f64) -> u32 {
         let fewest = fewest.max(1.0 / f64::from(u32::MAX));
         (fewest.ln() / self.fraction.ln()).ceil().max(0.0) as u32
     }
 
-    /// The rounds that leave `fewest` of `count` Gaussians, for people.
-    pub(crate) fn divided(&self, count: usize, fewest: usize) -> Vec<String> {
-        let of = |round: usize| self.pictures.div_ceil(if round == 0 { 1 } else { self.turns.max(1) });
+    /// Returns the rounds that leave `fewest` of `count` Gaussians, one line each for display.
+    pub(crate) fn shardable_rounds(&self, count: usize, fewest: usize) -> Vec<String> {
+        let view_count = |round: usize| self.pictures.div_ceil(if round == 0 { 1 } else { self.turns.max(1) });
         let rounds = 0..self.sizes(count, 0, fewest).len();
-        rounds.map(|round| format!("{}: {} pictures at most", name(round), of(round))).collect()
+        rounds.map(|round| format!("{}: {} views at most", entry_name(round), view_count(round))).collect()
     }
 
-    /// The pictures in as many parts as there are turns, each of frames of its own where there are as many.
+    /// Divides the views into groups (turns), by frames if there are enough frames, otherwise one by one.
     fn turns(&self, scene: &Scene, scored: &Scored) -> Vec<Vec<Picture>> {
         let pictures = spread_over(&scene.schedule, self.pictures, scored.frames_to_see);
         let by_frame: Vec<&[Picture]> = pictures.chunk_by(|a, b| a.frame == b.frame).collect();
@@ -147,12 +148,12 @@ impl Rounds {
         turns
     }
 
-    /// Ranks all but the dropped Gaussians in rounds, until a round leaves at most `fewest`; those that go in one
-    /// round, and those that stay after the last, by error, ties by the order there was. Protected Gaussians come
-    /// first.
+    /// Ranks all Gaussians that are not dropped in rounds, until a round leaves at most `fewest`. Gaussians removed in
+    /// one round, and the survivors of the last, are ordered by error; ties keep the order of `before`. Protected
+    /// Gaussians come first.
     ///
     /// # Errors
-    /// Frames that cannot be read.
+    /// Fails if frames cannot be read.
     pub(crate) fn rank(
         &self,
         scene: &Scene,
@@ -165,7 +166,7 @@ impl Rounds {
         let is_free = |id: &u32| !scored.is_protected(*id);
         let mut state = RoundState {
             free: before.order().iter().copied().filter(is_free).collect(),
-            gone: Vec::new(),
+            removed: Vec::new(),
             errors: Vec::new(),
         };
         let first = state.free.len() + protected.len();
@@ -175,30 +176,30 @@ impl Rounds {
         }
         let turns = self.turns(scene, scored);
         state.errors = vec![vec![0; scored.count()]; turns.len()];
-        // What a round leaves does not depend on how many are wanted in the end.
+        // The key does not contain `fewest`: the survivors of a round do not depend on it.
         let key = scene.work.key(&(self.fraction, self.contrast_floor, &turns, &before, protected));
         let mut done = 0;
         for round in (0..sizes.len()).rev().filter(|_| scene.work.keeps()) {
-            if let Some(found) = scene.work.find(&name(round), key.and(&round))? {
+            if let Some(found) = scene.work.find(&entry_name(round), key.and(&round))? {
                 (state, done) = (found, round + 1);
                 break;
             }
         }
         let pictures =
-            (done..sizes.len()).map(|round| looking(&turns, round).map(|turn| turns[turn].len()).sum::<usize>());
+            (done..sizes.len()).map(|round| active_turns(&turns, round).map(|turn| turns[turn].len()).sum::<usize>());
         let progress = scene.events.task(NAME, "pictures", pictures.sum::<usize>() as u64);
-        let RoundState { free, gone, .. } = journal.stage(NAME, first, scene.source(), |_| {
+        let RoundState { free, removed, .. } = journal.stage(NAME, first, scene.source(), |_| {
             for (round, &left) in sizes.iter().enumerate().skip(done) {
                 state = self.round(scene, scored, (state, &turns), round, (key, left), &progress)?;
             }
             let left = state.free.len() + protected.len();
             Ok((state, left))
         })?;
-        Ok(Ranking::new(protected.iter().copied().chain(free).chain(gone).collect()))
+        Ok(Ranking::new(protected.iter().copied().chain(free).chain(removed).collect()))
     }
 
-    /// Returns how many of so many free Gaussians each round leaves, until a round leaves at most `fewest` with those
-    /// protected. Every round removes at least one.
+    /// Returns how many of `free` Gaussians each round leaves, until at most `fewest` are left including the
+    /// `protected` ones. Every round removes at least one.
     fn sizes(&self, mut free: usize, protected: usize, fewest: usize) -> Vec<usize> {
         let mut sizes = Vec::new();
         while free > 0 && free + protected > fewest {
@@ -209,7 +210,7 @@ impl Rounds {
         sizes
     }
 
-    /// One round, which leaves `left` free Gaussians. It can be divided by pictures.
+    /// Runs one round, which leaves `left` free Gaussians. The views can be divided among shards.
     fn round(
         &self,
         scene: &Scene,
@@ -221,70 +222,72 @@ impl Rounds {
     ) -> Result<RoundState> {
         let mut ids: Vec<u32> = state.free.iter().chain(&scored.protected).copied().collect();
         ids.sort_unstable();
-        let looking: Vec<usize> = looking(turns, round).collect();
+        let active: Vec<usize> = active_turns(turns, round).collect();
         let (background, floor) = (scene.background, self.contrast_floor as f32);
-        let units = looking.iter().map(|&turn| turns[turn].len()).sum();
-        // Of every turn that looks, what those of its pictures show that are among `some`; nothing, if none is.
+        let units = active.iter().map(|&turn| turns[turn].len()).sum();
+        // Removal errors of each active group, summed over the views of that group that are in `some`; empty if there
+        // are none.
         let compute = |some: Range<usize>| -> Result<Vec<Vec<u64>>> {
             let mut start = 0;
-            let of_turn = |&turn: &usize| {
+            let turn_errors = |&turn: &usize| {
                 let pictures = &turns[turn];
                 let place = |unit: usize| unit.saturating_sub(start).min(pictures.len());
-                let of = place(some.start)..place(some.end);
+                let range = place(some.start)..place(some.end);
                 start += pictures.len();
-                if of.is_empty() {
+                if range.is_empty() {
                     return Ok(Vec::new());
                 }
-                let pictures = (&scene.schedule.cameras[..], &pictures[of]);
+                let pictures = (&scene.schedule.cameras[..], &pictures[range]);
                 let advance = || progress.advance(1);
                 Ok(removal_error(scene.source(), &ids, pictures, background, floor, scene.limits, advance)?.sum)
             };
-            looking.iter().map(of_turn).collect()
+            active.iter().map(turn_errors).collect()
         };
-        scene.work.divided(&name(round), key.and(&round), units, compute, |parts| {
-            for &turn in &looking {
+        scene.work.divided(&entry_name(round), key.and(&round), units, compute, |parts| {
+            for &turn in &active {
                 ids.iter().for_each(|&id| state.errors[turn][id as usize] = 0);
             }
             for part in parts {
-                for (&turn, found) in looking.iter().zip(part?) {
+                for (&turn, found) in active.iter().zip(part?) {
                     let errors = &mut state.errors[turn];
                     for (&id, error) in ids.iter().zip(found) {
                         errors[id as usize] = errors[id as usize].saturating_add(error);
                     }
                 }
             }
-            let error = |id: &u32| state.errors.iter().fold(0u64, |sum, of| sum.saturating_add(of[*id as usize]));
-            // Stable: ties keep the order there was.
+            let error =
+                |id: &u32| state.errors.iter().fold(0u64, |sum, errors| sum.saturating_add(errors[*id as usize]));
+            // The sort is stable: ties keep the earlier order.
             state.free.sort_by_cached_key(|id| std::cmp::Reverse(error(id)));
             let mut worst = state.free.split_off(left);
-            worst.append(&mut state.gone);
-            state.gone = worst;
+            worst.append(&mut state.removed);
+            state.removed = worst;
             Ok(state)
         })
     }
 }
 
-/// What a round leaves.
+/// State after a round.
 #[derive(Serialize, Deserialize)]
 struct RoundState {
-    /// Neither protected nor gone, best first.
+    /// Survivors that are not protected, best first.
     free: Vec<u32>,
-    /// Worst last.
-    gone: Vec<u32>,
-    /// By turn, what its pictures showed of every Gaussian when it last looked.
+    /// Removed Gaussians, worst last.
+    removed: Vec<u32>,
+    /// Removal error of every Gaussian by group of views, when the group was last rendered.
     errors: Vec<Vec<u64>>,
 }
 
-/// What a round is called in a work folder.
-fn name(round: usize) -> String {
+/// Returns the name of a round in the cache.
+fn entry_name(round: usize) -> String {
     format!("{NAME}-{:02}", round + 1)
 }
 
-/// Which turns look in a round: first all, then one after the other.
-fn looking(turns: &[Vec<Picture>], round: usize) -> impl Iterator<Item = usize> {
+/// Returns the groups of views that a round renders: all in the first round, then one after the other.
+fn active_turns(turns: &[Vec<Picture>], round: usize) -> impl Iterator<Item = usize> {
     let count = turns.len().max(1);
-    let looking = if round == 0 { turns.len() } else { 1.min(turns.len()) };
-    (0..looking).map(move |k| (round + k) % count)
+    let active = if round == 0 { turns.len() } else { 1.min(turns.len()) };
+    (0..active).map(move |k| (round + k) % count)
 }
 
 #[cfg(test)]
@@ -297,7 +300,7 @@ mod tests {
     use crate::recipe::Recipe;
     use crate::render::render;
 
-    /// The order of scoring, and that of the rounds.
+    /// Returns the ranking by score and the ranking of the rounds.
     fn ranked(scene: &Scene, user: &UserOverrides, fewest: usize) -> (Ranking, Ranking) {
         let recipe = Recipe::preset("default").unwrap();
         let scored = score_scene(scene, &recipe, user);
@@ -319,19 +322,19 @@ mod tests {
     }
 
     #[test]
-    fn rounds_keep_more_of_the_pictures_than_one_ranking_by_coverage() {
+    fn rounds_keep_more_quality_than_ranking_once() {
         let folder = tempfile::tempdir().unwrap();
         let scene = scene(folder.path());
         let (once, rounds) = ranked(&scene, &UserOverrides::default(), 150);
         let all: Vec<u32> = (0..1500).collect();
         for target in [150, 500] {
             let quality = |kept: &[u32]| -> f64 {
-                let of_picture = |picture: &Picture| {
+                let view_psnr = |picture: &Picture| {
                     let original = gather(scene.source(), &all, picture.frame, Columns::all()).unwrap();
                     let camera = &scene.schedule.cameras[picture.camera as usize];
                     psnr(&render(&original.pick(kept), camera, [0.0; 3]), &render(&original, camera, [0.0; 3]))
                 };
-                spread(&scene.schedule, 12, 1).iter().map(of_picture).sum::<f64>() / 12.0
+                spread(&scene.schedule, 12, 1).iter().map(view_psnr).sum::<f64>() / 12.0
             };
             let got = quality(&rounds.take(target));
             let at_once = quality(&once.take(target));
@@ -340,7 +343,7 @@ mod tests {
     }
 
     #[test]
-    fn what_the_user_keeps_comes_first_and_what_he_drops_does_not_come() {
+    fn kept_ids_rank_first_and_dropped_ids_do_not_rank() {
         let folder = tempfile::tempdir().unwrap();
         let scene = scene(folder.path());
         let worst = ranked(&scene, &UserOverrides::default(), 100).1.order()[1490..].to_vec();
@@ -354,7 +357,7 @@ mod tests {
     }
 
     #[test]
-    fn turns_part_the_pictures_by_frames_or_one_by_one_where_frames_are_few() {
+    fn views_are_grouped_by_frame_or_singly_if_frames_are_few() {
         let folder = tempfile::tempdir().unwrap();
         let scene = scene(folder.path());
         let recipe = Recipe::preset("default").unwrap();
@@ -393,7 +396,7 @@ mod tests {
     }
 
     #[test]
-    fn the_number_of_rounds_is_bounded_for_no_gaussians_at_all() {
+    fn number_of_rounds_is_bounded_even_for_a_zero_target() {
         let recipe = Recipe::preset("default").unwrap();
         let rounds =
             Rounds { fraction: recipe::MOST_LEFT_BY_ROUND, ..Rounds::from_recipe(&recipe.select, Some(0.0)).unwrap() };
@@ -401,7 +404,7 @@ mod tests {
     }
 
     #[test]
-    fn a_model_that_is_small_enough_keeps_its_order() {
+    fn small_enough_model_keeps_its_order() {
         let folder = tempfile::tempdir().unwrap();
         let scene = scene(folder.path());
         let (once, rounds) = ranked(&scene, &UserOverrides::default(), 1500);

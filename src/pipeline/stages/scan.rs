@@ -1,4 +1,4 @@
-//! Stage `scan`: every Gaussian at every frame once, through one fixed-size accumulator each.
+//! Stage `scan`: one pass over every Gaussian at every frame, with one accumulator of fixed size per Gaussian.
 
 use crate::error::Result;
 use crate::journal::Journal;
@@ -12,28 +12,27 @@ use crate::statistics;
 use crate::statistics::ScanPlan;
 use crate::statistics::pass::{Scanned, scan_blocks, scan_units};
 
-/// What the stage is called.
+/// Name of the stage.
 pub(crate) const NAME: &str = "scan";
 
-/// Seconds that a state takes to be added to an accumulator, and to be projected to a picture (`benches/scan.rs`,
-/// `benches/projection.rs`).
-const ACCUMULATING: f64 = 2e-8;
-/// See [`ACCUMULATING`].
-const PROJECTING: f64 = 8e-9;
+/// Time to add a state to an accumulator, seconds (`benches/scan.rs`).
+const SECONDS_TO_ACCUMULATE: f64 = 2e-8;
+/// Time to project a state to a view, seconds (`benches/projection.rs`).
+const SECONDS_TO_PROJECT: f64 = 8e-9;
 
-/// The scan of a run.
+/// Stage that scans.
 #[derive(Debug, Clone)]
 pub struct ScanStage {
-    /// Its parameters.
+    /// Parameters of the scan.
     pub recipe: recipe::ScanParams,
 }
 
 impl ScanStage {
-    /// A block of Gaussians at a time, then the rows of all, joined.
+    /// Returns the estimate: one block of Gaussians per thread, and the joined rows of all.
     pub fn need(&self, work: &Workload, _: &Limits) -> ResourceEstimate {
-        // In stages a second reader decodes while the first is read.
+        // Within the stage a second reader may decode while the first is read.
         let block = statistics::BYTES_PER_GAUSSIAN as u64 + 2 * work.held(&Limits::NONE, Columns::all());
-        // How many live in each, in the blocks of all threads; the steps between uneven ones.
+        // Number of alive Gaussians per frame, for the blocks of all threads, and the steps between uneven frames.
         let frames = work.frames * (4 * work.threads + 8);
         ResourceEstimate {
             stage: NAME,
@@ -41,7 +40,7 @@ impl ScanStage {
             seconds: work.pace.states
                 * work.count()
                 * work.frames as f64
-                * (ACCUMULATING + work.views as f64 * PROJECTING)
+                * (SECONDS_TO_ACCUMULATE + work.views as f64 * SECONDS_TO_PROJECT)
                 + work.reading(work.count(), work.frames as f64),
             per_gaussian: vec![("rows", 2 * Rows::BYTES_PER_GAUSSIAN as u64)],
             fixed: vec![
@@ -52,10 +51,10 @@ impl ScanStage {
         }
     }
 
-    /// Statistics of every Gaussian of `scene`.
+    /// Computes statistics of every Gaussian of `scene`.
     ///
     /// # Errors
-    /// Frames that cannot be read, or whose times cannot be scanned.
+    /// Fails if frames cannot be read or their times cannot be scanned.
     pub fn run(&self, scene: &Scene, journal: &mut Journal) -> Result<Scanned> {
         let source = scene.source();
         let info = source.info();
@@ -82,7 +81,7 @@ mod tests {
     use crate::recipe::Recipe;
 
     #[test]
-    fn every_gaussian_gets_a_row_and_the_stage_is_written_down() {
+    fn every_gaussian_gets_a_row_and_the_stage_is_recorded() {
         let folder = tempfile::tempdir().unwrap();
         let scene = scene(folder.path());
         let scan = ScanStage { recipe: Recipe::preset("default").unwrap().scan };
@@ -94,7 +93,7 @@ mod tests {
     }
 
     #[test]
-    fn memory_beside_the_rows_does_not_grow_with_gaussians_beyond_a_block() {
+    fn memory_beside_rows_is_bounded_by_one_block() {
         let scan = ScanStage { recipe: Recipe::preset("default").unwrap().scan };
         let need = |count| {
             let need = scan.need(&work(count), &Limits::NONE);

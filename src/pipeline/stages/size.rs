@@ -1,5 +1,5 @@
-//! Stages of a run that is asked for a size on disk: `size` finds how many Gaussians fit before anything is ranked, and
-//! shrinks the result at the end where its values take more bytes than those that the count was found by.
+//! Stages `size` of a run with a byte limit. The first finds how many Gaussians fit before anything is ranked. The
+//! second shrinks the result at the end if its values take more bytes than those by which the count was found.
 
 use crate::cache::CacheKey;
 use crate::compressed_model::CompressedModel;
@@ -19,14 +19,14 @@ use crate::pruning::score::Scored;
 use crate::recipe::Precision;
 use crate::scene::Scene;
 
-/// What the stage is called.
+/// Name of the stages.
 const NAME: &str = "size";
-/// Part of the bytes that may stay free.
-const FREE: f64 = 0.01;
-/// Sizes that are written at most, to see their bytes.
-const MOST_TRIED: usize = 8;
-/// Pictures that say who goes, where the values of the best turn out larger than those of any.
-const PICTURES: usize = 48;
+/// Fraction of the byte limit that may remain unused.
+const MAX_UNUSED: f64 = 0.01;
+/// Maximum number of sizes that are written to measure their bytes.
+const MAX_TRIED: usize = 8;
+/// Number of views used to rank removals if the result exceeds the byte limit.
+const RANKING_VIEWS: usize = 48;
 
 /// Adds the stage that finds how many Gaussians fit.
 pub(super) fn plan_count(planning: &Planning<'_>, stages: &mut StageList) {
@@ -35,14 +35,15 @@ pub(super) fn plan_count(planning: &Planning<'_>, stages: &mut StageList) {
     }
 }
 
-/// Adds the stage that shrinks what does not fit. An archive of any number fits on some grids.
+/// Adds the stage that shrinks a result that does not fit. An archive needs no such stage: its quantization steps
+/// adapt.
 pub(super) fn plan_shrink(planning: &Planning<'_>, stages: &mut StageList) {
     if let Some(limit) = ByteLimit::from_planning(planning).filter(|_| planning.output != OutputKind::Archive) {
         stages.add(Phase::Reduce, ShrinkToBytes { limit });
     }
 }
 
-/// The stage that finds how many Gaussians fit.
+/// Stage that finds how many Gaussians fit.
 #[derive(Debug)]
 struct CountByBytes {
     limit: ByteLimit,
@@ -56,15 +57,15 @@ impl Stage for CountByBytes {
     }
 
     fn run(&self, run: &mut RunState<'_>) -> Result<()> {
-        let like = CompressedModel { field: self.limit.field, ..run.template.clone() };
+        let template = CompressedModel { field: self.limit.field, ..run.template.clone() };
         let (present, recipe) = (run.scored()?.present(), run.recipe.len() as u64);
-        run.fits = self.limit.fits(run.scene, (&present, recipe), &like, self.drops_bands, &mut run.journal)?;
+        run.fits = self.limit.fits(run.scene, (&present, recipe), &template, self.drops_bands, &mut run.journal)?;
         run.target = run.fits.first().map(|fit| fit.gaussians);
         Ok(())
     }
 }
 
-/// The stage that shrinks what does not fit.
+/// Stage that shrinks a result that does not fit.
 #[derive(Debug)]
 struct ShrinkToBytes {
     limit: ByteLimit,
@@ -82,14 +83,14 @@ impl Stage for ShrinkToBytes {
     }
 }
 
-/// So many bytes for everything that is written.
+/// Byte limit of all files that are written.
 #[derive(Debug, Clone)]
 struct ByteLimit {
-    /// What writes.
-    emit: Emit,
-    /// Bytes at most.
+    /// Stage that writes the files.
+    writer: Emit,
+    /// Maximum number of bytes.
     most: u64,
-    /// Precision of the field that takes its room: one that may be rounded is taken in half precision.
+    /// Assumed precision of the field: half precision if the field may be rounded.
     field: Precision,
 }
 
@@ -98,74 +99,77 @@ impl ByteLimit {
         let Some(Goal::Bytes(most)) = planning.request.goal else { return None };
         let is_rounded = FieldPrecisionStage::from_request(planning.request, planning.output).is_some();
         let field = if is_rounded { Precision::Half } else { Precision::Exact };
-        Some(ByteLimit { emit: Emit::from_planning(planning), most, field })
+        Some(ByteLimit { writer: Emit::from_planning(planning), most, field })
     }
 
-    /// [`ByteLimit::count`] of the Gaussians `ids` for the SH degree of `like` and, where bands may go, every lower one, until everything fits.
+    /// Returns the numbers of Gaussians `ids` that fit for the SH degree of `template` and, if degrees may be dropped,
+    /// for every lower one, until all Gaussians fit. See [`ByteLimit::count`].
     ///
     /// # Errors
-    /// Those of [`ByteLimit::count`].
+    /// Fails where [`ByteLimit::count`] fails.
     fn fits(
         &self,
         scene: &Scene,
         (ids, recipe): (&[u32], u64),
-        like: &CompressedModel,
+        template: &CompressedModel,
         drops: bool,
         journal: &mut Journal,
     ) -> Result<Vec<ByteLimitFit>> {
         let info = scene.source().info();
-        let highest = like.sh_degree.min(info.sh_degree);
+        let highest = template.sh_degree.min(info.sh_degree);
         let lowest = if drops && scene.input.needs_all_bands().is_none() { 0 } else { highest };
         let mut fits: Vec<ByteLimitFit> = Vec::new();
         for sh_degree in (lowest..=highest).rev() {
             if fits.last().is_some_and(|fit| fit.gaussians == ids.len()) {
                 break;
             }
-            let like = CompressedModel { sh_degree, ..like.clone() };
-            fits.push(ByteLimitFit { sh_degree, gaussians: self.count(scene, (ids, recipe), &like, journal)? });
+            let template = CompressedModel { sh_degree, ..template.clone() };
+            fits.push(ByteLimitFit { sh_degree, gaussians: self.count(scene, (ids, recipe), &template, journal)? });
         }
         Ok(fits)
     }
 
-    /// What bytes follow from, with a recipe of so many bytes beside the result.
-    fn key(&self, scene: &Scene, recipe: u64, reduction: &CompressedModel) -> CacheKey {
-        scene.work.key(&(self.emit.kind, self.emit.merges, self.most, recipe, reduction))
+    /// Returns the cache key of everything that the bytes depend on, with a recipe of `recipe` bytes beside the result.
+    fn key(&self, scene: &Scene, recipe: u64, compressed: &CompressedModel) -> CacheKey {
+        scene.work.key(&(self.writer.kind, self.writer.merges, self.most, recipe, compressed))
     }
 
-    /// As many of the Gaussians `ids` as fit, of any of them, with the rule and the field of `like`.
+    /// Returns how many of the Gaussians `ids`, evenly sampled, fit the limit, with the merge parameters and the field
+    /// of `template`.
     ///
     /// # Errors
-    /// Not even one fits; frames that cannot be read, a failed write.
+    /// Fails if not even one fits, if frames cannot be read, or if a write fails.
     fn count(
         &self,
         scene: &Scene,
         (ids, recipe): (&[u32], u64),
-        like: &CompressedModel,
+        template: &CompressedModel,
         journal: &mut Journal,
     ) -> Result<usize> {
         let (all, most) = (ids.len(), self.most);
-        journal.kept_stage(NAME, all, scene, self.key(scene, recipe, like), |_| {
+        journal.kept_stage(NAME, all, scene, self.key(scene, recipe, template), |_| {
             let bytes = |count: usize| {
                 let kept = (0..count).map(|k| ids[k * all / count]).collect();
-                let some = like.with(kept);
-                match self.emit.kind {
-                    // What lies beside it is neither stored nor sent.
+                let some = template.with(kept);
+                match self.writer.kind {
+                    // The files beside an archive are neither stored nor sent with it, so they do not count.
                     OutputKind::Archive => archive::bytes(scene, &some),
-                    _ => self.emit.bytes(scene, &some, recipe),
+                    _ => self.writer.bytes(scene, &some, recipe),
                 }
             };
             let one = 1.min(all);
             let least = bytes(one)?;
             if least > most {
                 return Err(Error::usage(format!(
-                    "--target-size: an output of one Gaussian has {least} bytes, nearly all of what is not Gaussians; \
-                     expected at least that, found {most}"
+                    "--size: expected at least {least} bytes, the size of an output with one Gaussian (nearly \
+                     all of it is not Gaussians), found {most}"
                 )));
             }
-            // Sizes and their bytes: the largest that fits, and the smallest that does not.
+            // Numbers of Gaussians with their bytes: `fits` is the largest that fits, `over` the smallest that does
+            // not.
             let (mut fits, mut over) = ((one, least), None);
             let (mut next, mut overs) = (all, 0);
-            for _ in 0..MOST_TRIED {
+            for _ in 0..MAX_TRIED {
                 let found = bytes(next)?;
                 if found <= most {
                     (fits, overs) = ((next, found), 0);
@@ -173,11 +177,12 @@ impl ByteLimit {
                     (over, overs) = (Some((next, found)), overs + 1);
                 }
                 let Some(over) = over.filter(|over: &(usize, u64)| over.0 - fits.0 > 1) else { break };
-                if most - fits.1 <= (FREE * most as f64) as u64 {
+                if most - fits.1 <= (MAX_UNUSED * most as f64) as u64 {
                     break;
                 }
                 let part = (most - fits.1) as f64 / (over.1 - fits.1).max(1) as f64;
-                // A line between both leads no further where the first few take most bytes, as those of an archive do.
+                // Linear interpolation makes slow progress if the first few Gaussians take most bytes, as in an
+                // archive.
                 let part = if overs > 1 { part.min(0.5) } else { part };
                 next = fits.0 + ((0.998 * part * (over.0 - fits.0) as f64) as usize).clamp(1, over.0 - fits.0 - 1);
             }
@@ -185,63 +190,65 @@ impl ByteLimit {
         })
     }
 
-    /// `reduction`, less those that pictures lose least with as long as it does not fit: refined values may pack worse
-    /// than those that the count was found by. Protected Gaussians stay.
+    /// Removes the Gaussians of `compressed` with the lowest removal error until the result fits. This is needed
+    /// because refined values may compress worse than those by which the count was found. Protected Gaussians stay.
     ///
     /// # Errors
-    /// What is protected does not fit; frames that cannot be read, a failed write.
+    /// Fails if the protected Gaussians alone do not fit, if frames cannot be read, or if a write fails. What is
+    /// protected does not fit; frames that cannot be read, a failed write.
     fn shrink(
         &self,
         scene: &Scene,
         scored: &Scored,
-        mut reduction: CompressedModel,
+        mut compressed: CompressedModel,
         recipe: u64,
         journal: &mut Journal,
     ) -> Result<CompressedModel> {
-        let key = self.key(scene, recipe, &reduction).and(&scored.protected);
-        journal.kept_stage(NAME, reduction.len(), scene, key, |_| {
-            let bytes = |reduction: &CompressedModel| self.emit.bytes(scene, reduction, recipe);
-            let empty = bytes(&reduction.pick(&[]))?;
+        let key = self.key(scene, recipe, &compressed).and(&scored.protected);
+        journal.kept_stage(NAME, compressed.len(), scene, key, |_| {
+            let bytes = |compressed: &CompressedModel| self.writer.bytes(scene, compressed, recipe);
+            let empty = bytes(&compressed.pick(&[]))?;
             let mut tried = 0;
             loop {
-                let found = bytes(&reduction)?;
+                let found = bytes(&compressed)?;
                 if found <= self.most {
-                    let count = reduction.len();
-                    return Ok((reduction, count));
+                    let count = compressed.len();
+                    return Ok((compressed, count));
                 }
                 let protected = scored.protected.len();
-                if reduction.len() <= protected {
+                if compressed.len() <= protected {
                     return Err(Error::usage(format!(
-                        "--target-size: the {protected} Gaussians that are to be kept take {found} bytes with \
-                         everything beside them; expected at least that, found {}",
+                        "--size: expected at least {found} bytes, the size of an output with only the \
+                         {protected} Gaussians that are to be kept, found {}",
                         self.most
                     )));
                 }
                 let part = self.most.saturating_sub(empty) as f64 / found.saturating_sub(empty).max(1) as f64;
-                let left = next_size(reduction.len(), protected, part, tried);
+                let left = next_size(compressed.len(), protected, part, tried);
                 tried += 1;
-                let places = self.best(scene, scored, &reduction, left)?;
-                reduction = reduction.pick(&places);
+                let places = self.best(scene, scored, &compressed, left)?;
+                compressed = compressed.pick(&places);
             }
         })
     }
 
-    /// Places of the `count` that are protected or that pictures would lose most with.
-    fn best(&self, scene: &Scene, scored: &Scored, reduction: &CompressedModel, count: usize) -> Result<Vec<u32>> {
-        let result = scene.input.reduced(reduction)?;
-        let places: Vec<u32> = (0..reduction.len() as u32).collect();
-        let pictures = spread(&scene.schedule, PICTURES, VIEWS_AT_ONCE);
+    /// Returns the indices of the `count` Gaussians that are protected or have the highest removal errors.
+    fn best(&self, scene: &Scene, scored: &Scored, compressed: &CompressedModel, count: usize) -> Result<Vec<u32>> {
+        let result = scene.input.reduced(compressed)?;
+        let places: Vec<u32> = (0..compressed.len() as u32).collect();
+        let pictures = spread(&scene.schedule, RANKING_VIEWS, VIEWS_AT_ONCE);
         let looked_at = (&scene.schedule.cameras[..], &pictures[..]);
         let errors = removal_error(&*result, &places, looked_at, scene.background, 0.0, scene.limits, || ())?;
-        Ok(errors.most_missed(count, |place| scored.is_protected(reduction.kept[place])))
+        Ok(errors.most_missed(count, |place| scored.is_protected(compressed.kept[place])))
     }
 }
 
-/// Returns how many of `count` Gaussians to try next where a `part` of their bytes is expected to fit, after so many sizes
-/// were `tried`. `protected` ones stay, fewer than `count`. Always fewer than `count`; after [`MOST_TRIED`] sizes at most
-/// half as many, so that bytes which follow no line end the search after at most 32 more.
+/// Returns how many of `count` Gaussians to try next if the fraction `part` of their bytes is expected to fit, after
+/// `tried` sizes. `protected` Gaussians, fewer than `count`, stay. The result is less than `count`, and after
+/// [`MAX_TRIED`] sizes at most half of it, so that the search ends after at most 32 more sizes even if bytes follow no
+/// line.
 fn next_size(count: usize, protected: usize, part: f64, tried: usize) -> usize {
-    let most = if tried < MOST_TRIED { count - 1 } else { count / 2 };
+    let most = if tried < MAX_TRIED { count - 1 } else { count / 2 };
     ((0.998 * part * count as f64) as usize).min(most).max(protected)
 }
 
@@ -250,7 +257,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn shrinking_to_a_size_ends_whatever_the_bytes_are() {
+    fn shrinking_ends_whatever_the_bytes_are() {
         for (count, part) in
             (1..=50).chain([4_000_000_000]).flat_map(|n| [0.0, 0.5, 1.0, 1e9, f64::NAN].map(|p| (n, p)))
         {
@@ -261,7 +268,7 @@ mod tests {
                     assert!((protected..left).contains(&next), "{left} to {next}, {protected} protected, part {part}");
                     (left, tried) = (next, tried + 1);
                 }
-                assert!(tried <= MOST_TRIED + 33, "{tried} sizes of {count} tried");
+                assert!(tried <= MAX_TRIED + 33, "{tried} sizes of {count} tried");
             }
         }
     }

@@ -1,4 +1,4 @@
-//! Stage `emit`: the smaller model and, beside it, the recipe, the index map and the summary.
+//! Stage `emit`: writes the compressed model and, beside it, the recipe, the index map and the summary.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -30,23 +30,24 @@ use crate::pruning::score::scored_memory;
 use crate::scene::Scene;
 use crate::source::FrameSource;
 
-/// What the stage is called.
+/// Name of the stage.
 const NAME: &str = "emit";
 
-/// Part of the Gaussians that is usually left.
-const LEFT: f64 = 0.5;
-/// Seconds that a state takes to be encoded and written (`benches/pack.rs`).
+/// Usual fraction of the Gaussians that is written, for time estimates.
+const USUAL_LEFT: f64 = 0.5;
+/// Time to encode and write a state, seconds (`benches/pack.rs`).
 pub const ENCODING: f64 = 3.5e-7;
 
-/// Bytes of the summary and a header beside a result, at most but for long lists of files or notes.
-const BESIDE: u64 = 16 << 10;
+/// Assumed maximum bytes of the summary and a file header beside a result; long lists of files or notes may exceed it.
+const MAX_SUMMARY_BYTES: u64 = 16 << 10;
 
-/// File beside every result: all parameters it was made with.
+/// Name of the file beside every result with all parameters of its run.
 pub const RECIPE: &str = "recipe.toml";
-/// File beside every result: where each Gaussian of the input went.
+/// Name of the file beside every result with the output index of every input Gaussian.
 pub const INDEX_MAP: &str = "index_map.npy";
 
-/// Path of a file beside the result: inside a folder, next to a file and named after it.
+/// Returns the path of a file beside the result: inside the result if that is a folder, otherwise next to the result
+/// file and named after it.
 pub fn beside(result: &Path, is_folder: bool, name: &str) -> PathBuf {
     if is_folder {
         return result.join(name);
@@ -57,19 +58,19 @@ pub fn beside(result: &Path, is_folder: bool, name: &str) -> PathBuf {
     result.with_file_name(file)
 }
 
-/// Paths of what goes with a result of `kind` named `output`.
+/// Returns the paths of the files beside a result of `kind` at `output`.
 pub fn beside_names(output: &Path, kind: OutputKind) -> impl Iterator<Item = String> {
     [RECIPE, INDEX_MAP, MARKER]
         .into_iter()
         .map(move |name| beside(output, kind.is_folder(), name).to_string_lossy().into_owned())
 }
 
-/// The writing of a run.
+/// Stage that writes the result.
 #[derive(Debug, Clone)]
 pub struct Emit {
-    /// What is written.
+    /// Kind of output.
     pub kind: OutputKind,
-    /// Whether there may be proxies.
+    /// Whether the result may have proxies.
     pub merges: bool,
     output: PathBuf,
     overwrite: Replace,
@@ -129,7 +130,7 @@ impl Stage for Emit {
         };
         let archived = run.archived.as_ref();
         let mut summary = self.write(run.scene, &run.result, (&map, archived), &run.recipe, journal, summarize)?;
-        // The file has names alone, for it is published; whoever asked for the run sees the paths as they were given.
+        // The file may be published, so it has only file names. The caller gets the paths as given by the user.
         summary.input.path = run.scene.path.to_string_lossy().into_owned();
         summary.output = self.output.to_string_lossy().into_owned();
         run.written = Some((summary, map));
@@ -137,7 +138,7 @@ impl Stage for Emit {
     }
 }
 
-/// Has places follow those of an archive, whose Gaussian `i` was at `order[i]`.
+/// Replaces the indices in `map` by those in an archive, whose Gaussian `i` had the index `order[i]`.
 fn reorder(map: &mut [Option<u32>], order: &[u32]) {
     let mut places = vec![0; order.len()];
     order.iter().zip(0..).for_each(|(&before, now)| places[before as usize] = now);
@@ -145,16 +146,16 @@ fn reorder(map: &mut [Option<u32>], order: &[u32]) {
 }
 
 impl Emit {
-    /// Returns the writing that a run needs.
+    /// Returns the stage for the output of a run.
     pub(in crate::pipeline) fn from_planning(planning: &Planning<'_>) -> Emit {
         let Planning { request, output, merges, .. } = *planning;
         Emit { kind: output, merges, output: request.output.clone(), overwrite: request.overwrite }
     }
 
-    /// Confirms, before any work, that the result and what goes beside it can be written by a run that reads `inputs`.
+    /// Checks, before any work, that a run which reads `inputs` can write the result and the files beside it.
     ///
     /// # Errors
-    /// Outputs that are there already, or cannot be; see [`check_target`].
+    /// Fails if an output exists already or cannot be created; see [`check_target`].
     pub fn check_target(&self, inputs: &[&Path]) -> Result<()> {
         if self.kind.is_folder() {
             return check_target(&self.output, Kind::Folder, inputs, self.overwrite);
@@ -162,12 +163,12 @@ impl Emit {
         check_targets(&self.output, &self.companions(), inputs, self.overwrite)
     }
 
-    /// Paths of the files beside a result that is a file.
+    /// Returns the paths of the files beside a result that is a file.
     fn companions(&self) -> [PathBuf; 3] {
         [MARKER, RECIPE, INDEX_MAP].map(|name| beside(&self.output, false, name))
     }
 
-    /// Folder in which the recipe of the result will lie.
+    /// Returns the folder in which the recipe of the result will be.
     pub fn recipe_folder(&self) -> PathBuf {
         if self.kind.is_folder() {
             return self.output.clone();
@@ -175,17 +176,17 @@ impl Emit {
         self.output.parent().map(Path::to_owned).unwrap_or_default()
     }
 
-    /// What is left, a part `left` of the Gaussians, and buffers of what is written.
+    /// Returns the estimate: the result with the fraction `left` of the Gaussians, and write buffers.
     pub fn need(&self, work: &Workload, limits: &Limits, left: f64) -> ResourceEstimate {
         let whole = work.state(Columns::all());
         let is_solved = work.input.reduced > 0;
         let mut per_gaussian =
             [scored_memory(limits), vec![("kept", 40), ("result", of_left(left, work.input.reduced))]].concat();
-        let within = if self.kind == OutputKind::Archive { bounds::storing(work) } else { Vec::new() };
+        let within = if self.kind == OutputKind::Archive { bounds::storing_memory(work) } else { Vec::new() };
         let mut fixed = if within.is_empty() { work.writing() } else { within };
         match self.kind {
             OutputKind::Gseq if self.merges && !is_solved => {
-                // Of each that is merged and of each that comes of it the frames of a block, and a state.
+                // Frames of one block, and one state, of each member and of each proxy.
                 let mixed = Columns::all().difference(Columns::SH) | work.varying;
                 let waiting = work.held(&Limits::NONE, Columns::all()) + FRAME_BLOCK as u64 * work.state(mixed);
                 let together = (limits.gaussians_together as u64).min(work.gaussians);
@@ -193,9 +194,10 @@ impl Emit {
                 fixed.push(("merged", together * (waiting + 2 * whole + work.input.reader + 24)));
             }
             OutputKind::Gseq => (),
-            // A file to be like, its rows and the proxies among them for each thread, or one state and what it is made of.
+            // Template file and output rows, including proxies, for each thread; or one state and the data it is
+            // computed from.
             _ => {
-                // Merged trajectories are read of all that merge.
+                // The trajectories of proxies are computed from all members.
                 let merging = if is_solved { left } else { 1.0 };
                 per_gaussian.push(("readers", of_left(merging, work.input.reader)));
                 per_gaussian.push(("held", of_left(merging, work.held(limits, Columns::all()))));
@@ -205,10 +207,11 @@ impl Emit {
             }
         }
         if self.kind == OutputKind::Model {
-            // A field's tensors as they are read and as they are stored.
+            // Tensors of the field as they are read and as they are stored.
             fixed.push(("field", work.input.fixed));
         }
-        // Of a family that is solved only sequences take states; of others, merged ones are read part by part.
+        // Formats whose proxies are solved read states only to write sequences. For others, proxies are read part by
+        // part.
         let parts = match self.kind {
             OutputKind::Gseq if self.merges => work.gaussians.div_ceil(limits.gaussians_together as u64).max(1),
             _ => 1,
@@ -218,51 +221,52 @@ impl Emit {
             false => parts as f64 * work.scattered_reads(work.frames, limits),
         };
         let frames = if is_solved && !self.kind.holds_frames() { 0.0 } else { work.frames as f64 };
-        let left = LEFT * work.count();
+        let left = USUAL_LEFT * work.count();
         let seconds = work.reading(left, frames) + left * frames * ENCODING;
         ResourceEstimate { stage: NAME, reads, seconds, per_gaussian, fixed }
     }
 
-    /// Bytes of everything that is written of `reduction` with a recipe of so many; made in a scratch folder, and removed.
+    /// Returns the bytes of all files for `compressed` with a recipe of `recipe` bytes. Writes the result to a scratch
+    /// folder and removes it again.
     ///
     /// # Errors
-    /// Frames that cannot be read, a failed write.
-    pub fn bytes(&self, scene: &Scene, reduction: &CompressedModel, recipe: u64) -> Result<u64> {
+    /// Fails if frames cannot be read or a write fails.
+    pub fn bytes(&self, scene: &Scene, compressed: &CompressedModel, recipe: u64) -> Result<u64> {
         let folder = ScratchFolder::new(&scene.scratch)?;
         let path = folder.path().join("result");
-        let written = write_alone(&*scene.input, reduction, self.kind, &path, &scene.limits, &scene.events)?;
-        let beside = BESIDE + recipe + size_of::<i64>() as u64 * scene.source().info().count as u64;
+        let written = write_alone(&*scene.input, compressed, self.kind, &path, &scene.limits, &scene.events)?;
+        let beside = MAX_SUMMARY_BYTES + recipe + size_of::<i64>() as u64 * scene.source().info().count as u64;
         Ok(written + beside)
     }
 
-    /// Writes the result and the files beside it. They get their names at the end: a folder in one step, a file after the
-    /// files beside it. `summarize` is told the size of the result.
+    /// Writes the result and the files beside it under temporary names and renames them at the end: a folder in one
+    /// step, a file after the files beside it. `summarize` receives the size of the result.
     ///
     /// # Errors
-    /// Frames that cannot be read, a failed write; nothing is left behind then.
+    /// Fails if frames cannot be read or a write fails; no output is left behind then.
     fn write(
         &self,
         scene: &Scene,
-        reduction: &CompressedModel,
+        compressed: &CompressedModel,
         (map, archive): (&[Option<u32>], Option<&Archived>),
         recipe: &str,
         mut journal: Journal,
         summarize: impl FnOnce(Journal, Size) -> Summary,
     ) -> Result<Summary> {
         let mut write = |path: &Path| -> Result<Size> {
-            journal.stage(NAME, reduction.len(), scene.source(), |journal| {
+            journal.stage(NAME, compressed.len(), scene.source(), |journal| {
                 let size = match archive {
                     Some(Archived::Content(encoded)) => {
                         fs::write(path, &encoded.bytes).map_err(Error::io("write", path))?;
                         encoded.parts.into()
                     }
                     Some(Archived::Frames(bounds)) => {
-                        write_within(&*scene.input.reduced(reduction)?, *bounds, path, &scene.events)?;
+                        write_within(&*scene.input.reduced(compressed)?, *bounds, path, &scene.events)?;
                         Size::of_frames(fs::metadata(path).map_err(Error::io("read", path))?.len())
                     }
                     None => {
                         journal.notes.extend(scene.input.write(
-                            reduction,
+                            compressed,
                             self.kind,
                             path,
                             &scene.limits,
@@ -272,7 +276,7 @@ impl Emit {
                     }
                 };
                 journal.notes.extend(size.why_larger_than(&scene.input.size()?));
-                Ok((size, reduction.len()))
+                Ok((size, compressed.len()))
             })
         };
         let target = self.output.as_path();
@@ -298,13 +302,13 @@ impl Emit {
     }
 }
 
-/// Writes `reduction` as a result of `kind`, without anything beside it; gives its bytes.
+/// Writes `compressed` as a result of `kind`, without files beside it. Returns its bytes.
 ///
 /// # Errors
-/// Frames that cannot be read, a failed write.
+/// Fails if frames cannot be read or a write fails.
 pub fn write_alone(
     input: &dyn InputModel,
-    reduction: &CompressedModel,
+    compressed: &CompressedModel,
     kind: OutputKind,
     path: &Path,
     limits: &Limits,
@@ -313,7 +317,7 @@ pub fn write_alone(
     if kind.is_folder() {
         fs::create_dir(path).map_err(Error::io("create", path))?;
     }
-    input.write(reduction, kind, path, limits, events)?;
+    input.write(compressed, kind, path, limits, events)?;
     Ok(input.size_written(kind, path)?.whole())
 }
 
@@ -333,7 +337,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn files_beside_results_of_other_kinds_do_not_collide() {
+    fn companion_paths_do_not_collide_between_output_kinds() {
         assert_eq!(beside(Path::new("a/small"), true, "summary.json"), Path::new("a/small/summary.json"));
         assert_eq!(beside(Path::new("a/small.ply"), false, "summary.json"), Path::new("a/small.ply.summary.json"));
         assert_eq!(beside(Path::new("small.gseq"), false, "summary.json"), Path::new("small.gseq.summary.json"));

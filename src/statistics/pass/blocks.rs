@@ -1,4 +1,4 @@
-//! The blocks of Gaussians of one scan: what they share, and how one of them is gone through.
+//! Blocks of Gaussians of one scan: the data that they share, and the scan of a single block.
 
 use std::ops::Range;
 use std::sync::{Mutex, PoisonError};
@@ -10,16 +10,17 @@ use crate::progress::Progress;
 use crate::source::{BlockReader, FrameSource, Ids};
 use crate::statistics::{BlockScan, ScanPlan, wanted};
 
-/// What the scans of all blocks share.
+/// Data that the scans of all blocks share.
 pub(crate) struct BlockScans<'a> {
     pub(crate) source: &'a dyn FrameSource,
-    /// Cameras, frame by frame.
+    /// Cameras of each frame.
     pub(crate) schedule: &'a Schedule,
     pub(crate) plan: &'a ScanPlan,
-    /// Those that are gone through.
+    /// Blocks to scan.
     pub(crate) blocks: Range<usize>,
     pub(crate) progress: Progress,
-    /// Living Gaussians in each frame. Sums of integers: the order in which blocks finish does not show.
+    /// Number of Gaussians alive in each frame. The order in which blocks finish does not matter, as the sums are
+    /// integers.
     pub(crate) alive: Mutex<Vec<u32>>,
 }
 
@@ -32,17 +33,18 @@ impl<'a> BlockScans<'a> {
         self.source.info().times.len()
     }
 
-    /// The Gaussians of a block, counted among those that are gone through.
+    /// Returns the Gaussians of block number `block`, counted from the first block to scan.
     pub(crate) fn range(&self, block: usize) -> Range<usize> {
         let block = self.blocks.start + block;
         block * BLOCK..self.source.info().count.min((block + 1) * BLOCK)
     }
 
-    /// What may have changed since the frame before.
+    /// Returns the columns that may have changed since the previous frame.
     pub(crate) fn changed(&self, frame: usize) -> Columns {
         wanted(frame, self.source.info().varying)
     }
 
+    /// Returns an empty scan of a block, with a buffer for its state at one frame.
     pub(crate) fn begin(&self, block: usize) -> (BlockScan<'a>, Gaussians) {
         let range = self.range(block);
         let state = Gaussians::zeros(range.len(), self.source.info().sh_degree);
@@ -50,6 +52,9 @@ impl<'a> BlockScans<'a> {
     }
 
     /// Adds the next frames of a block.
+    ///
+    /// # Errors
+    /// Frames that cannot be read.
     pub(crate) fn add(
         &self,
         (scan, state): &mut (BlockScan<'a>, Gaussians),
@@ -69,7 +74,7 @@ impl<'a> BlockScans<'a> {
         Ok(())
     }
 
-    /// The rows of a block of which all frames have been added, and its largest coordinate.
+    /// Returns the rows of a block whose frames have all been added, and its largest coordinate.
     pub(crate) fn finish(&self, (scan, _): (BlockScan<'a>, Gaussians)) -> (Rows, f32) {
         let found = scan.finish();
         let mut alive = self.alive.lock().unwrap_or_else(PoisonError::into_inner);
@@ -79,7 +84,10 @@ impl<'a> BlockScans<'a> {
         (found.rows, found.largest_coordinate)
     }
 
-    /// A block from first to last.
+    /// Scans all frames of one block and returns its rows and its largest coordinate.
+    ///
+    /// # Errors
+    /// Frames that cannot be read.
     pub(crate) fn block(&self, block: usize) -> Result<(Rows, f32)> {
         let mut scan = self.begin(block);
         let mut reader = self.source.open(Ids::Range(self.range(block)))?;

@@ -1,14 +1,15 @@
-//! The scan of a source on a slow disk, in stages: one thread fetches bytes, some decode tiles, as many accumulate
-//! frames. The disk, the decoder and the arithmetic overlap.
+//! Scan of a source on a slow disk as a pipeline: one thread fetches bytes, some decode tiles, and as many accumulate
+//! frames. Disk, decoder and arithmetic overlap.
 //!
-//! The unit of work is a block of Gaussians over a frame block. Every thread of the pool that is not there for this
-//! stands for a lane, a decoder and an accumulator with a bounded channel between; a block of Gaussians stays in its
-//! lane, so that its frames arrive in order and no result depends on the number of threads. As many blocks as there are
-//! lanes take their turns frame block by frame block: their tiles lie side by side in a container. The threads are the
-//! stages' own, for they wait for one another, which tasks of a pool must not.
+//! The unit of work is a block of Gaussians over a frame block. The number of lanes is the number of threads of the
+//! pool (at most one per block). A lane is a decoder and an accumulator with a bounded channel between them. A block of
+//! Gaussians stays in its lane, so its frames arrive in order and no result depends on the number of threads. As many
+//! blocks as there are lanes advance together, frame block by frame block, because their tiles are adjacent in a
+//! container. The stages run on threads of their own because they wait for one another, which tasks of a thread pool
+//! must not do.
 //!
-//! Memory: per lane two readers with what they keep of a frame block, the one that decodes and the one that is read.
-//! What is fetched stays with the system.
+//! Memory: two readers per lane, each with the frames it keeps of a frame block: one that decodes and one that is read.
+//! Fetched bytes stay in the file cache of the system.
 
 use std::ops::Range;
 use std::sync::{Mutex, PoisonError};
@@ -21,26 +22,29 @@ use crate::error::{Error, Result};
 use crate::model::Rows;
 use crate::source::{BlockReader, Ids, Prefetch};
 
-/// Units that have been fetched and wait for a lane's decoder, at most.
+/// Maximum number of fetched units that wait for the decoder of a lane.
 const FETCHED: usize = 4;
 
-/// A block of Gaussians over a frame block.
+/// Unit of work: a block of Gaussians over a frame block.
 struct Unit {
     block: usize,
     frames: Range<usize>,
 }
 
-/// A reader for the Gaussians of a block.
-type OfBlock<'a> = (usize, Box<dyn BlockReader + 'a>);
+/// Number of a block, and a reader for its Gaussians.
+type BlockReaderOf<'a> = (usize, Box<dyn BlockReader + 'a>);
 
-/// What came of the blocks.
+/// Results of the blocks.
 struct StagedResult {
     blocks: Vec<Option<(Rows, f32)>>,
-    /// The error of the first block that has one.
+    /// Error of the lowest-numbered block that failed, with that number.
     error: Option<(usize, Error)>,
 }
 
-/// The rows of all blocks of `scan` and their largest coordinates, in order.
+/// Scans all blocks of `scan` and returns their rows and largest coordinates, in order.
+///
+/// # Errors
+/// Frames that cannot be read: the error of the lowest-numbered block that failed.
 pub(crate) fn scan_in_stages(scan: &BlockScans<'_>, ahead: &dyn Prefetch) -> Result<Vec<(Rows, f32)>> {
     let blocks = scan.blocks();
     let lanes = rayon::current_num_threads().min(blocks);
@@ -49,7 +53,8 @@ pub(crate) fn scan_in_stages(scan: &BlockScans<'_>, ahead: &dyn Prefetch) -> Res
         let mut to_lanes = Vec::with_capacity(lanes);
         for _ in 0..lanes {
             let (to_lane, fetched) = bounded(FETCHED);
-            // Whoever decodes waits until the other takes what it has: two readers, no more.
+            // A channel without capacity: the decoder waits until the accumulator takes the reader, so there are at
+            // most two readers.
             let (decoded, ready) = bounded(0);
             let (done, free) = bounded(2);
             let found = &found;
@@ -66,7 +71,7 @@ pub(crate) fn scan_in_stages(scan: &BlockScans<'_>, ahead: &dyn Prefetch) -> Res
     }
 }
 
-/// Brings the bytes of every unit and sends it to its lane, until a lane is gone.
+/// Fetches the bytes of every unit and sends the unit to its lane; stops when a lane has ended.
 fn fetch(scan: &BlockScans<'_>, ahead: &dyn Prefetch, to_lanes: Vec<Sender<Unit>>) {
     let frame_block = ahead.frame_block().max(1);
     for first in (0..scan.blocks()).step_by(to_lanes.len().max(1)) {
@@ -82,12 +87,12 @@ fn fetch(scan: &BlockScans<'_>, ahead: &dyn Prefetch, to_lanes: Vec<Sender<Unit>
     }
 }
 
-/// Decodes unit after unit, with readers that have been read where they are of the same block.
+/// Decodes the units of a lane. Reuses a reader that the accumulator returned if it is of the same block.
 fn decode<'a>(
     scan: &BlockScans<'a>,
     fetched: &Receiver<Unit>,
-    free: &Receiver<OfBlock<'a>>,
-    decoded: &Sender<(Unit, Result<OfBlock<'a>>)>,
+    free: &Receiver<BlockReaderOf<'a>>,
+    decoded: &Sender<(Unit, Result<BlockReaderOf<'a>>)>,
 ) {
     for unit in fetched {
         let reader = free.try_iter().find(|&(block, _)| block == unit.block);
@@ -103,11 +108,11 @@ fn decode<'a>(
     }
 }
 
-/// Accumulates the frames of unit after unit, and gives the readers back.
+/// Accumulates the frames of the units of a lane, and returns the readers to the decoder.
 fn accumulate<'a>(
     scan: &BlockScans<'a>,
-    ready: &Receiver<(Unit, Result<OfBlock<'a>>)>,
-    done: &Sender<OfBlock<'a>>,
+    ready: &Receiver<(Unit, Result<BlockReaderOf<'a>>)>,
+    done: &Sender<BlockReaderOf<'a>>,
     found: &Mutex<StagedResult>,
 ) {
     let mut running = None;
@@ -115,7 +120,8 @@ fn accumulate<'a>(
         let added = prepared.and_then(|(block, mut reader)| {
             let running = running.get_or_insert_with(|| scan.begin(block));
             scan.add(running, unit.frames.clone(), &mut *reader)?;
-            // There is room: no more than two readers are about. If nobody takes it, it is not needed.
+            // The channel has room, as there are at most two readers. If the decoder has ended, the reader is not
+            // needed.
             _ = done.send((block, reader));
             Ok(())
         });
@@ -127,7 +133,7 @@ fn accumulate<'a>(
             return;
         }
         if unit.frames.end == scan.frames() {
-            found.blocks[unit.block] = running.take().map(|of_block| scan.finish(of_block));
+            found.blocks[unit.block] = running.take().map(|state| scan.finish(state));
         }
     }
 }
@@ -144,20 +150,21 @@ mod tests {
     use crate::statistics::pass::Scanned;
     use crate::statistics::pass::scan;
 
-    /// Gaussians, frames and columns.
+    /// Gaussians, frames and columns of one call of `fetch`.
     type Fetched = (Range<usize>, Range<usize>, Columns);
 
-    /// A scene that wants to be fetched, by `frame_block` frames, and whose frames from one on cannot be read.
-    struct Slow {
+    /// Scene that asks to be fetched in blocks of `frame_block` frames, and whose frames from `fails_from` on cannot be
+    /// read.
+    struct SlowScene {
         scene: Scene,
         frame_block: Option<usize>,
         fails_from: usize,
         fetched: Mutex<Vec<Fetched>>,
     }
 
-    impl Slow {
-        fn new(frame_block: Option<usize>, fails_from: usize) -> Slow {
-            Slow { scene: Scene::new(4 * BLOCK + 77, 7), frame_block, fails_from, fetched: Mutex::default() }
+    impl SlowScene {
+        fn new(frame_block: Option<usize>, fails_from: usize) -> SlowScene {
+            SlowScene { scene: Scene::new(4 * BLOCK + 77, 7), frame_block, fails_from, fetched: Mutex::default() }
         }
 
         fn scan(&self, threads: usize) -> Result<Scanned> {
@@ -169,7 +176,7 @@ mod tests {
         }
     }
 
-    impl FrameSource for Slow {
+    impl FrameSource for SlowScene {
         fn info(&self) -> &SequenceInfo {
             self.scene.info()
         }
@@ -183,7 +190,7 @@ mod tests {
         }
     }
 
-    impl Prefetch for Slow {
+    impl Prefetch for SlowScene {
         fn frame_block(&self) -> usize {
             self.frame_block.unwrap_or_default()
         }
@@ -208,27 +215,27 @@ mod tests {
     }
 
     #[test]
-    fn stages_find_what_blocks_side_by_side_find_whatever_the_threads_and_frame_blocks() {
-        let expected = Slow::new(None, usize::MAX).scan(2).unwrap();
+    fn staged_scan_equals_the_parallel_scan() {
+        let expected = SlowScene::new(None, usize::MAX).scan(2).unwrap();
         for (threads, frame_block) in [(1, 3), (2, 7), (3, 1), (9, 100)] {
-            let slow = Slow::new(Some(frame_block), usize::MAX);
-            let found = slow.scan(threads).unwrap();
+            let scene = SlowScene::new(Some(frame_block), usize::MAX);
+            let found = scene.scan(threads).unwrap();
             assert_eq!(found.rows, expected.rows, "{threads} threads, {frame_block} frames");
             assert_eq!(found.alive_per_frame, expected.alive_per_frame);
             assert_eq!(found.largest_coordinate, expected.largest_coordinate);
             let mut states = 0;
-            for (gaussians, frames, want) in slow.fetched.into_inner().unwrap() {
+            for (gaussians, frames, want) in scene.fetched.into_inner().unwrap() {
                 states += gaussians.len() * frames.len();
-                assert_eq!(want, if frames.start == 0 { Columns::all() } else { slow.scene.info().varying });
+                assert_eq!(want, if frames.start == 0 { Columns::all() } else { scene.scene.info().varying });
             }
-            assert_eq!(states, slow.scene.info().count * 7, "each unit is fetched once");
+            assert_eq!(states, scene.scene.info().count * 7, "each unit is fetched once");
         }
     }
 
     #[test]
-    fn a_source_that_fails_midway_ends_all_stages_with_its_error() {
+    fn a_failing_read_ends_all_stages_with_its_error() {
         for fails_from in [0, 5] {
-            let error = Slow::new(Some(2), fails_from).scan(3).unwrap_err().to_string();
+            let error = SlowScene::new(Some(2), fails_from).scan(3).unwrap_err().to_string();
             assert!(error.contains(&format!("frame {fails_from} is gone")), "{error}");
         }
     }

@@ -1,8 +1,8 @@
 //! Robust normalization and scores (method.md, sections 2 and 3).
 //!
-//! In: rows of statistics. Out: S, its static and dynamic parts, and these normalized. Memory: six
-//! f64 per Gaussian at most, and one sketch at a time. Source: "Temporally-Aware Pruning for Compact
-//! 4D Gaussian Splatting Models", section 3.2.
+//! Input: rows of statistics. Output: the score S, its static and dynamic parts, and both parts normalized. Memory: six
+//! f64 per Gaussian at most, and one sketch at a time. Source: "Temporally-Aware Pruning for Compact 4D Gaussian
+//! Splatting Models", section 3.2.
 
 mod norm;
 pub mod sketch;
@@ -18,7 +18,7 @@ use crate::recipe::{self, StaticTerm};
 /// Scores of N Gaussians; every array has N entries, all finite.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Scores {
-    /// S_static = norm(C) + λ·norm(E), with W or √(C·W) for C as the recipe says.
+    /// S_static = norm(C) + λ·norm(E). The recipe may replace C by W or √(C·W).
     pub static_score: Vec<f64>,
     /// S_dynamic = norm(D) + μ·norm(κ) + η·norm(V) + ξ·norm(Life).
     pub dynamic_score: Vec<f64>,
@@ -28,29 +28,29 @@ pub struct Scores {
     pub static_norm: Vec<f64>,
     /// norm(S_dynamic), for stage 2.
     pub dynamic_norm: Vec<f64>,
-    /// What every term was normalized by, those of S_static, then those of S_dynamic, then these two; terms of weight 0
-    /// were not computed and are missing.
+    /// Normalization of every term: first the terms of S_static, then those of S_dynamic, then S_static and S_dynamic
+    /// themselves. Terms of weight 0 are not computed and are missing.
     pub terms: Vec<Term>,
 }
 
 impl Scores {
-    /// Memory of a Gaussian's scores.
+    /// Bytes of the scores of one Gaussian.
     pub const BYTES_PER_GAUSSIAN: usize = 5 * size_of::<f64>();
 }
 
-/// How a term was normalized.
+/// Term of a score, with its normalization.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Term {
-    /// What is normalized.
+    /// Quantity that is normalized.
     pub of: Graded,
-    /// Its percentiles.
+    /// Normalization of the quantity.
     pub norm: Norm,
 }
 
-/// What grades Gaussians: a statistic, or what is made of several.
+/// Quantity that grades Gaussians: a statistic, or a combination of several.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Graded {
-    /// One statistic.
+    /// A single statistic.
     By(Statistic),
     /// √(C·W).
     Geometric,
@@ -71,7 +71,7 @@ impl From<StaticTerm> for Graded {
 }
 
 impl Graded {
-    /// As summaries and reports call it.
+    /// Returns the name used in summaries and reports.
     pub fn name(self) -> &'static str {
         match self {
             Graded::By(statistic) => statistic.name(),
@@ -81,7 +81,7 @@ impl Graded {
         }
     }
 
-    /// The property that it grades by.
+    /// Returns the property of a Gaussian that the quantity measures, in words.
     pub fn property(self) -> &'static str {
         match self {
             Graded::By(statistic) => statistic.property(),
@@ -92,23 +92,23 @@ impl Graded {
     }
 }
 
-/// Scores of `rows` from a sequence of `frames` frames.
+/// Computes the scores of `rows`, which come from a sequence of `frames` frames.
 ///
-/// Rows with [`Flags::NON_FINITE`] count in no percentile and score 0 throughout. `rows.e` is used
-/// only when λ > 0. No rows give empty scores.
+/// Rows with [`Flags::NON_FINITE`] are excluded from the percentiles and have score 0 throughout. `rows.e` is used only
+/// if λ > 0. An empty list of rows gives empty scores.
 pub fn score(rows: &Rows, frames: usize, recipe: &recipe::ScoreParams) -> Scores {
     score_by(PercentilePasses::Two, rows, frames, recipe)
 }
 
-/// [`score`] with percentiles found by `looks`.
-pub fn score_by(looks: PercentilePasses, rows: &Rows, frames: usize, recipe: &recipe::ScoreParams) -> Scores {
+/// Computes the scores as [`score`] does, with percentiles found in the given number of passes.
+pub fn score_by(passes: PercentilePasses, rows: &Rows, frames: usize, recipe: &recipe::ScoreParams) -> Scores {
     use Graded::By;
     use Statistic::{C, D, E, Kappa, Life, V, W};
-    let counts: Vec<bool> = rows.flags.iter().map(|flags| !flags.contains(Flags::NON_FINITE)).collect();
+    let is_finite: Vec<bool> = rows.flags.iter().map(|flags| !flags.contains(Flags::NON_FINITE)).collect();
     let life = |i: usize| f64::from(rows.life[i]) / frames.max(1) as f64;
     let motion_weight = |i: usize| if recipe.weigh_motion_by_life { life(i) } else { 1.0 };
 
-    let mut sum = Summation { counts: &counts, recipe, looks, terms: Vec::new() };
+    let mut sum = Summation { is_finite: &is_finite, recipe, passes, terms: Vec::new() };
     let mut static_score = vec![0.0; rows.len()];
     match recipe.static_term {
         StaticTerm::Peak if !rows.w.is_empty() => sum.add(&mut static_score, By(W), 1.0, |i| rows.w[i]),
@@ -134,24 +134,25 @@ pub fn score_by(looks: PercentilePasses, rows: &Rows, frames: usize, recipe: &re
     Scores { static_score, dynamic_score, score, static_norm, dynamic_norm, terms }
 }
 
-/// Adds up normalized terms.
+/// Sum of normalized terms in the making.
 struct Summation<'a> {
-    counts: &'a [bool],
+    is_finite: &'a [bool],
     recipe: &'a recipe::ScoreParams,
-    looks: PercentilePasses,
+    passes: PercentilePasses,
     terms: Vec<Term>,
 }
 
 impl Summation<'_> {
-    /// total += weight · norm(value), over the rows that count; nothing when the weight is 0.
+    /// Adds weight · norm(value) to `total` in all rows that are finite, and records the term. Does nothing if the
+    /// weight is 0.
     fn add(&mut self, total: &mut [f64], of: Graded, weight: f64, value: impl Fn(usize) -> f64) {
         if weight == 0.0 {
             return;
         }
-        let counted = || (0..total.len()).filter(|&i| self.counts[i]);
-        let norm = Norm::from_values(|| counted().map(&value), self.recipe, self.looks);
+        let counted = || (0..total.len()).filter(|&i| self.is_finite[i]);
+        let norm = Norm::from_values(|| counted().map(&value), self.recipe, self.passes);
         for (i, total) in total.iter_mut().enumerate() {
-            if self.counts[i] {
+            if self.is_finite[i] {
                 *total += weight * norm.apply(value(i));
             }
         }
@@ -196,7 +197,7 @@ mod tests {
             ..preset("paper")
         };
         let scores = score(&rows, 2000, &recipe);
-        // Every statistic is a ramp 0..999: nearest rank puts P1 at 9 and P99 at 989 steps.
+        // Every statistic is a ramp of 0 to 999 steps: by nearest rank, P1 is step 9 and P99 is step 989.
         let norm = |i: usize, scale: f64| (i as f64 - 9.0) * scale / (980.0 * scale + 1e-8);
         for i in [0, 9, 500, 989, 999] {
             let static_score = norm(i, 3.0) + 0.3 * norm(i, 2.0);
@@ -219,7 +220,7 @@ mod tests {
     }
 
     #[test]
-    fn flagged_rows_leave_percentiles_untouched() {
+    fn flagged_rows_do_not_change_percentiles() {
         let clean = rows(500);
         let mut odd = rows(500);
         let zeros = Rows {
@@ -243,7 +244,7 @@ mod tests {
     }
 
     #[test]
-    fn static_scene_has_no_dynamic_score_and_says_so() {
+    fn static_scene_has_inactive_dynamic_terms() {
         let mut rows = rows(300);
         for values in [&mut rows.d, &mut rows.kappa, &mut rows.v] {
             values.fill(0.0);
@@ -257,7 +258,7 @@ mod tests {
     }
 
     #[test]
-    fn movers_around_one_percent_all_reach_the_top() {
+    fn about_one_percent_of_movers_all_get_the_top_score() {
         for movers in [9, 10, 11] {
             let mut rows = rows(1000);
             rows.d = (0..1000).map(|i| if i < movers { 5.0 } else { 0.0 }).collect();
@@ -270,7 +271,7 @@ mod tests {
     }
 
     #[test]
-    fn no_rows_and_one_row_are_scored() {
+    fn zero_rows_and_one_row_are_scored() {
         let none = score(&Rows::default(), 0, &preset("default"));
         assert!(none.score.is_empty());
         let one = score(&rows(1), 1, &preset("paper"));
@@ -278,7 +279,7 @@ mod tests {
     }
 
     #[test]
-    fn motion_can_be_weighed_by_life() {
+    fn motion_can_be_weighted_by_the_life_span() {
         let mut rows = rows(200);
         rows.life = vec![50; 200];
         let plain = score(&rows, 100, &preset("paper"));

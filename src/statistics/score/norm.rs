@@ -5,44 +5,44 @@ use serde::{Deserialize, Serialize};
 use super::FloatSketch;
 use crate::recipe;
 
-/// norm(X) = (X − P1) / (P99 − P1 + ε), clipped to [0, 1] if asked.
+/// Normalization norm(X) = (X − P1) / (P99 − P1 + ε), clipped to [0, 1] if the recipe asks for it.
 ///
-/// Where P99 ≤ P1 (at most 1% of the values stand out) there is no scale to measure by: norm is 1
-/// above P99 and 0 elsewhere, and the term is *inactive*. This holds with ε too: dividing by
-/// ε = 1e-8 would let the few that stand out outweigh every other term a million times.
+/// If P99 ≤ P1 (at most 1% of the values differ from the rest), there is no scale to normalize by. norm is then 1 above
+/// P99 and 0 elsewhere, and the term is *inactive*. This rule also applies if ε > 0: dividing by ε = 1e-8 would let the
+/// few different values outweigh every other term by a factor of a million.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Norm {
-    /// 1st percentile, nearest rank; 0 over no values.
+    /// 1st percentile, nearest rank; 0 if there are no values.
     pub p1: f64,
-    /// 99th percentile, nearest rank; 0 over no values.
+    /// 99th percentile, nearest rank; 0 if there are no values.
     pub p99: f64,
     epsilon: f64,
     clip: bool,
 }
 
-/// How often the values are looked at for a percentile.
+/// Number of passes over the values that find a percentile.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum PercentilePasses {
-    /// Twice: exact.
+    /// Two passes: exact.
     Two,
-    /// Once, by so many mantissa bits: the middle of the bucket that holds it.
+    /// One pass with this number of mantissa bits: the percentile is the middle of the histogram bucket that holds it.
     One(u32),
 }
 
 impl Norm {
-    /// The normalization of a set of values; NaN and infinities are passed over.
+    /// Computes the normalization of a set of values. NaN and infinities are ignored.
     pub fn from_values<I: Iterator<Item = f64>>(
         values: impl Fn() -> I,
         recipe: &recipe::ScoreParams,
-        looks: PercentilePasses,
+        passes: PercentilePasses,
     ) -> Self {
-        let [p1, p99] = match looks {
+        let [p1, p99] = match passes {
             PercentilePasses::Two => {
                 let sketch = FloatSketch::from_values(values());
                 [1.0, 99.0].map(|p| sketch.percentile(p, values()))
             }
             PercentilePasses::One(bits) => {
-                let sketch = FloatSketch::keyed_by(bits, values());
+                let sketch = FloatSketch::with_mantissa_bits(bits, values());
                 [1.0, 99.0].map(|p| sketch.rough_percentile(p))
             }
         }
@@ -50,12 +50,12 @@ impl Norm {
         Norm { p1, p99, epsilon: recipe.norm_epsilon, clip: recipe.clip_norm }
     }
 
-    /// Whether the percentiles differ, so that the term grades rather than splits.
+    /// Returns whether the percentiles differ, so that the term grades values on a scale.
     pub fn is_active(&self) -> bool {
         self.p99 > self.p1
     }
 
-    /// norm(x).
+    /// Returns norm(x).
     pub fn apply(&self, x: f64) -> f64 {
         if !self.is_active() {
             return f64::from(u8::from(x > self.p99));
@@ -70,14 +70,14 @@ mod tests {
     use super::*;
     use crate::recipe::Recipe;
 
-    fn norm_of(preset: &str, values: &[f64]) -> Norm {
+    fn preset_norm(preset: &str, values: &[f64]) -> Norm {
         Norm::from_values(|| values.iter().copied(), &Recipe::preset(preset).unwrap().score, PercentilePasses::Two)
     }
 
     #[test]
     fn a_constant_term_is_inactive_and_zero() {
         for preset in ["paper", "default"] {
-            let norm = norm_of(preset, &[0.3; 1000]);
+            let norm = preset_norm(preset, &[0.3; 1000]);
             assert!(!norm.is_active() && norm.apply(0.3) == 0.0 && norm.apply(0.300_000_1) == 1.0, "{norm:?}");
         }
     }
@@ -85,14 +85,14 @@ mod tests {
     #[test]
     fn default_is_clipped_and_paper_is_not() {
         let ramp: Vec<f64> = (0..1000).map(f64::from).collect();
-        let (paper, default) = (norm_of("paper", &ramp), norm_of("default", &ramp));
+        let (paper, default) = (preset_norm("paper", &ramp), preset_norm("default", &ramp));
         assert!(paper.apply(2000.0) > 2.0 && paper.apply(-50.0) < 0.0);
         assert!(default.apply(2000.0) == 1.0 && default.apply(-50.0) == 0.0);
     }
 
     #[test]
-    fn no_values_give_an_inactive_norm() {
-        let norm = norm_of("default", &[]);
+    fn an_empty_set_gives_an_inactive_norm() {
+        let norm = preset_norm("default", &[]);
         assert!(!norm.is_active() && norm.apply(0.0) == 0.0);
     }
 }

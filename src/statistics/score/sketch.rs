@@ -1,36 +1,37 @@
-//! Percentiles, exact: a histogram of order-preserving float bits finds the bucket that holds one, and a second look at
-//! the values that fall into it finds the value.
+//! Exact percentiles in two passes: a histogram of order-preserving float bits finds the bucket that holds the
+//! percentile, and a second pass over the values in that bucket finds the value.
 //!
-//! A value is rounded to f32 and keyed by its sign, exponent and upper mantissa bits, so that keys order as values do. With
-//! 7 of these, values in one bucket are within 0.8% of each other, and counts take 256 KiB; the second look takes a copy of
-//! the values in one bucket. Counts are integers: any order, same answer.
-//! Rank-error sketches (KLL, t-digest) are random or depend on order, and at P99 of a heavy tail were
-//! off by 3–47% in value.
+//! A value is rounded to f32 and keyed by its sign, exponent and upper mantissa bits, so that keys order as values do.
+//! With 7 mantissa bits, values in one bucket are within 0.8% of each other, and the counts take 256 KiB. The second
+//! pass copies the values of one bucket. Counts are integers, so the result does not depend on the order of the values.
+//! Rank-error sketches (KLL, t-digest) are random or depend on the order, and were off by 3–47% in value at P99 of a
+//! heavy tail.
 
-/// Mantissa bits of a key, unless asked otherwise.
+/// Default number of mantissa bits of a key.
 const MANTISSA_BITS: u32 = 7;
-/// Most mantissa bits of a key: counts then take 16 MiB.
+/// Maximum number of mantissa bits of a key; the counts then take 16 MiB.
 pub const MOST_BITS: u32 = 13;
-/// Mantissa bits of an f32.
+/// Number of mantissa bits of an f32.
 const ALL_BITS: u32 = 23;
 
-/// Histogram of the finite ones of up to 2³² − 1 values.
+/// Histogram of the finite values among up to 2³² − 1 values.
 pub struct FloatSketch {
-    /// f32 mantissa bits below a key.
+    /// Number of low f32 mantissa bits that a key omits.
     dropped: u32,
     counts: Vec<u32>,
     finite: u64,
 }
 
 impl FloatSketch {
-    /// The sketch of all of `values`; NaN and infinities are passed over. −0 counts as 0, and a finite value beyond f32
-    /// as the largest f32.
+    /// Counts `values` with the default number of mantissa bits. NaN and infinities are ignored. −0 counts as 0, and a
+    /// finite value beyond the range of f32 as the largest f32 of its sign.
     pub fn from_values(values: impl IntoIterator<Item = f64>) -> Self {
-        Self::keyed_by(MANTISSA_BITS, values)
+        Self::with_mantissa_bits(MANTISSA_BITS, values)
     }
 
-    /// The same with keys of `bits` mantissa bits, of which more than [`MOST_BITS`] count as these: 2⁹ times 2 to that of counts of 4 bytes.
-    pub fn keyed_by(bits: u32, values: impl IntoIterator<Item = f64>) -> Self {
+    /// Counts `values` with keys of `bits` mantissa bits, at most [`MOST_BITS`]. There are 2^(9 + bits) counts of 4
+    /// bytes.
+    pub fn with_mantissa_bits(bits: u32, values: impl IntoIterator<Item = f64>) -> Self {
         let dropped = ALL_BITS - bits.min(MOST_BITS);
         let mut sketch = FloatSketch { dropped, counts: vec![0; 1 << (32 - dropped)], finite: 0 };
         for value in values.into_iter().filter(|value| value.is_finite()) {
@@ -40,26 +41,28 @@ impl FloatSketch {
         sketch
     }
 
-    /// The middle of the bucket that holds the `p`-th percentile: what one look tells.
+    /// Returns the middle of the bucket that holds the `p`-th percentile, without a second pass; `None` if there are no
+    /// finite values.
     pub fn rough_percentile(&self, p: f64) -> Option<f64> {
         let (bucket, _) = self.locate(p)?;
         let [low, high] = [bucket << self.dropped, (bucket << self.dropped) | ((1 << self.dropped) - 1)].map(value_of);
         Some(0.5 * (low + high))
     }
 
-    /// The `p`-th percentile (0 to 100) by nearest rank, ⌈p·n/100⌉ but at least 1, over the n finite
-    /// values; none when n = 0. `values` are those of the sketch again; those in one bucket are copied: at worst, all.
+    /// Returns the `p`-th percentile (0 to 100) by nearest rank, ⌈p·n/100⌉ but at least 1, over the n finite values;
+    /// `None` if n = 0. `values` are the values of the sketch again. The values in one bucket are copied; these may be
+    /// all values.
     pub fn percentile(&self, p: f64, values: impl IntoIterator<Item = f64>) -> Option<f64> {
         let (bucket, rank) = self.locate(p)?;
         let mut inside: Vec<f64> =
             values.into_iter().filter(|x| x.is_finite() && key(*x, self.dropped) == bucket).map(|x| x + 0.0).collect();
-        // A rank beyond the bucket means that other values were counted than are given now.
+        // A rank beyond the bucket shows that `values` differ from the values that were counted.
         (rank < inside.len()).then(|| *inside.select_nth_unstable_by(rank, f64::total_cmp).1)
     }
 
-    /// The key of the `p`-th percentile, and the rank inside that bucket, from 0.
+    /// Returns the key of the bucket that holds the `p`-th percentile, and the rank inside that bucket, counted from 0.
     fn locate(&self, p: f64) -> Option<(u32, usize)> {
-        // p·n before the division: exact for whole p, so that P1 of 100 values is the first.
+        // Multiplying before dividing is exact for whole p, so P1 of 100 values is the first one.
         let mut rank = ((p * self.finite as f64 / 100.0).ceil() as u64).max(1) - 1;
         for (key, &count) in self.counts.iter().enumerate() {
             if rank < u64::from(count) {
@@ -71,15 +74,16 @@ impl FloatSketch {
     }
 }
 
-/// The f32 bits of `value` without the last `dropped`, mapped so that keys order as values do.
+/// Returns the f32 bits of `value` without the lowest `dropped` bits, mapped so that keys order as values do.
 fn key(value: f64, dropped: u32) -> u32 {
     let bits = (value.clamp(f64::from(f32::MIN), f64::from(f32::MAX)) as f32 + 0.0).to_bits();
-    // Negative floats order backwards: flip all bits; positive ones go above them: flip the sign.
+    // The bits of negative floats order backwards, so all bits are flipped; positive floats must come after them, so
+    // their sign bit is set.
     let ordered = if bits >> 31 == 1 { !bits } else { bits | 1 << 31 };
     ordered >> dropped
 }
 
-/// The value whose bits were mapped to `ordered`.
+/// Returns the value whose bits were mapped to `ordered`.
 fn value_of(ordered: u32) -> f64 {
     let bits = if ordered >> 31 == 1 { ordered ^ (1 << 31) } else { !ordered };
     f64::from(f32::from_bits(bits))
@@ -90,7 +94,7 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    /// Nearest rank on the sorted values.
+    /// Returns the percentile by nearest rank on the sorted values.
     fn sorted_percentile(values: &[f64], p: u32) -> Option<f64> {
         let mut finite: Vec<f64> = values.iter().copied().filter(|x| x.is_finite()).collect();
         finite.sort_by(|a, b| a.partial_cmp(b).unwrap());
@@ -112,7 +116,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn percentiles_equal_the_sorted_answer(values in prop::collection::vec(any_value(), 0..300), p in 0u32..=100) {
+        fn percentiles_equal_those_of_sorted_values(values in prop::collection::vec(any_value(), 0..300), p in 0u32..=100) {
             let sketch = FloatSketch::from_values(values.iter().copied());
             let got = sketch.percentile(f64::from(p), values.iter().copied());
             prop_assert_eq!(got, sorted_percentile(&values, p));
@@ -128,12 +132,13 @@ mod tests {
         }
 
         #[test]
-        fn one_look_is_off_by_half_a_bucket_at_most(
+        fn one_pass_is_off_by_half_a_bucket_at_most(
             values in prop::collection::vec(-1e6..1e6f64, 1..300), p in 0u32..=100, bits in 1u32..=MOST_BITS
         ) {
             let exact = sorted_percentile(&values, p).unwrap();
-            let rough = FloatSketch::keyed_by(bits, values.iter().copied()).rough_percentile(f64::from(p)).unwrap();
-            // Of a bucket [m, m + 1)·2^(e − bits) half is at most 2^−bits / 2 of its least value, but for subnormals.
+            let rough = FloatSketch::with_mantissa_bits(bits, values.iter().copied()).rough_percentile(f64::from(p)).unwrap();
+            // Half of a bucket [m, m + 1)·2^(e − bits) is at most 2^−bits / 2 of its least value, except for
+            // subnormals.
             prop_assert!((rough - exact).abs() <= 0.51 * exact.abs().max(1e-37) * 0.5f64.powi(bits as i32));
         }
     }
@@ -147,7 +152,7 @@ mod tests {
     }
 
     #[test]
-    fn nan_and_infinity_touch_no_percentile() {
+    fn nan_and_infinity_change_no_percentile() {
         let odd = [f64::NAN, f64::INFINITY, f64::NEG_INFINITY, -f64::NAN];
         let values = || odd.into_iter().chain((1..=100).map(f64::from));
         let sketch = FloatSketch::from_values(values());

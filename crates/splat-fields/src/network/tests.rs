@@ -4,21 +4,24 @@ use crate::synthetic::deep::{DeepVariant, KINDS, tensors};
 
 const FILE: &str = "deform.pth";
 
+/// Builds a network with random weights.
 fn network(kind: DeepVariant) -> Network {
     Network::new(&tensors(kind), "network.", Path::new(FILE)).unwrap()
 }
 
+/// Returns random positions.
 fn positions(rows: usize) -> Column {
     let mut noise = Noise(11);
-    let mut made = Column::zeros(3, rows);
-    made.planes_mut().iter_mut().for_each(|x| *x = 1.5 * noise.next());
-    made
+    let mut values = Column::zeros(3, rows);
+    values.planes_mut().iter_mut().for_each(|x| *x = 1.5 * noise.next());
+    values
 }
 
-/// The network in f64, layer by layer as it is written down.
-struct Oracle(Tensors);
+/// Reference evaluation of the network in f64, layer by layer as defined. Holds the state dict.
+struct NetworkOracle(Tensors);
 
-impl Oracle {
+impl NetworkOracle {
+    /// Returns W·x + b of the layer `name`.
     fn linear(&self, name: &str, x: &[f64]) -> Vec<f64> {
         let [weight, bias] = ["weight", "bias"].map(|part| &self.0[&format!("network.{name}.{part}")]);
         let row = |(row, &bias): (&[f32], &f32)| -> f64 {
@@ -28,22 +31,23 @@ impl Oracle {
         weight.data.chunks(x.len()).zip(&bias.data).map(row).collect()
     }
 
+    /// Returns the encoding of `v`.
     fn encoding(v: &[f64], octaves: i32) -> Vec<f64> {
-        let sines = (0..octaves).flat_map(|k| {
-            let of = move |f: fn(f64) -> f64| v.iter().map(move |x| f(2f64.powi(k) * x));
-            of(f64::sin).chain(of(f64::cos)).collect::<Vec<f64>>()
+        let waves = (0..octaves).flat_map(|k| {
+            let wave = move |f: fn(f64) -> f64| v.iter().map(move |x| f(2f64.powi(k) * x));
+            wave(f64::sin).chain(wave(f64::cos)).collect::<Vec<f64>>()
         });
-        v.iter().copied().chain(sines).collect()
+        v.iter().copied().chain(waves).collect()
     }
 
-    /// Outputs of the heads, one after the other.
+    /// Returns the outputs of the heads, one after the other.
     fn motion(&self, kind: DeepVariant, position: [f64; 3], time: f64) -> Vec<f64> {
         let relu = |x: Vec<f64>| x.into_iter().map(|x| x.max(0.0)).collect::<Vec<f64>>();
-        let of_time = match kind.time_network {
+        let encoded_time = match kind.time_network {
             true => self.linear("timenet.2", &relu(self.linear("timenet.0", &Self::encoding(&[time], 6)))),
             false => Self::encoding(&[time], 10),
         };
-        let encodings = [Self::encoding(&position, 10), of_time].concat();
+        let encodings = [Self::encoding(&position, 10), encoded_time].concat();
         let mut h = encodings.clone();
         for k in 0..5 {
             h = relu(self.linear(&format!("linear.{k}"), &h));
@@ -58,6 +62,7 @@ impl Oracle {
     }
 }
 
+/// Returns all outputs for Gaussian `i`.
 fn row(motion: &PredictedMotion, i: usize) -> Vec<f64> {
     let PredictedMotion { warp, rotation, scaling, opacity, color } = motion;
     let columns = [warp, rotation, scaling, opacity, color];
@@ -65,9 +70,9 @@ fn row(motion: &PredictedMotion, i: usize) -> Vec<f64> {
 }
 
 #[test]
-fn every_kind_agrees_with_the_f64_oracle() {
+fn every_variant_matches_the_f64_oracle() {
     for kind in KINDS {
-        let (network, oracle, positions) = (network(kind), Oracle(tensors(kind)), positions(37));
+        let (network, oracle, positions) = (network(kind), NetworkOracle(tensors(kind)), positions(37));
         assert_eq!((network.has_screws(), network.active().contains(Columns::SH)), (kind.screws, kind.all_heads));
         let encoded = network.encode(&positions);
         let mut motion = PredictedMotion::default();
@@ -91,15 +96,15 @@ fn every_kind_agrees_with_the_f64_oracle() {
 }
 
 #[test]
-fn sines_are_those_of_f64_to_the_last_bit_of_f32() {
+fn encoded_values_are_correctly_rounded() {
     let mut noise = Noise(3);
     let mut off = 0.0f64;
     for k in 0..2000 {
         let value = noise.next() * [1.0, 30.0, 3000.0][k % 3];
-        for (octave, pair) in sines(value, OCTAVES)[1..].chunks(2).enumerate() {
+        for (octave, pair) in encode_scalar(value, POSITION_OCTAVES)[1..].chunks(2).enumerate() {
             let (sine, cosine) = (f64::from(value) * 2f64.powi(octave as i32)).sin_cos();
             for (got, expected) in pair.iter().zip([sine, cosine]) {
-                // Half a unit of the last place, and what doubling adds.
+                // Half a unit in the last place of f32, and the error of the double-angle formulas.
                 let unit = f64::from(f32::EPSILON) * expected.abs().log2().floor().exp2() / 2.0;
                 off = off.max(((f64::from(*got) - expected).abs() - unit) / 1e-13);
             }
@@ -109,9 +114,9 @@ fn sines_are_those_of_f64_to_the_last_bit_of_f32() {
 }
 
 #[test]
-fn slopes_are_those_of_finite_differences() {
+fn slopes_match_finite_differences() {
     for kind in &KINDS[..2] {
-        let (network, oracle, positions) = (network(*kind), Oracle(tensors(*kind)), positions(19));
+        let (network, oracle, positions) = (network(*kind), NetworkOracle(tensors(*kind)), positions(19));
         let slopes = network.slopes(&positions, 0.25).unwrap();
         let outputs = if kind.screws { 6 } else { 3 };
         assert_eq!(slopes.width(), 3 * outputs);
@@ -122,7 +127,7 @@ fn slopes_are_those_of_finite_differences() {
                     moved[axis] += by;
                     oracle.motion(*kind, moved, 0.25)
                 };
-                // Small beside 1/512; ReLUs that switch within the step are rare.
+                // The step is small beside the shortest wavelength, 1/512. ReLUs that switch within the step are rare.
                 let (above, below) = (at(1e-7), at(-1e-7));
                 for o in 0..outputs {
                     let (got, expected) = (f64::from(slopes.plane(3 * o + axis)[i]), (above[o] - below[o]) / 2e-7);
@@ -135,7 +140,7 @@ fn slopes_are_those_of_finite_differences() {
 }
 
 #[test]
-fn a_gaussian_has_the_same_bits_in_every_block_and_for_every_choice_of_heads() {
+fn motion_does_not_depend_on_block_or_requested_heads() {
     let network = network(KINDS[0]);
     let all = positions(70);
     let mut whole = PredictedMotion::default();
@@ -151,7 +156,7 @@ fn a_gaussian_has_the_same_bits_in_every_block_and_for_every_choice_of_heads() {
 }
 
 #[test]
-fn tensors_that_do_not_fit_are_named() {
+fn tensors_that_do_not_fit_are_named_in_the_error() {
     type Break = fn(&mut Tensors);
     let cases: [(DeepVariant, Break, &[&str]); 7] = [
         (KINDS[0], |t| drop(t.remove("network.linear.0.weight")), &["network.linear.0.weight", "none"]),

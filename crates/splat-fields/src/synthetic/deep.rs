@@ -1,51 +1,52 @@
-//! Deep networks of positions and times with random weights.
+//! Deep MLPs of position and time with random weights.
 
 use super::Noise;
 use crate::{Tensor, Tensors};
 
-/// Outputs of each hidden layer, which are no multiple of the outputs that are summed together.
+/// Width of the hidden layers. Not a multiple of the number of outputs that are summed together.
 const WIDTH: usize = 22;
 
-/// Inputs of the network for one position: itself, and 10 octaves of sine and cosine.
+/// Number of values in the encoding of a position: itself, and 10 octaves of sine and cosine.
 const POSITION_INPUTS: usize = 3 + 2 * 3 * 10;
 
-/// Variants of the architecture.
+/// Variant of the architecture.
 #[derive(Clone, Copy, Debug)]
 pub struct DeepVariant {
-    /// Whether a network of its own encodes the time.
+    /// Whether a separate network encodes the time.
     pub time_network: bool,
     /// Whether positions move by screw motions (rotation and translation) instead of offsets.
     pub screws: bool,
-    /// Whether opacity and color have heads too.
+    /// Whether opacity and color also have heads.
     pub all_heads: bool,
 }
 
-/// Examples in which each option is on and off.
+/// Variants in which each option is once on and once off.
 pub const KINDS: [DeepVariant; 3] = [
     DeepVariant { time_network: true, screws: false, all_heads: false },
     DeepVariant { time_network: false, screws: true, all_heads: false },
     DeepVariant { time_network: true, screws: false, all_heads: true },
 ];
 
-/// Tensors `network.*` of five layers, of which the fourth joins; outputs are of size 1.
+/// Returns tensors `network.*` of five layers, of which the fourth has a skip connection. Outputs are of the order of
+/// 1.
 pub fn tensors(kind: DeepVariant) -> Tensors {
     let mut noise = Noise(5);
     let mut tensors = Tensors::new();
     let mut add = |name: &str, outputs: usize, inputs: usize, size: f32| {
         let size = size / (inputs as f32).sqrt();
-        let mut made = |shape: &[usize]| Tensor {
+        let mut random_tensor = |shape: &[usize]| Tensor {
             shape: shape.to_vec(),
             data: (0..shape.iter().product()).map(|_| 2.0 * size * noise.next()).collect(),
         };
-        tensors.insert(format!("network.{name}.weight"), made(&[outputs, inputs]));
-        tensors.insert(format!("network.{name}.bias"), made(&[outputs]));
+        tensors.insert(format!("network.{name}.weight"), random_tensor(&[outputs, inputs]));
+        tensors.insert(format!("network.{name}.bias"), random_tensor(&[outputs]));
     };
-    let of_time = if kind.time_network { 5 } else { 21 };
+    let time_inputs = if kind.time_network { 5 } else { 21 };
     if kind.time_network {
         add("timenet.0", 17, 13, 1.0);
-        add("timenet.2", of_time, 17, 1.0);
+        add("timenet.2", time_inputs, 17, 1.0);
     }
-    let encodings = POSITION_INPUTS + of_time;
+    let encodings = POSITION_INPUTS + time_inputs;
     for (k, inputs) in [encodings, WIDTH, WIDTH, encodings + WIDTH, WIDTH].into_iter().enumerate() {
         add(&format!("linear.{k}"), WIDTH, inputs, 1.3);
     }

@@ -1,18 +1,19 @@
-//! Memory that this process may take, and has taken.
+//! Memory limits and memory use of this process.
 //!
-//! Read from files below a root folder, `/` outside tests: `/proc` and the control groups.
+//! The files below a root folder are read: `/proc` and the control groups. The root is `/` outside tests.
 
 use std::fs;
 use std::path::{Component, Path, PathBuf};
 
 use crate::{LimitSource, MemoryLimit, MemoryLimits};
 
-/// Physical memory of the machine, the limits of the control group of this process and of the groups around it, and the
-/// limits that `ulimit` sets for the process. Empty where the system tells nothing.
+/// Returns the physical memory of the machine, the limits of the control group of this process and of its parent
+/// groups, and the limits that `ulimit` sets for the process. Empty if the system does not tell.
 pub fn memory_limits() -> MemoryLimits {
     limits_under(Path::new("/"))
 }
 
+/// Returns the memory limits that the files below `root` state.
 fn limits_under(root: &Path) -> MemoryLimits {
     let read = |path: &Path| fs::read_to_string(root.join(path.strip_prefix("/").unwrap_or(path))).ok();
     let mut around = Vec::from_iter(machine_limit(&read));
@@ -20,6 +21,7 @@ fn limits_under(root: &Path) -> MemoryLimits {
     MemoryLimits { around, own: process_limits(&read) }
 }
 
+/// Returns the physical memory of the machine.
 fn machine_limit(read: &impl Fn(&Path) -> Option<String>) -> Option<MemoryLimit> {
     let info = read(Path::new("/proc/meminfo"))?;
     let total = info.lines().find_map(|line| line.strip_prefix("MemTotal:"))?;
@@ -27,7 +29,7 @@ fn machine_limit(read: &impl Fn(&Path) -> Option<String>) -> Option<MemoryLimit>
     Some(MemoryLimit { bytes: kibibytes.saturating_mul(1024), source: LimitSource::Machine })
 }
 
-/// Adds the limits of the control group of this process and of every group around it that is in sight: all of them hold.
+/// Adds the limits of the control group of this process and of every visible parent group. All of these limits apply.
 fn add_groups(read: &impl Fn(&Path) -> Option<String>, limits: &mut Vec<MemoryLimit>) {
     let (Some(memberships), Some(mounts)) =
         (read(Path::new("/proc/self/cgroup")), read(Path::new("/proc/self/mountinfo")))
@@ -35,7 +37,7 @@ fn add_groups(read: &impl Fn(&Path) -> Option<String>, limits: &mut Vec<MemoryLi
         return;
     };
     for membership in memberships.lines() {
-        // Number, controllers (none in version 2), path.
+        // Fields of a line: hierarchy number, controllers (empty in version 2), path.
         let mut fields = membership.splitn(3, ':').skip(1);
         let (Some(controllers), Some(path)) = (fields.next(), fields.next()) else { continue };
         let (kind, files): (&str, &[&str]) = match controllers {
@@ -56,34 +58,35 @@ fn add_groups(read: &impl Fn(&Path) -> Option<String>, limits: &mut Vec<MemoryLi
     }
 }
 
-/// Mount of a tree of control groups, or of a part of one.
+/// Mount of a control group hierarchy, or of a part of one.
 struct Mount {
-    /// The part's path in the tree.
+    /// Path of the mounted part within the hierarchy.
     root: PathBuf,
+    /// Mount point.
     point: PathBuf,
-    /// The type of file system.
+    /// File system type.
     kind: String,
-    /// Whether groups of this tree limit memory. Some trees of version 1 do not.
+    /// Whether groups of this hierarchy limit memory. Some version 1 hierarchies do not.
     limits_memory: bool,
 }
 
 impl Mount {
-    /// Parses a line of mountinfo: numbers, device, root, point, options, then after a dash type, source, options.
+    /// Parses a line of `mountinfo`: numbers, device, root, mount point, options, a dash, type, source, options.
     fn from_line(line: &str) -> Option<Mount> {
-        let (before, behind) = line.split_once(" - ")?;
-        let mut before = before.split(' ').skip(3);
-        let mut behind = behind.split(' ');
+        let (before_dash, after_dash) = line.split_once(" - ")?;
+        let mut before_dash = before_dash.split(' ').skip(3);
+        let mut after_dash = after_dash.split(' ');
         let path = |text: &str| PathBuf::from(text.replace("\\040", " "));
-        let (root, point, kind) = (path(before.next()?), path(before.next()?), behind.next()?.to_owned());
-        let options = behind.nth(1).unwrap_or("");
+        let (root, point, kind) = (path(before_dash.next()?), path(before_dash.next()?), after_dash.next()?.to_owned());
+        let options = after_dash.nth(1).unwrap_or("");
         let limits_memory = kind == "cgroup2" || options.split(',').any(|option| option == "memory");
         Some(Mount { root, point, kind, limits_memory })
     }
 
-    /// Returns the folder of the group `path`, or the mount point if the group is not in the mounted part.
+    /// Returns the folder of the group `path`, or the mount point if the group is outside the mounted part.
     fn folder_of(&self, path: &str) -> PathBuf {
         let inside = Path::new(path).strip_prefix(&self.root).unwrap_or(Path::new(""));
-        // Relative to the root of a namespace that this process is outside of.
+        // The path is relative to the root of a control group namespace that does not contain this process.
         if inside.components().any(|component| component == Component::ParentDir) {
             return self.point.clone();
         }
@@ -91,6 +94,7 @@ impl Mount {
     }
 }
 
+/// Returns the soft limits of the address space and the data size of this process.
 fn process_limits(read: &impl Fn(&Path) -> Option<String>) -> Vec<MemoryLimit> {
     let text = read(Path::new("/proc/self/limits")).unwrap_or_default();
     let soft = |name: &str, source| {
@@ -101,15 +105,15 @@ fn process_limits(read: &impl Fn(&Path) -> Option<String>) -> Vec<MemoryLimit> {
     limits.into_iter().flatten().collect()
 }
 
-/// Largest resident memory of this process so far in bytes, mapped pages included (`VmHWM`). `None` if the system does not
-/// tell.
+/// Returns the largest resident memory of this process so far in bytes, including mapped pages (`VmHWM`). `None` if the
+/// system does not tell.
 pub fn peak_memory_bytes() -> Option<u64> {
     let status = fs::read_to_string("/proc/self/status").ok()?;
     let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"))?;
     line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok().map(|kib| kib * 1024)
 }
 
-/// Makes [`peak_memory_bytes`] start again from the present resident memory. Returns whether the system did so.
+/// Resets [`peak_memory_bytes`] to the present resident memory. Returns whether the system did so.
 pub fn reset_peak_memory() -> bool {
     fs::write("/proc/self/clear_refs", "5").is_ok()
 }
@@ -125,7 +129,7 @@ mod tests {
         Max data size             unlimited            unlimited            bytes\n\
         Max address space         unlimited            unlimited            bytes\n";
 
-    /// Lowest limit of a machine of 64 GiB with these files.
+    /// Returns the lowest limit of a machine with 64 GiB and these files.
     fn limit(files: &[(&str, &str)]) -> (u64, LimitSource) {
         let root = tempfile::tempdir().unwrap();
         let machine =
@@ -145,13 +149,13 @@ mod tests {
     }
 
     #[test]
-    fn without_anything_else_the_machine_is_the_limit_and_without_that_nothing() {
+    fn machine_is_the_limit_without_control_groups() {
         assert_eq!(limit(&[]), (64 * GIB, LimitSource::Machine));
         assert_eq!(limits_under(Path::new("/no/such/root")), MemoryLimits::default());
     }
 
     #[test]
-    fn every_group_around_the_process_counts_and_the_tightest_is_named() {
+    fn lowest_limit_of_all_parent_groups_is_named() {
         let nested = |job: &str, step: &str, high: &str| {
             limit(&[
                 ("proc/self/cgroup", "0::/slurm/job_7/step_0\n"),
@@ -162,16 +166,20 @@ mod tests {
                 ("sys/fs/cgroup/slurm/job_7/step_0/memory.high", high),
             ])
         };
-        let of = |bytes: u64, file: &str| (bytes, group(&format!("/sys/fs/cgroup/slurm/job_7/{file}")));
-        assert_eq!(nested("4294967296", "max", "max"), of(4 * GIB, "memory.max"));
-        assert_eq!(nested("4294967296", "2147483648\n", "max"), of(2 * GIB, "step_0/memory.max"));
-        assert_eq!(nested("max", "2147483648\n", "1073741824"), of(GIB, "step_0/memory.high"));
+        let group_limit = |bytes: u64, file: &str| (bytes, group(&format!("/sys/fs/cgroup/slurm/job_7/{file}")));
+        assert_eq!(nested("4294967296", "max", "max"), group_limit(4 * GIB, "memory.max"));
+        assert_eq!(nested("4294967296", "2147483648\n", "max"), group_limit(2 * GIB, "step_0/memory.max"));
+        assert_eq!(nested("max", "2147483648\n", "1073741824"), group_limit(GIB, "step_0/memory.high"));
         assert_eq!(nested("max", "max", "0").0, 64 * GIB);
-        assert_eq!(nested("max", "137438953472", "max").0, 64 * GIB, "a limit above the machine's memory is none");
+        assert_eq!(
+            nested("max", "137438953472", "max").0,
+            64 * GIB,
+            "a limit above the physical memory must not count"
+        );
     }
 
     #[test]
-    fn groups_of_version_1_and_of_both_versions_are_followed() {
+    fn limits_of_version_1_groups_are_found() {
         let mounts = "40 35 0:35 / /sys/fs/cgroup/unified rw - cgroup2 cgroup2 rw\n\
             41 35 0:36 / /sys/fs/cgroup/cpu,cpuacct rw - cgroup cgroup rw,cpu,cpuacct\n\
             42 35 0:37 / /sys/fs/cgroup/memory rw - cgroup cgroup rw,memory\n";
@@ -188,7 +196,7 @@ mod tests {
     }
 
     #[test]
-    fn a_container_that_sees_a_part_of_the_tree_finds_its_limit() {
+    fn limit_is_found_if_a_part_of_the_hierarchy_is_mounted() {
         let v1 = "42 35 0:37 /docker/abc /sys/fs/cgroup/memory ro - cgroup cgroup rw,memory\n";
         for (group, mounts, file) in [
             ("0::/\n", V2, "sys/fs/cgroup/memory.max"),
@@ -202,7 +210,7 @@ mod tests {
     }
 
     #[test]
-    fn a_limit_of_the_process_itself_holds() {
+    fn limits_of_the_process_itself_apply() {
         let limits = NO_LIMITS.replace("space         unlimited ", "space         1073741824");
         assert_eq!(limit(&[("proc/self/limits", &limits)]), (GIB, LimitSource::AddressSpace));
     }

@@ -12,25 +12,34 @@ use rustix::fs::{AtFlags, CWD, Dir, FileType, Mode, OFlags};
 
 use crate::{FileIdentity, FolderStatus};
 
-/// An open folder. Names are relative to it and links are never followed.
+/// Open folder. Names are relative to it. Links are never followed.
 #[derive(Debug)]
 pub struct FolderHandle(OwnedFd);
 
 impl FolderHandle {
     /// Opens the folder at `path`, or the folder that a link at `path` leads to.
+    ///
+    /// # Errors
+    /// The folder does not exist; the system refuses.
     pub fn open(path: &Path) -> io::Result<FolderHandle> {
         let flags = OFlags::RDONLY | OFlags::DIRECTORY | OFlags::CLOEXEC;
         Ok(FolderHandle(rustix::fs::open(path, flags, Mode::empty())?))
     }
 
     /// Opens the folder `name` in this folder. A link is an error.
+    ///
+    /// # Errors
+    /// No folder has this name; the system refuses.
     pub fn open_folder(&self, name: impl AsRef<OsStr>) -> io::Result<FolderHandle> {
         let flags = OFlags::RDONLY | OFlags::DIRECTORY | OFlags::NOFOLLOW | OFlags::CLOEXEC;
         Ok(FolderHandle(rustix::fs::openat(&self.0, name.as_ref(), flags, Mode::empty())?))
     }
 
-    /// Opens the regular file `name` for reading and, if asked for, writing. Anything else is an error; a FIFO does
-    /// not block.
+    /// Opens the regular file `name` for reading and, if `writes`, for writing. Any other kind of entry is an error; a
+    /// FIFO does not block.
+    ///
+    /// # Errors
+    /// No regular file has this name; the system refuses.
     pub fn open_file(&self, name: &str, writes: bool) -> io::Result<File> {
         let access = if writes { OFlags::RDWR } else { OFlags::RDONLY };
         let flags = access | OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::CLOEXEC;
@@ -41,21 +50,24 @@ impl FolderHandle {
         }
     }
 
-    /// Creates the file `name`; an entry of that name is an error.
+    /// Creates the file `name`.
+    ///
+    /// # Errors
+    /// An entry has this name; the system refuses.
     pub fn create_file(&self, name: &str) -> io::Result<File> {
         let flags = OFlags::RDWR | OFlags::CREATE | OFlags::EXCL | OFlags::CLOEXEC;
         Ok(File::from(rustix::fs::openat(&self.0, name, flags, Mode::RUSR | Mode::WUSR)?))
     }
 
-    /// Whether the entry `name` is the open file `file`.
+    /// Returns whether the entry `name` is the open file `file`.
     pub fn names_file(&self, name: &str, file: &File) -> bool {
-        // Opening the file once more could release a lock on it, on network file systems.
+        // Does not open the file again: on network file systems that could release a lock on it.
         let named = rustix::fs::statat(&self.0, name, AtFlags::SYMLINK_NOFOLLOW);
         let open = rustix::fs::fstat(file);
         named.is_ok_and(|named| open.is_ok_and(|open| (named.st_dev, named.st_ino) == (open.st_dev, open.st_ino)))
     }
 
-    /// Identity, owner and permissions of this folder.
+    /// Returns the identity, owner and permissions of this folder.
     ///
     /// # Errors
     /// The system refuses.
@@ -68,7 +80,10 @@ impl FolderHandle {
         })
     }
 
-    /// Names of all entries, sorted.
+    /// Returns the names of all entries, sorted.
+    ///
+    /// # Errors
+    /// The system refuses.
     pub fn entries(&self) -> io::Result<Vec<OsString>> {
         let mut names = Vec::new();
         for entry in Dir::read_from(&self.0)? {
@@ -81,26 +96,32 @@ impl FolderHandle {
         Ok(names)
     }
 
-    /// Whether an entry has this name, a link to nothing included.
+    /// Returns whether an entry has this name, including a link whose target does not exist.
     pub fn has(&self, name: impl AsRef<OsStr>) -> bool {
         rustix::fs::statat(&self.0, name.as_ref(), AtFlags::SYMLINK_NOFOLLOW).is_ok()
     }
 
-    /// Whether the entry is a folder and not a link to one.
+    /// Returns whether the entry is a folder and not a link to one.
     pub fn has_folder(&self, name: impl AsRef<OsStr>) -> bool {
         let found = rustix::fs::statat(&self.0, name.as_ref(), AtFlags::SYMLINK_NOFOLLOW);
         found.is_ok_and(|found| FileType::from_raw_mode(found.st_mode) == FileType::Directory)
     }
 
-    /// Renames the entry `from` to `name` in `to`.
+    /// Renames the entry `from` to `name` in the folder `to`.
+    ///
+    /// # Errors
+    /// No entry has this name; the system refuses.
     pub fn rename(&self, from: impl AsRef<OsStr>, to: &FolderHandle, name: impl AsRef<OsStr>) -> io::Result<()> {
         Ok(rustix::fs::renameat(&self.0, from.as_ref(), &to.0, name.as_ref())?)
     }
 
-    /// Renames the entry at the relative path `from` to `to`.
+    /// Moves the entry at the relative path `from` to the path `to`.
     ///
     /// The system moves a folder to another parent only if the folder itself is writable. A read-only folder of this
-    /// user is made writable for the moment of its move.
+    /// user is therefore made writable during its move.
+    ///
+    /// # Errors
+    /// As for [`FolderHandle::rename`].
     pub fn move_to(&self, from: &Path, to: &Path) -> io::Result<()> {
         let moved = || rustix::fs::renameat(&self.0, from, CWD, to);
         let refused = match moved() {
@@ -115,9 +136,12 @@ impl FolderHandle {
         Ok(moved?)
     }
 
-    /// Removes the entry `name`, a folder with everything in it. A link is removed, its target is not.
+    /// Removes the entry `name`; a folder is removed with its content. A link is removed, its target is not.
     ///
     /// Read-only folders of this user are made writable first.
+    ///
+    /// # Errors
+    /// No entry has this name; an entry cannot be removed.
     pub fn remove(&self, name: impl AsRef<OsStr>) -> io::Result<()> {
         let name = name.as_ref();
         if !self.has_folder(name) {
@@ -137,17 +161,24 @@ impl FolderHandle {
         result.and_then(|()| self.remove_empty(name))
     }
 
-    /// Removes the empty folder `name`; anything else is an error and stays.
+    /// Removes the empty folder `name`. Any other entry stays and is an error.
+    ///
+    /// # Errors
+    /// No empty folder has this name; the system refuses.
     pub fn remove_empty(&self, name: impl AsRef<OsStr>) -> io::Result<()> {
         Ok(rustix::fs::unlinkat(&self.0, name.as_ref(), AtFlags::REMOVEDIR)?)
     }
 
-    /// Writes the folder's list of names through to the disk.
+    /// Writes the entries of the folder, their names, through to the disk.
+    ///
+    /// # Errors
+    /// A write fails.
     pub fn sync(&self) -> io::Result<()> {
         Ok(rustix::fs::fsync(&self.0)?)
     }
 }
 
+/// Returns whether the system refused an operation for lack of permission.
 fn is_denied(error: rustix::io::Errno) -> bool {
     error == rustix::io::Errno::ACCESS || error == rustix::io::Errno::PERM
 }

@@ -1,4 +1,4 @@
-//! Files and folders of Linux and macOS.
+//! Linux and macOS: files and folders.
 
 mod folder;
 mod signals;
@@ -24,23 +24,25 @@ const PRIVATE: u32 = 0o700;
 /// Reads `bytes.len()` bytes at byte `offset` of `file`. Several threads may read one file at the same time.
 ///
 /// # Errors
-/// A failed read; a file that ends before.
+/// A read fails; the file ends before the last byte.
 pub fn read_exact_at(file: &File, bytes: &mut [u8], offset: u64) -> io::Result<()> {
     file.read_exact_at(bytes, offset)
 }
 
 impl FileIdentity {
+    /// Returns the identity of a file or folder with this metadata.
     fn from_metadata(found: &Metadata) -> FileIdentity {
         FileIdentity { volume: found.dev(), number: found.ino() }
     }
 }
 
 impl FileStatus {
+    /// Returns the status of a file with this metadata.
     fn from_metadata(found: &Metadata) -> FileStatus {
         FileStatus { identity: FileIdentity::from_metadata(found), length: found.len() }
     }
 
-    /// Status of an open file.
+    /// Returns the status of an open file.
     ///
     /// # Errors
     /// The system refuses.
@@ -48,16 +50,16 @@ impl FileStatus {
         Ok(FileStatus::from_metadata(&file.metadata()?))
     }
 
-    /// Status of the file at `path`, or of the file that a link at `path` leads to.
+    /// Returns the status of the file at `path`, or of the file that a link at `path` leads to.
     ///
     /// # Errors
-    /// Nothing there; the system refuses.
+    /// The path does not exist; the system refuses.
     pub fn from_path(path: &Path) -> io::Result<FileStatus> {
         Ok(FileStatus::from_metadata(&std::fs::metadata(path)?))
     }
 }
 
-/// Kind of an entry that is no file, folder or link.
+/// Returns the kind of an entry that is not a file, folder or link.
 pub(crate) fn special_kind(found: FileType) -> FileKind {
     match found {
         found if found.is_fifo() => FileKind::Fifo,
@@ -68,20 +70,20 @@ pub(crate) fn special_kind(found: FileType) -> FileKind {
     }
 }
 
-/// Opens `path` for reading. A named pipe without a writer is opened, too, instead of waiting for the writer; reading a
-/// regular file is the same as ever.
+/// Opens `path` for reading. Opens a named pipe at once even if it has no writer. Reading a regular file is not
+/// affected.
 ///
 /// # Errors
-/// Nothing there; the system refuses.
+/// The path does not exist; the system refuses.
 pub fn open_without_waiting(path: &Path) -> io::Result<File> {
     OpenOptions::new().read(true).custom_flags(OFlags::NONBLOCK.bits() as i32).open(path)
 }
 
 /// Opens the character device or FIFO `path` for writing. Returns `None` for a FIFO that no program has opened for
-/// reading. Writes to the opened file wait until there is room.
+/// reading. Writes to the opened file block until there is space.
 ///
 /// # Errors
-/// Nothing there; the system refuses.
+/// The path does not exist; the system refuses.
 pub fn open_stream(path: &Path) -> io::Result<Option<File>> {
     let flags = OFlags::NONBLOCK | OFlags::NOCTTY;
     let opened = OpenOptions::new().write(true).custom_flags(flags.bits() as i32).open(path);
@@ -95,7 +97,7 @@ pub fn open_stream(path: &Path) -> io::Result<Option<File>> {
     Ok(Some(file))
 }
 
-/// Whether `file` is the same file, device or pipe as standard output.
+/// Returns whether `file` is the file, device or pipe of standard output.
 ///
 /// # Errors
 /// The status of `file` cannot be read.
@@ -105,8 +107,8 @@ pub fn is_standard_output(file: &File) -> io::Result<bool> {
     Ok(out.is_ok_and(|out| out.identity == found.identity))
 }
 
-/// Whether `folder` is, or lies in, a folder whose links belong to the system, as `/dev/stdout` does. `folder` is a path
-/// without links. Files in the shared memory `/dev/shm` belong to users.
+/// Returns whether `folder` is or lies in a folder whose links belong to the system, such as `/dev` with `/dev/stdout`.
+/// `folder` is a path without links. Files in the shared memory `/dev/shm` belong to users.
 pub fn is_system_folder(folder: &Path) -> bool {
     (folder.starts_with("/dev") && !folder.starts_with("/dev/shm")) || folder.starts_with("/proc")
 }
@@ -114,13 +116,13 @@ pub fn is_system_folder(folder: &Path) -> bool {
 /// Creates the folder `path`, which only its owner may enter, read or write.
 ///
 /// # Errors
-/// An entry of that name; the system refuses.
+/// An entry has this name; the system refuses.
 pub fn create_private_folder(path: &Path) -> io::Result<()> {
     DirBuilder::new().mode(PRIVATE).create(path)
 }
 
-/// Permissions of a private folder, for whoever creates one with another function than [`create_private_folder`]. `None`
-/// where the parent decides about permissions.
+/// Returns the permissions of a private folder, for callers that create one without [`create_private_folder`]. Returns
+/// `None` on systems where the parent decides about permissions.
 pub fn private_permissions() -> Option<Permissions> {
     Some(Permissions::from_mode(PRIVATE))
 }
@@ -128,31 +130,31 @@ pub fn private_permissions() -> Option<Permissions> {
 /// Writes the content of the file `path` through to the disk.
 ///
 /// # Errors
-/// Nothing there; a failed write.
+/// The path does not exist; a write fails.
 pub fn sync_file(path: &Path) -> io::Result<()> {
     File::open(path)?.sync_all()
 }
 
-/// Writes the names in the folder `path` through to the disk, so that a finished rename lasts through a power failure.
+/// Writes the entries of the folder `path` through to the disk, so that a finished rename survives a power failure.
 ///
 /// # Errors
-/// Nothing there; a failed write.
+/// The path does not exist; a write fails.
 pub fn sync_folder(path: &Path) -> io::Result<()> {
     sync_file(path)
 }
 
-/// Tells the system that the bytes `range` of `map` will be read soon. Without effect if the system refuses.
+/// Tells the system that the bytes `range` of `map` will be read soon. Has no effect if the system refuses.
 pub fn expect_pages(map: &Mmap, range: Range<usize>) {
     _ = map.advise_range(Advice::WillNeed, range.start, range.len());
 }
 
-/// Gives the pages of the bytes `range` of `map` back to the system, so that they no longer count as memory of this
-/// process. Reading them again reads the file. Without effect if the system refuses.
+/// Returns the pages of the bytes `range` of `map` to the system, so that they no longer count as memory of this
+/// process. Later access reads the file again. Has no effect if the system refuses.
 ///
 /// # Safety
-/// `map` is backed by a file and not by anonymous memory: the content of other pages would be lost.
+/// `map` must be backed by a file and not by anonymous memory: the content of anonymous pages would be lost.
 pub unsafe fn release_pages(map: &Mmap, range: Range<usize>) {
-    // SAFETY: the advice drops what was written to private pages. The map is read-only and, as the caller confirms,
-    // backed by a file, so every dropped page comes back with the file's bytes and slices of the map stay valid.
+    // SAFETY: the advice drops modified private pages. The map is read-only and, as the caller guarantees, backed by a
+    // file, so every dropped page returns with the bytes of the file and slices of the map stay valid.
     _ = unsafe { map.unchecked_advise_range(UncheckedAdvice::DontNeed, range.start, range.len()) };
 }

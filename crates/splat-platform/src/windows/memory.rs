@@ -1,4 +1,4 @@
-//! Memory that this process may take, and has taken.
+//! Memory limits and memory use of this process.
 
 use std::mem::{size_of, zeroed};
 
@@ -12,13 +12,14 @@ use windows_sys::Win32::System::Threading::GetCurrentProcess;
 
 use crate::{LimitSource, MemoryLimit, MemoryLimits};
 
-/// Physical memory of the machine and the limits of the job object of this process.
+/// Returns the physical memory of the machine and the limits of the job object of this process.
 pub fn memory_limits() -> MemoryLimits {
     let machine = machine_bytes().map(|bytes| MemoryLimit { bytes, source: LimitSource::Machine });
     let job = job_bytes().into_iter().map(|bytes| MemoryLimit { bytes, source: LimitSource::JobObject });
     MemoryLimits { around: machine.into_iter().chain(job).collect(), own: Vec::new() }
 }
 
+/// Returns the physical memory of the machine in bytes.
 fn machine_bytes() -> Option<u64> {
     // SAFETY: all fields are integers.
     let mut status: MEMORYSTATUSEX = unsafe { zeroed() };
@@ -27,11 +28,12 @@ fn machine_bytes() -> Option<u64> {
     (unsafe { GlobalMemoryStatusEx(&mut status) } != 0).then_some(status.ullTotalPhys)
 }
 
+/// Returns the limits of the job object of this process in bytes, per process and per job. Empty without a job object.
 fn job_bytes() -> Vec<u64> {
     // SAFETY: all fields are integers.
     let mut limits: JOBOBJECT_EXTENDED_LIMIT_INFORMATION = unsafe { zeroed() };
     let size = size_of::<JOBOBJECT_EXTENDED_LIMIT_INFORMATION>() as u32;
-    // SAFETY: no handle stands for the job of this process; the pointer and the size are those of `limits`.
+    // SAFETY: a null handle means the job of this process; the pointer and the size are those of `limits`.
     let found = unsafe {
         QueryInformationJobObject(
             std::ptr::null_mut(),
@@ -41,7 +43,7 @@ fn job_bytes() -> Vec<u64> {
             std::ptr::null_mut(),
         )
     };
-    // Without a job the call fails.
+    // The call fails if the process belongs to no job.
     let flags = if found == 0 { 0 } else { limits.BasicLimitInformation.LimitFlags };
     let stated = [
         (JOB_OBJECT_LIMIT_PROCESS_MEMORY, limits.ProcessMemoryLimit),
@@ -50,7 +52,7 @@ fn job_bytes() -> Vec<u64> {
     stated.into_iter().filter(|(flag, _)| flags & flag != 0).map(|(_, bytes)| bytes as u64).collect()
 }
 
-/// Largest working set of this process so far in bytes, mapped pages included.
+/// Returns the largest working set of this process so far in bytes, including mapped pages.
 pub fn peak_memory_bytes() -> Option<u64> {
     // SAFETY: all fields are integers.
     let mut counters: PROCESS_MEMORY_COUNTERS = unsafe { zeroed() };
@@ -60,7 +62,7 @@ pub fn peak_memory_bytes() -> Option<u64> {
     (found != 0).then_some(counters.PeakWorkingSetSize as u64)
 }
 
-/// Makes [`peak_memory_bytes`] start again from the present memory: not possible on Windows, returns false.
+/// Returns false: Windows cannot reset [`peak_memory_bytes`].
 pub fn reset_peak_memory() -> bool {
     false
 }

@@ -1,13 +1,14 @@
-//! Pictures differentiated: from ∂L/∂ pixel to ∂L/∂ what is stored of the Gaussians they show.
+//! Gradients of renders: from ∂L/∂pixel to derivatives with respect to the stored attributes of Gaussians.
 //!
-//! Reads as a pipeline: the picture as [`render`](super::render) makes it, a loss of the caller's, `tile` (a second
-//! walk over the same pairs), `splat` (the projection's derivative). Data in: [`Gaussians`] and a [`Camera`]. Data out:
-//! [`Gradients`]. Memory beside the picture's: 72 bytes per visible Gaussian ([`GRADIENT_BYTES_PER_VISIBLE`]) and 36
-//! per pair of a strip ([`GRADIENT_STRIP_BYTES`]). Sources: Kerbl et al., "3D Gaussian Splatting", 2023, and Ye et al.,
-//! "gsplat", 2024, for what is to be derived; derived in method.md, section 8.1.
+//! The modules form a pipeline: the render as in [`render`](super::render), a loss of the caller, `tile` (a backward
+//! pass over the same pairs), `splat` (the derivative of the projection). Input: [`Gaussians`] and a [`Camera`].
+//! Output: [`Gradients`]. Memory beside that of the render: 72 bytes per visible Gaussian
+//! ([`GRADIENT_BYTES_PER_VISIBLE`]) and 36 bytes per pair of a strip ([`GRADIENT_STRIP_BYTES`]). Sources of the forward
+//! model: Kerbl et al., "3D Gaussian Splatting", 2023, and Ye et al., "gsplat", 2024. The gradients are derived in
+//! src/method.md, section 8.1.
 //!
-//! Steps have no derivative: what crosses alpha = 1/255, an order that changes, a tile that is just reached. An alpha
-//! cut at 0.99, a channel cut off at 0 and a scale beyond e^±80 pass nothing on.
+//! Discontinuities have no derivative: an alpha that crosses 1/255, an order that changes, a tile that is newly
+//! touched. An alpha clamped at 0.99, a channel clamped at 0 and a scale beyond e^±80 have derivative 0.
 
 mod splat;
 pub(super) mod sums;
@@ -22,29 +23,31 @@ use super::project::CameraTerms;
 use super::renderer::{BYTES_PER_VISIBLE, Image, Renderer, fill_pairs};
 use splat_core::{Camera, Columns, Gaussians, GradientSpan, Gradients};
 use sums::{ImageGradientSums, SplatSums};
-use tile::{Pull, Pulled};
+use tile::{GradientSink, PixelGradients};
 
-/// Gaussians whose gradients one task adds to: whole blocks.
+/// Number of Gaussians whose gradients one task adds: a multiple of the block size.
 const SPAN: usize = 32 * BLOCK;
 
-/// Memory of a picture that is differentiated per Gaussian it shows.
+/// Bytes per visible Gaussian for the gradient of a render.
 pub const GRADIENT_BYTES_PER_VISIBLE: usize = BYTES_PER_VISIBLE + size_of::<SplatSums<f64>>();
-/// Pairs of splats and tiles whose sums lie ready at a time: of small pictures all, of others a part of the strip.
+/// Maximum number of pairs of a splat and a tile whose sums are in memory. Small renders have fewer pairs; others are
+/// processed in parts of a strip.
 const SUMMED_PAIRS: usize = STRIP_PAIRS / 4;
 
-/// Memory of a picture that is differentiated for pairs of Gaussians and tiles.
+/// Bytes for the pairs of a splat and a tile for the gradient of a render.
 pub const GRADIENT_STRIP_BYTES: usize = STRIP_PAIRS * size_of::<u32>() + SUMMED_PAIRS * size_of::<SplatSums<f32>>();
 
 impl Renderer {
-    /// Renders as [`Renderer::render`], asks `loss` for a number and its derivative by each value of the picture,
-    /// `[height, width, 3]`, and adds the derivatives by what is stored of `gaussians` to `out`.
+    /// Renders like [`Renderer::render`] and adds the derivatives of a loss with respect to the stored attributes of
+    /// `gaussians` to `out`.
     ///
-    /// The same bits for any number of threads. A pixel where the picture or the derivative is not finite counts as one
-    /// that the number does not depend on. What is not visible, or hidden, gets nothing.
+    /// `loss` returns the loss of the render and its derivative with respect to each value, `[height, width, 3]`.
+    /// Returns the loss. Results have the same bits for any number of threads. A pixel gets gradient 0 if its color or
+    /// its derivative is not finite. Gaussians that are not visible get 0.
     ///
     /// # Panics
-    /// If `out` is not of as many Gaussians or has more harmonics, the columns of `gaussians` differ in length, or
-    /// `loss` gives a derivative of another size.
+    /// If `out` has another number of Gaussians or a higher SH degree, the attributes of `gaussians` have different
+    /// lengths, or `loss` returns a derivative of another size.
     pub fn gradient(
         &mut self,
         gaussians: &Gaussians,
@@ -53,20 +56,27 @@ impl Renderer {
         loss: impl FnOnce(&Image) -> (f64, Image),
         out: &mut Gradients,
     ) -> f64 {
-        assert_eq!(out.len(), gaussians.len(), "gradients of another model");
-        assert!(out.column(Columns::SH).width() <= gaussians.sh.width(), "gradients of harmonics that do not exist");
+        assert_eq!(out.len(), gaussians.len(), "expected as many gradients as Gaussians");
+        assert!(
+            out.column(Columns::SH).width() <= gaussians.sh.width(),
+            "expected gradients of at most the SH degree of the Gaussians"
+        );
         let view = CameraTerms::new(camera);
         self.prepare(gaussians, &view, true);
-        let picture = self.picture(&view, background);
-        let (value, pull) = loss(&picture);
-        assert_eq!([pull.width, pull.height], view.size, "a derivative of another size");
+        let image = self.render_prepared(&view, background);
+        let (value, pixel_gradient) = loss(&image);
+        assert_eq!(
+            [pixel_gradient.width, pixel_gradient.height],
+            view.size,
+            "expected a derivative of the size of the render"
+        );
 
         if Columns::SH.contains(out.columns()) {
-            self.second_walk::<false>(&view, &picture, &pull);
+            self.backward_pass::<false>(&view, &image, &pixel_gradient);
         } else {
-            self.second_walk::<true>(&view, &picture, &pull);
+            self.backward_pass::<true>(&view, &image, &pixel_gradient);
         }
-        let (splats, sums) = (&self.splats.splats, &self.taken.totals);
+        let (splats, sums) = (&self.splats.splats, &self.gradient_sums.totals);
         let add = |mut span: GradientSpan<'_>| {
             let [start, end] =
                 [span.ids().start, span.ids().end].map(|id| splats.partition_point(|splat| (splat.id as usize) < id));
@@ -80,9 +90,10 @@ impl Renderer {
         value
     }
 
-    /// What every splat takes: tiles at once, then splats at once, each adding up its tiles in their order.
-    fn second_walk<const SHAPE: bool>(&mut self, view: &CameraTerms, picture: &Image, pull: &Image) {
-        let ImageGradientSums { totals, of_pairs } = &mut self.taken;
+    /// Computes the gradient sums of every splat. First tiles run in parallel, then splats; each splat adds its tiles
+    /// in their order.
+    fn backward_pass<const SHAPE: bool>(&mut self, view: &CameraTerms, image: &Image, pixel_gradient: &Image) {
+        let ImageGradientSums { totals, pairs: pair_sums } = &mut self.gradient_sums;
         totals.clear();
         totals.resize(self.splats.splats.len(), SplatSums::default());
         let part = match self.parallel {
@@ -93,14 +104,17 @@ impl Renderer {
         while let Some(strip) = self.bins.next_strip(&self.splats, self.strip_pairs) {
             let (bins, splats, blend) = (&self.bins, &self.splats.splats, self.blend);
             for tiles in bins.parts(strip, self.strip_pairs.min(SUMMED_PAIRS)) {
-                fill_pairs(bins, tiles.clone(), self.parallel, of_pairs, |tile, pairs, sums| {
-                    let lattice = SampledPixels::new(tile, view.size, 1);
-                    let mut ink = Pulled::<SHAPE> { pull: Pull::new(picture, pull, tile), pairs: sums };
-                    blend.tile(splats, pairs, &lattice, &mut ink);
+                fill_pairs(bins, tiles.clone(), self.parallel, pair_sums, |tile, pairs, sums| {
+                    let sampled = SampledPixels::new(tile, view.size, 1);
+                    let mut sink = GradientSink::<SHAPE> {
+                        gradients: PixelGradients::new(image, pixel_gradient, tile),
+                        pairs: sums,
+                    };
+                    blend.tile(splats, pairs, &sampled, &mut sink);
                 });
                 let add = |(k, totals): (usize, &mut [SplatSums<f64>])| {
-                    for (&splat, sums) in bins.pairs(tiles.clone()).iter().zip(&*of_pairs) {
-                        // Of another part it wraps or lies beyond.
+                    for (&splat, sums) in bins.pairs(tiles.clone()).iter().zip(&*pair_sums) {
+                        // The index of a splat of another part wraps around or lies beyond the end.
                         if let Some(total) = totals.get_mut((splat as usize).wrapping_sub(k * part)) {
                             total.add(sums);
                         }

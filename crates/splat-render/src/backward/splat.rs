@@ -1,9 +1,10 @@
-//! From what splats take to what the stored values of their Gaussians take: the derivative of the projection.
+//! Derivative of the projection: from splat gradients to gradients of the stored attributes.
 //!
-//! Block by block as the projection goes, in f64 where that is. A footprint enters through its whitened axes alone, so
-//! needles and giants lose no digits that the projection kept (method.md, section 8.1). Data in: sums per splat. Data
-//! out: sums per Gaussian. Memory: stack arrays of [`BLOCK`] entries. Source of the projection: Zwicker et al., "EWA
-//! Splatting", 2002.
+//! Blocks are processed like in the projection, in f64 where the projection uses f64. A footprint enters only through
+//! its whitened axes, so very thin and very large Gaussians lose no digits that the projection kept (src/method.md,
+//! section 8.1). Input: sums per splat. Output: sums per Gaussian. Memory: stack arrays of [`BLOCK`] entries. Source of
+//! the projection: Zwicker et al., "EWA Splatting", 2002. Names that begin with `by_` hold derivatives of the loss with
+//! respect to the rest of the name.
 
 use std::ops::Range;
 
@@ -13,7 +14,8 @@ use super::super::project::{CameraTerms, LOGARITHM_LIMIT, ProjectedShape, Splat,
 use super::sums::SplatSums;
 use splat_core::{Columns, Gaussians, GradientSpan, sh_coefficients};
 
-/// Adds what the Gaussians behind `splats` take to `out`, whose splats these are; `sums` is what each splat takes.
+/// Adds the gradients of the Gaussians of `splats` to `out`, which contains these Gaussians. `sums` holds the gradient
+/// sums of each splat.
 pub(super) fn add(
     gaussians: &Gaussians,
     splats: &[Splat],
@@ -23,7 +25,7 @@ pub(super) fn add(
 ) {
     #[cfg(target_arch = "x86_64")]
     {
-        /// The same loops, compiled for wider registers; no fused arithmetic, so the same bits.
+        /// Runs [`add_blocks`] compiled for AVX2. Arithmetic is not fused, so results have the same bits.
         #[target_feature(enable = "avx2")]
         fn add_avx2(
             gaussians: &Gaussians,
@@ -34,7 +36,7 @@ pub(super) fn add(
         ) {
             add_blocks(gaussians, splats, sums, view, out);
         }
-        /// The same for registers twice as wide.
+        /// Runs [`add_blocks`] compiled for AVX-512, with the same bits.
         #[target_feature(enable = "avx2,avx512f,avx512dq,avx512vl")]
         fn add_avx512(
             gaussians: &Gaussians,
@@ -60,6 +62,7 @@ pub(super) fn add(
     add_blocks(gaussians, splats, sums, view, out);
 }
 
+/// Adds the gradients block by block.
 #[inline(always)]
 fn add_blocks(
     gaussians: &Gaussians,
@@ -72,20 +75,20 @@ fn add_blocks(
     let (mut splats, mut sums) = (splats, sums);
     for start in out.ids().step_by(BLOCK) {
         let ids = start..(start + BLOCK).min(out.ids().end);
-        let of_block = splats[..splats.len().min(BLOCK)].partition_point(|splat| (splat.id as usize) < ids.end);
-        if of_block == 0 {
+        let count = splats[..splats.len().min(BLOCK)].partition_point(|splat| (splat.id as usize) < ids.end);
+        if count == 0 {
             continue;
         }
-        block.fill(&splats[..of_block], &sums[..of_block], start);
-        (splats, sums) = (&splats[of_block..], &sums[of_block..]);
+        block.fill(&splats[..count], &sums[..count], start);
+        (splats, sums) = (&splats[count..], &sums[count..]);
         let columns = out.columns();
-        let turns = columns.contains(Columns::POSITION) && color::coefficients(gaussians) > 1;
-        if turns || columns.contains(Columns::SH) {
+        let needs_direction = columns.contains(Columns::POSITION) && color::coefficients(gaussians) > 1;
+        if needs_direction || columns.contains(Columns::SH) {
             let directions = Directions::new(gaussians, ids.clone(), view);
             if columns.contains(Columns::SH) {
                 block.add_harmonics(gaussians, ids.clone(), &directions, out);
             }
-            if turns {
+            if needs_direction {
                 block.add_direction(gaussians, ids.clone(), &directions, out);
             }
         }
@@ -95,13 +98,16 @@ fn add_blocks(
     }
 }
 
-/// Of the Gaussians of a block: unit vectors toward them from the center of view, and one over their distances.
+/// View directions of the Gaussians of a block.
 struct Directions {
+    /// Unit vectors from the camera center to the Gaussians.
     unit: [[f32; BLOCK]; 3],
+    /// One over the distances.
     per_distance: [f32; BLOCK],
 }
 
 impl Directions {
+    /// Computes the directions of the Gaussians `ids`.
     #[inline(always)]
     fn new(gaussians: &Gaussians, ids: Range<usize>, view: &CameraTerms) -> Self {
         let n = ids.len().min(BLOCK);
@@ -116,18 +122,19 @@ impl Directions {
         directions
     }
 
+    /// Returns the unit vector of Gaussian `i` of the block.
     #[inline(always)]
     fn at(&self, i: usize) -> [f32; 3] {
         [self.unit[0][i], self.unit[1][i], self.unit[2][i]]
     }
 }
 
-/// What the Gaussians of a block take, as in [`SplatSums`]; 0 where they are not visible.
+/// Gradient sums of the Gaussians of a block, as in [`SplatSums`]; 0 for Gaussians that are not visible.
 struct GradientBlock {
     p: [f64; BLOCK],
     first: [[f64; BLOCK]; 2],
     second: [[f64; BLOCK]; 3],
-    /// Without channels cut off at 0, which move nothing.
+    /// Color gradients, 0 for channels that were clamped at 0.
     color: [[f32; BLOCK]; 3],
 }
 
@@ -139,6 +146,7 @@ impl Default for GradientBlock {
 }
 
 impl GradientBlock {
+    /// Copies the sums of the block's splats. `start` is the first Gaussian of the block.
     fn fill(&mut self, splats: &[Splat], sums: &[SplatSums<f64>], start: usize) {
         *self = GradientBlock::default();
         for (splat, sums) in splats.iter().zip(sums) {
@@ -150,7 +158,7 @@ impl GradientBlock {
         }
     }
 
-    /// Harmonics: Y_k times what the color takes.
+    /// Adds the gradients of SH coefficients: Y_k times the color gradient.
     #[inline(always)]
     fn add_harmonics(
         &self,
@@ -174,7 +182,7 @@ impl GradientBlock {
         }
     }
 
-    /// Position, through the color's change with the direction of view.
+    /// Adds the gradients of positions through the view direction, on which the color depends.
     #[inline(always)]
     fn add_direction(
         &self,
@@ -184,7 +192,7 @@ impl GradientBlock {
         out: &mut GradientSpan<'_>,
     ) {
         let n = ids.len().min(BLOCK);
-        // By value of Y_k: what the color takes times the coefficients.
+        // Gradient of each Y_k: color gradient times coefficients.
         let mut by_value = [[0.0f32; BLOCK]; sh_coefficients(3)];
         for (k, by_value) in by_value.iter_mut().enumerate().take(color::coefficients(gaussians)).skip(1) {
             let sh: [&[f32]; 3] = std::array::from_fn(|c| &gaussians.sh.plane(3 * k + c)[ids.clone()][..n]);
@@ -197,12 +205,12 @@ impl GradientBlock {
             let d = directions.at(i);
             let mut sum = [0.0; 3];
             let slopes = color::basis_gradient(d);
-            // Not zipped and skipped: that does not run in vectors.
+            // Indexed instead of `zip` and `skip`, which the compiler does not vectorize.
             for k in 1..slopes.len() {
-                let (of, slope) = (by_value[k][i], slopes[k]);
-                sum = [sum[0] + of * slope[0], sum[1] + of * slope[1], sum[2] + of * slope[2]];
+                let (by, slope) = (by_value[k][i], slopes[k]);
+                sum = [sum[0] + by * slope[0], sum[1] + by * slope[1], sum[2] + by * slope[2]];
             }
-            // Along itself a direction does not change.
+            // Moving a Gaussian along its view direction does not change the direction.
             let radial = sum[0] * d[0] + sum[1] * d[1] + sum[2] * d[2];
             for axis in 0..3 {
                 parts[axis][i] = directions.per_distance[i] * (sum[axis] - radial * d[axis]);
@@ -213,7 +221,7 @@ impl GradientBlock {
         }
     }
 
-    /// Opacity, scale, rotation, and position through the footprint.
+    /// Adds the gradients of opacity, scale, rotation, and of position through the footprint.
     #[inline(always)]
     fn add_shape(&self, gaussians: &Gaussians, ids: Range<usize>, view: &CameraTerms, out: &mut GradientSpan<'_>) {
         let n = ids.len().min(BLOCK);
@@ -225,7 +233,7 @@ impl GradientBlock {
         let mut parts = [[0.0f32; BLOCK]; 11];
         let GradientBlock { p, first, second, .. } = self;
         for i in 0..n {
-            let taken = GeometryGradient::new(
+            let gradient = GeometryGradient::new(
                 [position[0][i].into(), position[1][i].into(), position[2][i].into()],
                 [rotation[0][i].into(), rotation[1][i].into(), rotation[2][i].into(), rotation[3][i].into()],
                 [log_scale[0][i], log_scale[1][i], log_scale[2][i]],
@@ -234,11 +242,11 @@ impl GradientBlock {
                 view,
             );
             for axis in 0..3 {
-                parts[axis][i] = taken.position[axis] as f32;
-                parts[7 + axis][i] = taken.log_scale[axis] as f32;
+                parts[axis][i] = gradient.position[axis] as f32;
+                parts[7 + axis][i] = gradient.log_scale[axis] as f32;
             }
             for c in 0..4 {
-                parts[3 + c][i] = taken.rotation[c] as f32;
+                parts[3 + c][i] = gradient.rotation[c] as f32;
             }
             parts[10][i] = ((1.0 - opacity(logit[i])) * p[i]) as f32;
         }
@@ -256,7 +264,7 @@ impl GradientBlock {
     }
 }
 
-/// What one Gaussian's geometry takes.
+/// Gradient of the geometry of one Gaussian.
 struct GeometryGradient {
     position: [f64; 3],
     rotation: [f64; 4],
@@ -264,7 +272,7 @@ struct GeometryGradient {
 }
 
 impl GeometryGradient {
-    /// `first` and `second` are those of [`SplatSums`].
+    /// Computes the gradient from the sums `first` = [x, y] and `second` = [xx, xy, yy] of [`SplatSums`].
     #[inline(always)]
     fn new(
         position: [f64; 3],
@@ -275,36 +283,37 @@ impl GeometryGradient {
         view: &CameraTerms,
     ) -> Self {
         let shape = ProjectedShape::new(position, q, log_scale, view);
-        let seen = shape.covariance();
+        let covariance = shape.covariance();
         let [a, b] = shape.spread;
 
-        // Offsets in standard deviations: s = (x − slope·y)·per_s, t = y·per_t.
-        let (slope, per_s, per_t) = (seen.xy / seen.yy, (seen.yy / seen.det).sqrt(), (1.0 / seen.yy).sqrt());
+        // Offsets in standard deviations: s = (x − shear·y)·per_s, t = y·per_t.
+        let (shear, per_s, per_t) =
+            (covariance.xy / covariance.yy, (covariance.yy / covariance.det).sqrt(), (1.0 / covariance.yy).sqrt());
         let (s, t) = (per_s * x, per_t * y);
         let (ss, st, tt) = (per_s * per_s * xx, per_s * per_t * xy, per_t * per_t * yy);
-        // By each of the Gaussian's axes: ∂L/∂ log scale, ∂L/∂a and ∂L/∂b.
+        // For each axis of the Gaussian: ∂L/∂log scale, ∂L/∂a and ∂L/∂b.
         let by_axis = |j: usize| {
-            // The axis as s and t see it.
-            let (along_s, along_t) = (per_s * (a[j] - slope * b[j]), per_t * b[j]);
+            // Components of the axis in s and t.
+            let (along_s, along_t) = (per_s * (a[j] - shear * b[j]), per_t * b[j]);
             let (by_s, by_t) = (ss * along_s + st * along_t, st * along_s + tt * along_t);
             let by_a = per_s * by_s;
             let kept = f64::from(log_scale[j]).abs() <= LOGARITHM_LIMIT;
-            (if kept { by_s * along_s + by_t * along_t } else { 0.0 }, by_a, per_t * by_t - slope * by_a)
+            (if kept { by_s * along_s + by_t * along_t } else { 0.0 }, by_a, per_t * by_t - shear * by_a)
         };
         let [(scale_0, a_0, b_0), (scale_1, a_1, b_1), (scale_2, a_2, b_2)] = [by_axis(0), by_axis(1), by_axis(2)];
 
-        // a and b are `to` · axes · scale.
+        // a and b are `to_pixels` · axes · scale.
         let by_to = |by: [f64; 3]| {
             let by = [by[0] * shape.scale[0], by[1] * shape.scale[1], by[2] * shape.scale[2]];
             let along = |axis: usize| dot(by, [shape.axes[0][axis], shape.axes[1][axis], shape.axes[2][axis]]);
             [along(0), along(1), along(2)]
         };
         let (by_to_u, by_to_v) = (by_to([a_0, a_1, a_2]), by_to([b_0, b_1, b_2]));
-        // Turning the Gaussian one way is turning `to` the other way.
-        let (turn_u, turn_v) = (cross(by_to_u, shape.to[0]), cross(by_to_v, shape.to[1]));
+        // Rotating the Gaussian is equivalent to rotating `to_pixels` in the opposite direction.
+        let (turn_u, turn_v) = (cross(by_to_u, shape.to_pixels[0]), cross(by_to_v, shape.to_pixels[1]));
         let torque = [turn_u[0] + turn_v[0], turn_u[1] + turn_v[1], turn_u[2] + turn_v[2]];
 
-        // `to` is focal/depth · (row k − slope · row of the depth), with the slope cut at the limit.
+        // `to_pixels` is focal/depth · (row k − slope · depth row), with the slope clamped at the limit.
         let [row_x, row_y, row_z] = view.rotation;
         let by_slope = |k: usize, by_center: f64, by_to: [f64; 3]| {
             let through_to = view.focal[k] / shape.depth * dot(row_z, by_to);
@@ -312,8 +321,8 @@ impl GeometryGradient {
             view.focal[k] * by_center - if kept { through_to } else { 0.0 }
         };
         let by_slope_x = by_slope(0, per_s * s, by_to_u);
-        let by_slope_y = by_slope(1, per_t * t - slope * per_s * s, by_to_v);
-        let by_size = dot(shape.to[0], by_to_u) + dot(shape.to[1], by_to_v);
+        let by_slope_y = by_slope(1, per_t * t - shear * per_s * s, by_to_v);
+        let by_size = dot(shape.to_pixels[0], by_to_u) + dot(shape.to_pixels[1], by_to_v);
         let by_depth = -by_size - shape.slopes[0] * by_slope_x - shape.slopes[1] * by_slope_y;
         let inverse = 1.0 / shape.depth;
         let along =
@@ -326,8 +335,10 @@ impl GeometryGradient {
     }
 }
 
-/// ∂L/∂ wxyz quaternion of any length, given ∂L/∂ angle about each of the world's axes: 2·(0, torque) ⊗ q / ‖q‖². A
-/// quaternion changes by half an angle times itself; along itself nothing changes. Not finite for a zero one.
+/// Returns ∂L/∂quaternion (wxyz, of any length), given ∂L/∂angle about each world axis: 2·(0, torque) ⊗ q / ‖q‖².
+///
+/// A rotation changes a quaternion by half the angle times the quaternion. A change along the quaternion itself has no
+/// effect. The result is not finite for a zero quaternion.
 #[inline(always)]
 fn by_quaternion([w, x, y, z]: [f64; 4], torque: [f64; 3]) -> [f64; 4] {
     let twice = 2.0 / (w * w + x * x + y * y + z * z);

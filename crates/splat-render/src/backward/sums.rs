@@ -1,9 +1,9 @@
-//! What splats take of a picture: sums over pixels, by pair of a splat and a tile, and by splat.
+//! Gradients of splats: sums over pixels, per pair of a splat and a tile, and per splat.
 
-/// What one splat takes from pixels, f32 sums of a tile in a fixed order or f64 sums of those.
+/// Gradient sums of one splat: f32 sums of a tile in a fixed order, or f64 sums of those.
 ///
-/// With p = alpha · ∂L/∂alpha and a pixel's offset (x, y), pixels: y along v from the splat's center, x along u from the
-/// middle of the row.
+/// p = alpha · ∂L/∂alpha, and (x, y) is the offset of a pixel: y along v from the center of the splat, x along u from
+/// the maximum of the row.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct SplatSums<T> {
     /// Σ p.
@@ -12,11 +12,12 @@ pub(super) struct SplatSums<T> {
     pub(super) first: [T; 2],
     /// Σ p·x², Σ p·x·y and Σ p·y².
     pub(super) second: [T; 3],
-    /// Σ weight · ∂L/∂ pixel, by channel.
+    /// Σ weight · ∂L/∂pixel, by channel.
     pub(super) color: [T; 3],
 }
 
 impl SplatSums<f64> {
+    /// Adds the sums of one tile.
     #[inline(always)]
     pub(super) fn add(&mut self, tile: &SplatSums<f32>) {
         self.p += f64::from(tile.p);
@@ -26,11 +27,11 @@ impl SplatSums<f64> {
     }
 }
 
-/// What splats take of a picture.
+/// Gradient sums of all splats of a render.
 #[derive(Debug, Default)]
 pub(in super::super) struct ImageGradientSums {
-    /// One for every splat.
+    /// Sums of every splat.
     pub(super) totals: Vec<SplatSums<f64>>,
-    /// One for every pair of a strip.
-    pub(super) of_pairs: Vec<SplatSums<f32>>,
+    /// Sums of every pair of a strip.
+    pub(super) pairs: Vec<SplatSums<f32>>,
 }

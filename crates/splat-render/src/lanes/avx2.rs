@@ -1,20 +1,20 @@
-//! One AVX2 register.
+//! Implementation with AVX2 registers.
 
 use std::arch::x86_64::*;
 
 use super::{LANES, Lanes, Sums};
 
-/// One group; a mask is all or no bits of each lane.
+/// Vector of one group. As a mask, all or no bits of each lane are set.
 #[derive(Clone, Copy)]
 pub(in super::super) struct Avx2(pub(super) __m256);
 
-// SAFETY of every block below: the instructions need AVX2 (AVX for most), and `Avx2` is named only by
-// `super::super::blend::Blend::tile` and by `super::avx512`, inside functions entered after
-// `is_x86_feature_detected!("avx2")`. Loads and stores are the unaligned forms, over arrays of exactly eight f32; what is
-// fetched is a reference's, and fetching reads nothing.
+// SAFETY of every block below: the instructions need AVX2 (most only AVX). `Avx2` is used only by
+// `super::super::blend::BlendKernel::tile` and by `super::avx512`, in functions entered after
+// `is_x86_feature_detected!("avx2")`. Loads and stores use the unaligned forms, on arrays of exactly eight f32. A
+// prefetched address comes from a reference, and a prefetch reads nothing.
 macro_rules! avx2 {
     ($e:expr) => {
-        // SAFETY: as said above the macro.
+        // SAFETY: see the comment above the macro.
         unsafe { $e }
     };
 }
@@ -22,12 +22,12 @@ macro_rules! avx2 {
 impl Lanes for Avx2 {
     type Mask = Self;
     type Sums = Self;
-    type Twins = [Self; 2];
+    type EvenOddSums = [Self; 2];
     const GROUPS: usize = 1;
 
     #[inline(always)]
-    fn fetch<T>(of: &T) {
-        avx2!(_mm_prefetch::<_MM_HINT_T0>(std::ptr::from_ref(of).cast()))
+    fn prefetch<T>(value: &T) {
+        avx2!(_mm_prefetch::<_MM_HINT_T0>(std::ptr::from_ref(value).cast()))
     }
     #[inline(always)]
     fn splat(value: f32) -> Self {
@@ -38,7 +38,7 @@ impl Lanes for Avx2 {
         Avx2(avx2!(_mm256_loadu_ps(group.as_ptr())))
     }
     #[inline(always)]
-    fn spread<const N: usize>(values: &[[f32; LANES]; N], first: usize) -> Self {
+    fn splat_each<const N: usize>(values: &[[f32; LANES]; N], first: usize) -> Self {
         Self::splat(values.as_flattened()[first])
     }
     #[inline(always)]
@@ -94,7 +94,7 @@ impl Lanes for Avx2 {
         Avx2(avx2!(_mm256_blendv_ps(other.0, self.0, mask.0)))
     }
     #[inline(always)]
-    fn negative(self, mask: Self) -> Self {
+    fn negate_where(self, mask: Self) -> Self {
         Avx2(avx2!(_mm256_or_ps(self.0, _mm256_and_ps(mask.0, _mm256_set1_ps(-0.0)))))
     }
     #[inline(always)]
@@ -110,7 +110,7 @@ impl Lanes for Avx2 {
         sums.add(self)
     }
     #[inline(always)]
-    fn add_to_own(self, [own, other]: [Self; 2]) -> [Self; 2] {
+    fn add_to_even_odd(self, [own, other]: [Self; 2]) -> [Self; 2] {
         [own.add(self), other]
     }
     #[inline(always)]
@@ -128,7 +128,7 @@ impl Sums for Avx2 {
         Self::splat(0.0)
     }
     #[inline(always)]
-    fn and(self, other: Self) -> Self {
+    fn plus(self, other: Self) -> Self {
         self.add(other)
     }
     #[inline(always)]
@@ -139,14 +139,14 @@ impl Sums for Avx2 {
     }
     /// Halves the number of registers with each addition, so that eight sums cost little more than two.
     #[inline(always)]
-    fn totals(of: [Self; LANES]) -> [f32; LANES] {
+    fn totals(sums: [Self; LANES]) -> [f32; LANES] {
         let halves = |a: Self, b: Self| {
             avx2!(_mm256_add_ps(_mm256_permute2f128_ps::<0x20>(a.0, b.0), _mm256_permute2f128_ps::<0x31>(a.0, b.0)))
         };
         let quarters = |a, b| avx2!(_mm256_add_ps(_mm256_unpacklo_ps(a, b), _mm256_unpackhi_ps(a, b)));
-        let [a, b, c, d, e, f, g, h] = of;
+        let [a, b, c, d, e, f, g, h] = sums;
         let (ab, cd) = (quarters(halves(a, e), halves(b, f)), quarters(halves(c, g), halves(d, h)));
-        // Pairs of lanes (a, b) and (c, d) of the first sums, then of the second.
+        // Pairs of lanes (a, b) and (c, d) of the first sums, then of the second ones.
         Avx2(avx2!(_mm256_add_ps(_mm256_shuffle_ps::<0x44>(ab, cd), _mm256_shuffle_ps::<0xee>(ab, cd)))).values()
     }
 }

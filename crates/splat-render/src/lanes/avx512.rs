@@ -1,21 +1,21 @@
-//! One AVX-512 register.
+//! Implementation with AVX-512 registers.
 
 use std::arch::x86_64::*;
 
 use super::avx2::Avx2;
-use super::{LANES, Lanes, Twins};
+use super::{EvenOddSums, LANES, Lanes};
 
-/// Two groups.
+/// Vector of two groups.
 #[derive(Clone, Copy)]
 pub(in super::super) struct Avx512(__m512);
 
-// SAFETY of every block below: the instructions need AVX-512 F and DQ (VL lets narrower ones use all registers), and
-// `Avx512` is named only by `super::super::blend::Blend::tile`, inside a function entered after all were detected (with
-// AVX2, for `Avx2`). Loads and stores are the unaligned forms, over arrays of exactly two, eight or sixteen f32; what is fetched is a
-// reference's, and fetching reads nothing.
+// SAFETY of every block below: the instructions need AVX-512 F and DQ (VL lets narrower ones use all registers).
+// `Avx512` is used only by `super::super::blend::BlendKernel::tile`, in a function entered after all of them were
+// detected (with AVX2, for `Avx2`). Loads and stores use the unaligned forms, on arrays of exactly two, eight or
+// sixteen f32. A prefetched address comes from a reference, and a prefetch reads nothing.
 macro_rules! avx512 {
     ($e:expr) => {
-        // SAFETY: as said above the macro.
+        // SAFETY: see the comment above the macro.
         unsafe { $e }
     };
 }
@@ -23,12 +23,12 @@ macro_rules! avx512 {
 impl Lanes for Avx512 {
     type Mask = __mmask16;
     type Sums = Avx2;
-    type Twins = Self;
+    type EvenOddSums = Self;
     const GROUPS: usize = 2;
 
     #[inline(always)]
-    fn fetch<T>(of: &T) {
-        avx512!(_mm_prefetch::<_MM_HINT_T0>(std::ptr::from_ref(of).cast()))
+    fn prefetch<T>(value: &T) {
+        avx512!(_mm_prefetch::<_MM_HINT_T0>(std::ptr::from_ref(value).cast()))
     }
     #[inline(always)]
     fn splat(value: f32) -> Self {
@@ -39,7 +39,7 @@ impl Lanes for Avx512 {
         Avx512(avx512!(_mm512_broadcast_f32x8(_mm256_loadu_ps(group.as_ptr()))))
     }
     #[inline(always)]
-    fn spread<const N: usize>(values: &[[f32; LANES]; N], first: usize) -> Self {
+    fn splat_each<const N: usize>(values: &[[f32; LANES]; N], first: usize) -> Self {
         let two = &values.as_flattened().as_chunks::<2>().0[first / 2];
         Avx512(avx512!({
             let which = _mm512_setr_epi32(0, 0, 0, 0, 0, 0, 0, 0, 1, 1, 1, 1, 1, 1, 1, 1);
@@ -102,7 +102,7 @@ impl Lanes for Avx512 {
         Avx512(avx512!(_mm512_mask_blend_ps(mask, other.0, self.0)))
     }
     #[inline(always)]
-    fn negative(self, mask: __mmask16) -> Self {
+    fn negate_where(self, mask: __mmask16) -> Self {
         Avx512(avx512!(_mm512_or_ps(self.0, _mm512_maskz_mov_ps(mask, _mm512_set1_ps(-0.0)))))
     }
     #[inline(always)]
@@ -120,7 +120,7 @@ impl Lanes for Avx512 {
         sums.add(first).add(second)
     }
     #[inline(always)]
-    fn add_to_own(self, sums: Self) -> Self {
+    fn add_to_even_odd(self, sums: Self) -> Self {
         sums.add(self)
     }
     #[inline(always)]
@@ -132,24 +132,25 @@ impl Lanes for Avx512 {
     }
 }
 
-impl Twins for Avx512 {
+impl EvenOddSums for Avx512 {
     type Sums = Avx2;
     #[inline(always)]
     fn zero() -> Self {
         Self::splat(0.0)
     }
     #[inline(always)]
-    fn turned(self) -> Self {
+    fn swapped(self) -> Self {
         self
     }
     #[inline(always)]
-    fn together(self) -> Avx2 {
+    fn combined(self) -> Avx2 {
         let [even, odd] = self.groups();
         even.add(odd)
     }
 }
 
 impl Avx512 {
+    /// Returns the two groups.
     #[inline(always)]
     fn groups(self) -> [Avx2; 2] {
         avx512!([Avx2(_mm512_castps512_ps256(self.0)), Avx2(_mm512_extractf32x8_ps::<1>(self.0))])

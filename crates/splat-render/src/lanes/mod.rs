@@ -1,10 +1,9 @@
-//! Groups of eight f32 side by side: the arithmetic of the blend, once for AVX-512, once for AVX2 and once for every
-//! other machine.
+//! Vectors of f32 in groups of eight: the arithmetic of the blend for AVX-512, AVX2 and all other machines.
 //!
-//! All give the same bits: every operation is a single IEEE one, and no multiply-add is fused, because
-//! a fused one would make pictures depend on the machine (and its software form is slow where the
-//! hardware has none). The two groups of an AVX-512 vector are added to sums one after the other, as those of two
-//! narrower vectors are, or each to its own ([`Twins`]), as narrower vectors are in two goes.
+//! All implementations give the same bits. Every operation is a single IEEE operation. No multiply-add is fused: fused
+//! ones would make renders depend on the machine, and their software form is slow without hardware support. An AVX-512
+//! vector has two groups. Its groups are added to sums one after the other, like those of two narrower vectors.
+//! Alternatively each group is added to its own sums ([`EvenOddSums`]), like narrower vectors in two passes.
 
 mod portable;
 
@@ -21,10 +20,10 @@ pub(super) use avx2::Avx2;
 pub(super) use avx512::Avx512;
 pub(super) use portable::Portable;
 
-/// Lanes of one group.
+/// Number of lanes of one group.
 pub(super) const LANES: usize = 8;
 
-/// Values that begin with a line of the cache, so that no vector of them lies in two.
+/// Values aligned to a cache line, so that no vector of them spans two lines.
 #[derive(Debug, Clone, Copy, Default)]
 #[repr(align(64))]
 pub(super) struct Aligned<T>(pub(super) T);
@@ -44,75 +43,85 @@ impl<T> DerefMut for Aligned<T> {
     }
 }
 
-/// 1.5 · 2²³: adding it rounds an f32 of magnitude below 2²² to an integer kept in the low bits.
+/// Rounding constant 1.5 · 2²³: a sum with it rounds an f32 of magnitude below 2²² to an integer in the low bits.
 const ROUND: f32 = 12_582_912.0;
 
-/// 2^f = 1 + f·(c₁ + f·(c₂ + …)) on |f| ≤ ½: minimax of relative error, 4e-9 before rounding.
+/// Coefficients of 2^f = 1 + f·(c₁ + f·(c₂ + …)) on |f| ≤ ½: minimax approximation of the relative error, 4e-9 before
+/// rounding.
 const EXP2: [f32; 6] =
     [std::f32::consts::LN_2, 0.240_226_48, 0.055_503_324, 0.009_618_437, 0.001_339_887_5, 0.000_153_533_62];
 
-/// One or more groups of eight f32 values.
+/// Vector of one or more groups of eight f32 values.
 ///
-/// A type of this trait may be used only where its instructions exist; `super::blend` is the one place
-/// that chooses, after detection.
+/// A type of this trait may be used only if the machine has its instructions. Only `super::blend` chooses one, after
+/// detection.
 pub(super) trait Lanes: Copy {
     /// One truth value per lane.
     type Mask: Copy;
     /// Sums of one group.
     type Sums: Sums;
-    /// Sums of two groups, those at even and those at odd places.
-    type Twins: Twins<Sums = Self::Sums>;
-    /// Groups in one vector; a power of two.
+    /// Sums of two groups: of the groups with even index, and of those with odd index.
+    type EvenOddSums: EvenOddSums<Sums = Self::Sums>;
+    /// Number of groups in a vector; a power of two.
     const GROUPS: usize;
 
-    /// A hint that it will soon be read.
+    /// Tells the processor that the value will be read soon.
     #[inline(always)]
-    fn fetch<T>(_: &T) {}
+    fn prefetch<T>(_: &T) {}
+    /// Returns a vector with `value` in every lane.
     fn splat(value: f32) -> Self;
-    /// The same eight values in every group.
+    /// Returns a vector with these eight values in every group.
     fn repeat(group: &[f32; LANES]) -> Self;
-    /// To each group one value, the first of them at place `first` among all, a multiple of [`Lanes::GROUPS`].
-    fn spread<const N: usize>(values: &[[f32; LANES]; N], first: usize) -> Self;
-    /// Groups `first` and those after it, a multiple of [`Lanes::GROUPS`].
+    /// Returns a vector whose group k has value `first + k` in all of its lanes. `first` is a multiple of
+    /// [`Lanes::GROUPS`].
+    fn splat_each<const N: usize>(values: &[[f32; LANES]; N], first: usize) -> Self;
+    /// Loads the groups from `first` on. `first` is a multiple of [`Lanes::GROUPS`].
     fn load<const N: usize>(from: &[[f32; LANES]; N], first: usize) -> Self;
+    /// Stores the groups from `first` on. `first` is a multiple of [`Lanes::GROUPS`].
     fn store<const N: usize>(self, to: &mut [[f32; LANES]; N], first: usize);
+    /// Returns the sum.
     fn add(self, other: Self) -> Self;
+    /// Returns the difference.
     fn sub(self, other: Self) -> Self;
+    /// Returns the product.
     fn mul(self, other: Self) -> Self;
+    /// Returns the quotient.
     fn div(self, other: Self) -> Self;
-    /// `other` where either is NaN.
+    /// Returns the smaller value; `other` if either is NaN.
     fn min(self, other: Self) -> Self;
-    /// `other` where either is NaN.
+    /// Returns the larger value; `other` if either is NaN.
     fn max(self, other: Self) -> Self;
-    /// Mask of `self ≥ other`; false for NaN.
+    /// Returns the mask of `self ≥ other`; false for NaN.
     fn at_least(self, other: Self) -> Self::Mask;
+    /// Returns the intersection of two masks.
     fn both(a: Self::Mask, b: Self::Mask) -> Self::Mask;
-    /// One bit per lane.
+    /// Returns the mask as bits, one per lane.
     fn bits(mask: Self::Mask) -> u32;
-    /// `self` where the mask is set, else 0.
+    /// Returns `self` where the mask is set, else 0.
     fn keep(self, mask: Self::Mask) -> Self;
-    /// `self` where the mask is set, else `other`.
+    /// Returns `self` where the mask is set, else `other`.
     fn or_else(self, mask: Self::Mask, other: Self) -> Self;
-    /// `self`, made negative where the mask is set.
-    fn negative(self, mask: Self::Mask) -> Self;
-    /// Whether the sign of every lane is set.
+    /// Returns `self` with the sign bit set where the mask is set.
+    fn negate_where(self, mask: Self::Mask) -> Self;
+    /// Returns whether the sign bit of every lane is set.
     fn all_negative(self) -> bool;
-    /// Largest of all lanes, which are no NaN.
+    /// Returns the largest lane. No lane may be NaN.
     fn largest(self) -> f32;
-    /// `sums` with each group added in turn.
+    /// Adds each group in turn to `sums`.
     fn add_to(self, sums: Self::Sums) -> Self::Sums;
-    /// `sums` with each group added to its own, one alone to the first.
-    fn add_to_own(self, sums: Self::Twins) -> Self::Twins;
-    /// `self · 2ⁿ` with n the low bits of `rounded`, as left there by adding [`ROUND`].
+    /// Adds each group to its own sums. A vector of one group is added to the first sums.
+    fn add_to_even_odd(self, sums: Self::EvenOddSums) -> Self::EvenOddSums;
+    /// Returns `self · 2ⁿ`, where the low bits of `rounded` hold n, as after adding [`ROUND`].
     fn scale(self, rounded: Self) -> Self;
 
-    /// 2^self for `self ≤ 0`; relative error below 1.6e-7 down to 2⁻¹²⁶, where it stays below.
+    /// Computes 2^self for `self ≤ 0`. The relative error is below 1.6e-7 down to 2⁻¹²⁶; smaller results stay at or
+    /// below 2⁻¹²⁶.
     #[inline(always)]
     fn exp2(self) -> Self {
         let power = self.max(Self::splat(-126.0));
         let rounded = power.add(Self::splat(ROUND));
         let f = power.sub(rounded.sub(Self::splat(ROUND)));
-        // Estrin's pairing: half the latency of Horner's, which the blend waits for.
+        // Estrin's scheme has half the latency of Horner's, which is critical for the blend.
         let pair = |k: usize| Self::splat(EXP2[k + 1]).mul(f).add(Self::splat(EXP2[k]));
         let square = f.mul(f);
         let low = pair(0).add(square.mul(pair(2)));
@@ -121,52 +130,57 @@ pub(super) trait Lanes: Copy {
     }
 }
 
-/// Sums of two groups, each of its own: half the additions, of which none waits for another of the same vector.
+/// Sums of the groups with even index and of those with odd index.
 ///
-/// Vectors of one group are added to the first of both, and the two change places when all of the even ones are.
-pub(super) trait Twins: Copy {
+/// Two separate sums halve the number of dependent additions: the two groups of a vector never wait for each other. A
+/// vector of one group is always added to the first sums. The two sums are swapped after all groups with even index.
+pub(super) trait EvenOddSums: Copy {
     type Sums: Sums;
+    /// Returns sums of 0.
     fn zero() -> Self;
-    /// With the two in each other's place, where vectors are of one group.
-    fn turned(self) -> Self;
-    /// The sums of the odd added to those of the even.
-    fn together(self) -> Self::Sums;
+    /// Returns the sums in swapped order if vectors have one group, else unchanged.
+    fn swapped(self) -> Self;
+    /// Returns the sum of both.
+    fn combined(self) -> Self::Sums;
 }
 
-/// Of vectors of one group, turned as often as added to.
-impl<V: Sums> Twins for [V; 2] {
+/// Sums for vectors of one group. They are swapped after the even and after the odd groups.
+impl<V: Sums> EvenOddSums for [V; 2] {
     type Sums = V;
     #[inline(always)]
     fn zero() -> Self {
         [V::zero(); 2]
     }
     #[inline(always)]
-    fn turned(self) -> Self {
+    fn swapped(self) -> Self {
         [self[1], self[0]]
     }
     #[inline(always)]
-    fn together(self) -> V {
-        self[0].and(self[1])
+    fn combined(self) -> V {
+        self[0].plus(self[1])
     }
 }
 
-/// Eight sums side by side.
+/// Sums in eight lanes.
 pub(super) trait Sums: Copy {
+    /// Returns sums of 0.
     fn zero() -> Self;
-    fn and(self, other: Self) -> Self;
+    /// Returns the lane-wise sum.
+    fn plus(self, other: Self) -> Self;
+    /// Returns the eight sums.
     fn values(self) -> [f32; LANES];
 
-    /// Sum of all, in a fixed order.
+    /// Returns the sum of all lanes, added in a fixed order.
     #[inline(always)]
     fn total(self) -> f32 {
         let x = self.values();
         ((x[0] + x[4]) + (x[2] + x[6])) + ((x[1] + x[5]) + (x[3] + x[7]))
     }
 
-    /// [`Sums::total`] of each.
+    /// Returns [`Sums::total`] of eight sums.
     #[inline(always)]
-    fn totals(of: [Self; LANES]) -> [f32; LANES] {
-        of.map(Self::total)
+    fn totals(sums: [Self; LANES]) -> [f32; LANES] {
+        sums.map(Self::total)
     }
 }
 
@@ -175,7 +189,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn exp2_is_within_three_roundings_of_the_truth() {
+    fn exp2_has_relative_error_below_1_6e_7() {
         let mut worst = 0.0f64;
         for step in 0..2_000_000 {
             let power = -(step as f32) * 1e-5;
@@ -186,7 +200,7 @@ mod tests {
     }
 
     #[test]
-    fn exp2_far_below_stays_tiny_and_nonnegative() {
+    fn exp2_of_very_negative_numbers_is_tiny_and_nonnegative() {
         for power in [-126.0, -127.3, -1e9, f32::NEG_INFINITY] {
             let got = Portable::splat(power).exp2().largest();
             assert!((0.0..=f32::MIN_POSITIVE).contains(&got), "2^{power} gave {got}");

@@ -1,12 +1,13 @@
-//! The form every machine understands.
+//! Implementation for every machine, without intrinsics.
 
 use super::{LANES, Lanes, Sums};
 
-/// One group.
+/// Vector of one group.
 #[derive(Clone, Copy)]
 pub(in super::super) struct Portable([f32; LANES]);
 
 impl Portable {
+    /// Applies `f` to each pair of lanes.
     #[inline(always)]
     fn zip(self, other: Self, f: impl Fn(f32, f32) -> f32) -> Self {
         Portable(std::array::from_fn(|l| f(self.0[l], other.0[l])))
@@ -16,7 +17,7 @@ impl Portable {
 impl Lanes for Portable {
     type Mask = [bool; LANES];
     type Sums = Self;
-    type Twins = [Self; 2];
+    type EvenOddSums = [Self; 2];
     const GROUPS: usize = 1;
 
     #[inline(always)]
@@ -28,7 +29,7 @@ impl Lanes for Portable {
         Portable(*group)
     }
     #[inline(always)]
-    fn spread<const N: usize>(values: &[[f32; LANES]; N], first: usize) -> Self {
+    fn splat_each<const N: usize>(values: &[[f32; LANES]; N], first: usize) -> Self {
         Self::splat(values.as_flattened()[first])
     }
     #[inline(always)]
@@ -84,7 +85,7 @@ impl Lanes for Portable {
         Portable(std::array::from_fn(|l| if mask[l] { self.0[l] } else { other.0[l] }))
     }
     #[inline(always)]
-    fn negative(self, mask: [bool; LANES]) -> Self {
+    fn negate_where(self, mask: [bool; LANES]) -> Self {
         Portable(self.0.map(|value| -value.abs())).or_else(mask, self)
     }
     #[inline(always)]
@@ -100,7 +101,7 @@ impl Lanes for Portable {
         sums.add(self)
     }
     #[inline(always)]
-    fn add_to_own(self, [own, other]: [Self; 2]) -> [Self; 2] {
+    fn add_to_even_odd(self, [own, other]: [Self; 2]) -> [Self; 2] {
         [own.add(self), other]
     }
     #[inline(always)]
@@ -115,7 +116,7 @@ impl Sums for Portable {
         Portable([0.0; LANES])
     }
     #[inline(always)]
-    fn and(self, other: Self) -> Self {
+    fn plus(self, other: Self) -> Self {
         self.add(other)
     }
     #[inline(always)]

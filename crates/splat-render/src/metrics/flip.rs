@@ -1,15 +1,16 @@
-//! FLIP: what a person would see, flipping between two pictures.
+//! FLIP: the difference that a person perceives when alternating between two images.
 
 use nv_flip::{DEFAULT_PIXELS_PER_DEGREE, FlipImageRgb8};
 
 use super::{assert_same_size, clamped};
 use crate::Image;
 
-/// Mean over pixels of the LDR-FLIP error of `a` against the reference `b`, in [0, 1], seen from the
-/// method's own distance (67 pixels per degree); 0 of empty pictures.
+/// Computes the mean LDR-FLIP error over pixels of `a` against the reference `b`, in [0, 1]. Returns 0 for empty
+/// images.
 ///
-/// Both are taken as sRGB of 8 bits, as a screen shows them; NaN as 0. Source: Andersson et al., "FLIP: A
-/// Difference Evaluator for Alternating Images", 2020; computed by its authors' code.
+/// The viewing distance is the default of the method (67 pixels per degree). Images are converted to 8-bit sRGB values,
+/// as on a screen; NaN becomes 0. Source: Andersson et al., "FLIP: A Difference Evaluator for Alternating Images",
+/// 2020; computed by the authors' code.
 ///
 /// # Panics
 /// If the sizes differ.
@@ -19,11 +20,11 @@ pub fn flip(a: &Image, b: &Image) -> f64 {
         return 0.0;
     }
     let bytes = |image: &Image| -> Vec<u8> {
-        // A float-to-integer cast takes NaN to 0.
+        // A float-to-integer cast turns NaN into 0.
         image.data.iter().map(|&value| (clamped(value) * 255.0).round() as u8).collect()
     };
-    let picture = |image: &Image| FlipImageRgb8::with_data(image.width, image.height, &bytes(image));
-    let errors = nv_flip::flip(picture(b), picture(a), DEFAULT_PIXELS_PER_DEGREE).to_vec();
+    let flip_image = |image: &Image| FlipImageRgb8::with_data(image.width, image.height, &bytes(image));
+    let errors = nv_flip::flip(flip_image(b), flip_image(a), DEFAULT_PIXELS_PER_DEGREE).to_vec();
     errors.iter().map(|&error| f64::from(error)).sum::<f64>() / errors.len() as f64
 }
 
@@ -32,7 +33,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn flip_is_nothing_between_equals_and_all_between_black_and_white() {
+    fn flip_is_0_for_equal_images_and_near_1_for_black_and_white() {
         let image = |value| Image { width: 40, height: 30, data: vec![value; 3600] };
         assert_eq!(flip(&image(0.3), &image(0.3)), 0.0);
         let all = flip(&image(2.0), &image(f32::NAN));

@@ -1,8 +1,7 @@
-//! How close pictures are to one another: PSNR, SSIM, FLIP, and the error of what moves.
+//! Image metrics: PSNR, SSIM, FLIP, and the error of frame-to-frame differences.
 //!
-//! Data in: pairs of [`Image`]s of one size. Data out: one f64 per pair. Values are clamped to [0, 1]
-//! first, as a screen does, and everything is summed in f64. Memory: [`BYTES_PER_PIXEL`]; for
-//! FLIP what its authors' code takes.
+//! Input: pairs of [`Image`]s of equal size. Output: one f64 per pair. Values are clamped to [0, 1] first, as on a
+//! screen, and all sums are in f64. Memory: [`BYTES_PER_PIXEL`]; FLIP takes the memory of its authors' code.
 
 mod flip;
 mod ssim;
@@ -12,20 +11,19 @@ pub use ssim::{ssim, ssim_slope};
 
 use crate::Image;
 
-/// Memory of comparing two pictures, per pixel: SSIM's sums are the most.
+/// Bytes per pixel to compare two images. SSIM needs the most.
 pub const BYTES_PER_PIXEL: usize = 5 * size_of::<f64>();
 
-/// Memory of [`ssim_slope`], per pixel: SSIM's sums of three channels, and their slopes twice.
+/// Bytes per pixel for [`ssim_slope`]: the sums of SSIM for three channels, and their derivatives twice.
 pub const BYTES_PER_PIXEL_OF_SLOPE: usize = 3 * (BYTES_PER_PIXEL + size_of::<f64>() + size_of::<f32>());
 
-/// PSNR of pictures that agree to the last bit, and of any nearer than that: a mean over pictures then
-/// stays finite.
+/// Maximum PSNR in dB, returned for equal images. It keeps the mean over views finite.
 pub const PSNR_CAP_DB: f64 = 100.0;
 
-/// Peak signal-to-noise ratio with peak 1: −10·log₁₀ of the mean squared difference over pixels and
-/// channels, dB, at most [`PSNR_CAP_DB`]. Over several pictures, average this value.
+/// Computes the peak signal-to-noise ratio with peak 1 in dB: −10·log₁₀ of the mean squared difference over pixels and
+/// channels, at most [`PSNR_CAP_DB`]. For several views, average this value.
 ///
-/// Two empty images agree. NaN in either image gives NaN.
+/// Two empty images are equal. NaN in either image gives NaN.
 ///
 /// # Panics
 /// If the sizes differ.
@@ -33,13 +31,13 @@ pub fn psnr(a: &Image, b: &Image) -> f64 {
     decibels(mean_square(channels(a, b).map(|(a, b)| a - b)))
 }
 
-/// PSNR of a mean squared difference; NaN of NaN.
+/// Returns the PSNR in dB of a mean squared difference. NaN gives NaN.
 pub fn decibels(mean_square: f64) -> f64 {
     let db = -10.0 * mean_square.log10();
     if db > PSNR_CAP_DB { PSNR_CAP_DB } else { db }
 }
 
-/// Returns the text of a PSNR, with so many `digits` after the point; of NaN what NaN means.
+/// Returns a PSNR as text with `digits` decimal places. NaN becomes an explanation.
 pub fn decibels_text(psnr: f64, digits: usize) -> String {
     match psnr.is_nan() {
         true => "an unmeasurable PSNR (some pixels are NaN)".to_owned(),
@@ -47,10 +45,11 @@ pub fn decibels_text(psnr: f64, digits: usize) -> String {
     }
 }
 
-/// Error of frame-to-frame differences: the root mean square of (a₁ − a₀) − (b₁ − b₀) over pixels and
-/// channels, for one view at two successive frames; in [0, 2], 0 where `b` flickers exactly as `a` moves.
+/// Computes the error of frame-to-frame differences: the root mean square of (a₁ − a₀) − (b₁ − b₀) over pixels and
+/// channels.
 ///
-/// A loss that stands still costs nothing here, one that shimmers does.
+/// The arguments are the images of one view at two successive frames. The result is in [0, 2], and 0 if both sequences
+/// change equally. A constant error does not count; flicker does.
 ///
 /// # Panics
 /// If the sizes differ.
@@ -59,23 +58,24 @@ pub fn temporal_error(a: [&Image; 2], b: [&Image; 2]) -> f64 {
     mean_square(before.zip(after).map(|((a0, b0), (a1, b1))| (a1 - a0) - (b1 - b0))).sqrt()
 }
 
-/// Clamped values of both images, side by side.
+/// Iterates over the clamped values of both images, in pairs.
 fn channels<'a>(a: &'a Image, b: &'a Image) -> impl ExactSizeIterator<Item = (f64, f64)> + 'a {
     assert_same_size(a, b);
     a.data.iter().zip(&b.data).map(|(&a, &b)| (clamped(a), clamped(b)))
 }
 
+/// Panics if the sizes of the images differ.
 fn assert_same_size(a: &Image, b: &Image) {
-    assert_eq!((a.width, a.height), (b.width, b.height), "pictures of different sizes");
-    assert_eq!(a.data.len(), b.data.len(), "pictures of different sizes");
+    assert_eq!((a.width, a.height), (b.width, b.height), "images of different sizes");
+    assert_eq!(a.data.len(), b.data.len(), "images of different sizes");
 }
 
-/// What a screen shows of a value.
+/// Returns the value clamped to [0, 1], as on a screen.
 pub fn clamped(value: f32) -> f64 {
     f64::from(value.clamp(0.0, 1.0))
 }
 
-/// Mean of squares, 0 of nothing.
+/// Returns the mean of squares, or 0 for no values.
 fn mean_square(values: impl ExactSizeIterator<Item = f64>) -> f64 {
     let count = values.len().max(1) as f64;
     values.map(|value| value * value).sum::<f64>() / count
@@ -90,28 +90,28 @@ mod tests {
     }
 
     #[test]
-    fn a_constant_difference_has_its_closed_form() {
+    fn psnr_of_a_constant_difference_has_a_closed_form() {
         let (a, b) = (image(5, 4, |_| 0.25), image(5, 4, |_| 0.375));
         let expected = -20.0 * 0.125f64.log10();
         assert!((psnr(&a, &b) - expected).abs() < 1e-12, "got {}, expected {expected}", psnr(&a, &b));
     }
 
     #[test]
-    fn equal_pictures_are_capped() {
+    fn psnr_of_equal_images_is_capped() {
         let a = image(5, 4, |i| i as f32 * 0.01);
         assert_eq!(psnr(&a, &a), PSNR_CAP_DB);
         assert_eq!(psnr(&image(0, 0, |_| 0.0), &image(0, 0, |_| 0.0)), PSNR_CAP_DB);
     }
 
     #[test]
-    fn what_a_screen_clamps_does_not_count() {
+    fn values_above_1_count_as_1() {
         let (a, b) = (image(3, 3, |_| 1.0), image(3, 3, |i| 1.0 + i as f32));
         assert_eq!(psnr(&a, &b), PSNR_CAP_DB);
         assert_eq!(ssim(&a, &b), 1.0);
     }
 
     #[test]
-    fn nan_decibels_are_named_in_words() {
+    fn nan_psnr_is_explained_in_words() {
         assert_eq!(decibels_text(31.416, 1), "31.4 dB");
         assert_eq!(decibels_text(PSNR_CAP_DB, 2), "100.00 dB");
         let text = decibels_text(f64::NAN, 2);
@@ -119,13 +119,13 @@ mod tests {
     }
 
     #[test]
-    fn nan_is_not_called_agreement() {
+    fn nan_pixels_give_nan() {
         let (a, b) = (image(12, 12, |_| 0.5), image(12, 12, |i| if i == 7 { f32::NAN } else { 0.5 }));
         assert!(psnr(&a, &b).is_nan() && ssim(&a, &b).is_nan());
     }
 
     #[test]
-    fn a_steady_loss_has_no_temporal_error_and_a_flicker_has_its_own() {
+    fn temporal_error_counts_flicker_but_no_constant_error() {
         let (a0, a1) = (image(6, 6, |_| 0.2), image(6, 6, |i| 0.2 + i as f32 * 0.001));
         let shifted = |image: &Image| Image { data: image.data.iter().map(|v| v + 0.25).collect(), ..image.clone() };
         let steady = temporal_error([&a0, &a1], [&shifted(&a0), &shifted(&a1)]);

@@ -1,9 +1,9 @@
-//! Clouds and cameras that are hard on a rasteriser.
+//! Gaussians and cameras that are difficult for a rasterizer.
 
 use crate::model::{Camera, Gaussians};
 use glam::{DMat3, DQuat, DVec3};
 
-/// A camera at the origin that looks along +z, turned a little so that no axis is special.
+/// Returns a camera near the origin that looks along +z, rotated a little so that no axis is special.
 pub fn camera(width: u32, height: u32) -> Camera {
     Camera {
         width,
@@ -18,7 +18,7 @@ pub fn camera(width: u32, height: u32) -> Camera {
     }
 }
 
-/// A camera at the origin whose axes are the world's.
+/// Returns a camera at the origin with the axes of the world.
 pub fn plain_camera(size: u32) -> Camera {
     Camera {
         width: size,
@@ -37,7 +37,7 @@ pub fn plain_camera(size: u32) -> Camera {
 pub struct Random(pub u64);
 
 impl Random {
-    /// The next one.
+    /// Returns the next number.
     pub fn draw(&mut self) -> f32 {
         self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
         let mut z = self.0;
@@ -46,13 +46,14 @@ impl Random {
         ((z ^ z >> 31) >> 40) as f32 / (1u64 << 24) as f32
     }
 
-    /// The next one in [`low`, `high`).
+    /// Returns the next number, scaled to [`low`, `high`).
     pub fn within(&mut self, low: f32, high: f32) -> f32 {
         low + (high - low) * self.draw()
     }
 }
 
-/// A cloud with needles, pancakes, giants, specks, quaternions of any length and Gaussians off-screen.
+/// Returns Gaussians with needles, flat, very large and very small ones, quaternions of any length and Gaussians
+/// off-screen.
 pub fn scene(seed: u64, count: usize, degree: usize) -> Gaussians {
     let mut random = Random(seed);
     let mut scene = Gaussians::zeros(count, degree);
@@ -70,7 +71,7 @@ pub fn scene(seed: u64, count: usize, degree: usize) -> Gaussians {
     scene
 }
 
-/// One Gaussian on the axis of [`plain_camera`], `depth` away, of the color 1, ½, 0.
+/// Returns one Gaussian on the axis of [`plain_camera`], `depth` away, of the color 1, ½, 0.
 pub fn single(depth: f32, scale: f32, opacity: f32) -> Gaussians {
     let mut one = Gaussians::zeros(1, 0);
     one.position.set_row(0, [0.0, 0.0, depth]);

@@ -1,3 +1,3 @@
-//! Inputs made from nothing, the same on every run.
+//! Generated inputs, the same on every run.
 
 pub mod clouds;

@@ -1,23 +1,24 @@
-//! The rasteriser's conventions a second time, slowly: f64 throughout, pixel by pixel, full matrices, no
-//! bound on the reach of an alpha but the tiles of the original kernel.
+//! Oracle of the rasterizer: f64 throughout, pixel by pixel, with full matrices. The extent of a Gaussian is limited
+//! only by the tiles of the original kernel.
 
 use crate::model::{Camera, Gaussians};
 use glam::{DMat2, DMat3, DQuat, DVec2, DVec3};
 
-/// What the oracle sees in one picture.
+/// Result of the oracle for one view.
 pub struct OracleRender {
-    /// `[height · width]`.
+    /// Colors of the pixels, `[height · width]`.
     pub rgb: Vec<[f64; 3]>,
-    /// Whether some decision of the pixel fell within 1e-4 (relative) of its threshold: f32 may differ.
+    /// Whether a decision at the pixel was within 1e-4 (relative) of its threshold, so that f32 may decide differently.
     pub doubtful: Vec<bool>,
-    /// Per Gaussian Σ and max over sampled pixels of alpha · transmittance.
+    /// Sum over the sampled pixels of alpha · transmittance, per Gaussian.
     pub sum: Vec<f64>,
-    /// See [`OracleRender::sum`].
+    /// Maximum over the sampled pixels of alpha · transmittance, per Gaussian.
     pub max: Vec<f64>,
     /// Number of (Gaussian, pixel) pairs blended.
     pub events: u64,
 }
 
+/// A Gaussian projected to the image.
 struct Footprint {
     id: usize,
     depth: f32,
@@ -36,7 +37,7 @@ impl Footprint {
     }
 }
 
-/// Real spherical harmonics of degree up to 3 as products of x, y and z.
+/// Returns the real spherical harmonics of degree up to 3 as products of x, y and z.
 fn basis(d: DVec3) -> [f64; 16] {
     let DVec3 { x, y, z } = d;
     let pi = std::f64::consts::PI;
@@ -61,8 +62,8 @@ fn basis(d: DVec3) -> [f64; 16] {
     ]
 }
 
-/// View depth in f32, added up as the original kernel does.
-fn order([x, y, z]: [f32; 3], camera: &Camera) -> f32 {
+/// Returns the view depth in f32, summed in the order of the original kernel.
+fn view_depth([x, y, z]: [f32; 3], camera: &Camera) -> f32 {
     let row = camera.rotation.row(2).as_vec3();
     (row.x * x + row.y * y) + (row.z * z + camera.translation.z as f32)
 }
@@ -104,7 +105,7 @@ fn footprint(gaussians: &Gaussians, id: usize, camera: &Camera) -> Option<Footpr
     }
     Some(Footprint {
         id,
-        depth: order(gaussians.position.row(id), camera),
+        depth: view_depth(gaussians.position.row(id), camera),
         center,
         inverse: DMat2::from_cols(DVec2::new(a, b), DVec2::new(b, c)).inverse(),
         opacity: 1.0 / (1.0 + (-f64::from(gaussians.opacity_logit.plane(0)[id])).exp()),
@@ -113,19 +114,19 @@ fn footprint(gaussians: &Gaussians, id: usize, camera: &Camera) -> Option<Footpr
     })
 }
 
-/// Renders, and weighs the pixels of every `stride`-th column and row.
+/// Renders a view; only the pixels of every `stride`-th column and row contribute to `sum` and `max`.
 pub fn picture(gaussians: &Gaussians, camera: &Camera, background: [f32; 3], stride: u32) -> OracleRender {
-    picture_of(gaussians, camera, background, stride, |_, _| ())
+    render_with(gaussians, camera, background, stride, |_, _| ())
 }
 
-/// What each pixel blends, by id, nearest first: every decision that a small change of a Gaussian may turn over.
+/// Returns the ids that each pixel blends, nearest first. A small change of a Gaussian may change these lists.
 pub fn blended(gaussians: &Gaussians, camera: &Camera) -> Vec<Vec<usize>> {
     let mut ids = vec![Vec::new(); camera.width as usize * camera.height as usize];
-    picture_of(gaussians, camera, [0.0; 3], 1, |pixel, id| ids[pixel].push(id));
+    render_with(gaussians, camera, [0.0; 3], 1, |pixel, id| ids[pixel].push(id));
     ids
 }
 
-/// The pixels with `blended` decided: a function without steps of everything that is stored.
+/// Renders a view with the lists `blended` held fixed, which makes the image a smooth function of the parameters.
 pub fn decided(gaussians: &Gaussians, camera: &Camera, background: [f32; 3], blended: &[Vec<usize>]) -> Vec<[f64; 3]> {
     let footprints: Vec<Option<Footprint>> = (0..gaussians.len()).map(|id| footprint(gaussians, id, camera)).collect();
     let pixel = |(at, ids): (usize, &Vec<usize>)| {
@@ -141,7 +142,7 @@ pub fn decided(gaussians: &Gaussians, camera: &Camera, background: [f32; 3], ble
     blended.iter().enumerate().map(pixel).collect()
 }
 
-fn picture_of(
+fn render_with(
     gaussians: &Gaussians,
     camera: &Camera,
     background: [f32; 3],

@@ -1,9 +1,10 @@
-//! The statistics over again, slowly: whole sequences in memory, the definitions of method.md written out in
-//! f64, sharing no code with the streaming scan.
+//! Oracle of the statistics: whole sequences in memory, the definitions of method.md written out in f64, sharing no
+//! code with the streaming scan.
 
 use crate::model::{Camera, Gaussians, Schedule};
 use crate::recipe::{MotionParams, ScanParams};
 
+/// Statistics of one Gaussian.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct OracleRow {
     pub(crate) d: f64,
@@ -14,7 +15,7 @@ pub(crate) struct OracleRow {
     pub(crate) vis: f64,
 }
 
-/// The row of Gaussian `i`; frames are evenly spaced.
+/// Returns the statistics of Gaussian `i`; frames are evenly spaced.
 pub(crate) fn row(i: usize, frames: &[Gaussians], schedule: &Schedule, scan: &ScanParams) -> OracleRow {
     let last = frames.len() - 1;
     let x = |t: usize| frames[t].position.row::<3>(i).map(f64::from);
@@ -53,7 +54,7 @@ pub(crate) fn row(i: usize, frames: &[Gaussians], schedule: &Schedule, scan: &Sc
     OracleRow { d, kappa, v: mean(&deviations), life: life.len() as u32, c: c / pairs, vis: f64::from(touched) / pairs }
 }
 
-/// Area, px², by way of the 3-D covariance and its projection.
+/// Returns the projected area in px², computed from the 3-D covariance and its projection.
 pub(crate) fn area(frame: &Gaussians, i: usize, camera: &Camera) -> f64 {
     let w: [[f64; 3]; 3] = std::array::from_fn(|r| camera.rotation.row(r).to_array());
     let world = frame.position.row::<3>(i).map(f64::from);
@@ -65,8 +66,8 @@ pub(crate) fn area(frame: &Gaussians, i: usize, camera: &Camera) -> f64 {
     let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
     let q = if length == 0.0 { [1.0, 0.0, 0.0, 0.0] } else { q.map(|x| x / length) };
     let s = frame.log_scale.row::<3>(i).map(|log| f64::from(log).exp());
-    // Column k of R is the k-th unit vector turned by q.
-    let axes: [[f64; 3]; 3] = std::array::from_fn(|k| turn_unit_vector(q, k));
+    // Column k of R is the k-th unit vector rotated by q.
+    let axes: [[f64; 3]; 3] = std::array::from_fn(|k| rotated_unit_vector(q, k));
     let sigma: [[f64; 3]; 3] =
         std::array::from_fn(|r| std::array::from_fn(|c| (0..3).map(|k| axes[k][r] * s[k] * s[k] * axes[k][c]).sum()));
     let limit_x = 1.3 * f64::from(camera.width) / (2.0 * camera.fx);
@@ -79,11 +80,11 @@ pub(crate) fn area(frame: &Gaussians, i: usize, camera: &Camera) -> f64 {
     ];
     let t: [[f64; 3]; 2] =
         std::array::from_fn(|r| std::array::from_fn(|c| (0..3).map(|k| jacobian[r][k] * w[k][c]).sum()));
-    let flat = |r: usize, c: usize| -> f64 {
+    let projected = |r: usize, c: usize| -> f64 {
         (0..3).flat_map(|a| (0..3).map(move |b| (a, b))).map(|(a, b)| t[r][a] * sigma[a][b] * t[c][b]).sum()
     };
-    let (xx, xy, yy) = (flat(0, 0) + 0.3, flat(0, 1), flat(1, 1) + 0.3);
-    // Pixel (i, j) is sampled at integer coordinates, so the picture spans −½ to size − ½.
+    let (xx, xy, yy) = (projected(0, 0) + 0.3, projected(0, 1), projected(1, 1) + 0.3);
+    // Pixel (i, j) is sampled at integer coordinates, so the image spans −½ to size − ½.
     let u = camera.fx * p[0] / p[2] + camera.cx - 0.5;
     let v = camera.fy * p[1] / p[2] + camera.cy - 0.5;
     let share = |center: f64, reach: f64, size: f64| {
@@ -94,8 +95,8 @@ pub(crate) fn area(frame: &Gaussians, i: usize, camera: &Camera) -> f64 {
     9.0 * std::f64::consts::PI * (xx * yy - xy * xy).sqrt() * fraction
 }
 
-/// q e_k q*, multiplied out as quaternions.
-fn turn_unit_vector(q: [f64; 4], k: usize) -> [f64; 3] {
+/// Returns q e_k q*, multiplied out as quaternions.
+fn rotated_unit_vector(q: [f64; 4], k: usize) -> [f64; 3] {
     let mut e = [0.0; 4];
     e[k + 1] = 1.0;
     let turned = hamilton(hamilton(q, e), [q[0], -q[1], -q[2], -q[3]]);

@@ -5,11 +5,11 @@ use super::*;
 use crate::files::ply::tests::{file, names, shared_data};
 use crate::model::{ALL_HARMONICS, Column};
 
-struct Scratch(tempfile::TempDir);
+struct TempPly(tempfile::TempDir);
 
-impl Scratch {
-    fn new() -> Scratch {
-        Scratch(tempfile::tempdir().unwrap())
+impl TempPly {
+    fn new() -> TempPly {
+        TempPly(tempfile::tempdir().unwrap())
     }
 
     fn path(&self, name: &str) -> PathBuf {
@@ -41,7 +41,7 @@ fn all(ply: &Ply) -> Gaussians {
     out
 }
 
-/// `len` Gaussians, every value different and exact in an i16.
+/// Returns `len` Gaussians whose values are all different and exact in an i16.
 fn proxies(len: usize, sh_degree: usize) -> Gaussians {
     let mut out = Gaussians::zeros(len, sh_degree);
     for (k, column) in Columns::all().iter().enumerate() {
@@ -51,92 +51,92 @@ fn proxies(len: usize, sh_degree: usize) -> Gaussians {
     out
 }
 
-/// Bits, because NaN is not equal to itself.
+/// Returns the bits of all values, because NaN is not equal to itself.
 fn bits(column: &Column) -> Vec<u32> {
     column.planes().iter().map(|x| x.to_bits()).collect()
 }
 
 #[test]
-fn keeping_every_row_gives_the_file_back() {
-    let scratch = Scratch::new();
+fn keeping_every_row_gives_the_same_bytes() {
+    let temp = TempPly::new();
     for format in ["binary_little_endian", "binary_big_endian"] {
         for line_end in ["\n", "\r\n"] {
             let mut bytes = file(format, "double", &names(), 5, line_end);
             bytes.extend(b"trailing");
-            let ply = scratch.open(&bytes);
-            assert!(scratch.write(&ply, &kept(0..5), &Gaussians::default()) == bytes, "{format} {line_end:?}");
+            let ply = temp.open(&bytes);
+            assert!(temp.write(&ply, &kept(0..5), &Gaussians::default()) == bytes, "{format} {line_end:?}");
         }
     }
 }
 
 #[test]
 #[ignore = "needs the trained models"]
-fn real_models_come_back_byte_for_byte() {
+fn trained_models_are_rewritten_byte_for_byte() {
     let data = shared_data();
-    let scratch = Scratch::new();
+    let temp = TempPly::new();
     for name in ["deform2/point_cloud/iteration_600/point_cloud.ply", "static/guitar.ply", "static/biker.ply"] {
         let path = data.join(name);
         let ply = Ply::open(&path).unwrap();
-        let written = scratch.write(&ply, &kept(0..ply.count() as u32), &Gaussians::default());
+        let written = temp.write(&ply, &kept(0..ply.count() as u32), &Gaussians::default());
         assert!(written == fs::read(&path).unwrap(), "{name}");
-        // These are INRIA's own layout, so the other writer gives the same, where normals are zero.
-        write_inria(&all(&ply), ply.comments(), &scratch.path("inria.ply")).unwrap();
-        assert!(fs::read(scratch.path("inria.ply")).unwrap() == written, "{name}");
+        // These files have the INRIA layout, so the other writer gives the same bytes, except that normals are zero.
+        write_inria(&all(&ply), ply.comments(), &temp.path("inria.ply")).unwrap();
+        assert!(fs::read(temp.path("inria.ply")).unwrap() == written, "{name}");
     }
 }
 
 #[test]
 fn fewer_rows_change_the_count_and_nothing_else() {
-    let scratch = Scratch::new();
+    let temp = TempPly::new();
     let bytes = file("binary_big_endian", "float", &names(), 12, "\r\n");
-    let ply = scratch.open(&bytes);
-    let written = scratch.write(&ply, &kept([3, 11, 0]), &Gaussians::default());
+    let ply = temp.open(&bytes);
+    let written = temp.write(&ply, &kept([3, 11, 0]), &Gaussians::default());
     let text = String::from_utf8_lossy(ply.header().text.as_slice()).replace("vertex 12", "vertex 3");
     assert_eq!(written, [text.as_bytes(), ply.row(3), ply.row(11), ply.row(0)].concat());
-    let none = scratch.write(&ply, &[], &Gaussians::default());
-    assert_eq!(scratch.open(&none).count(), 0);
+    let none = temp.write(&ply, &[], &Gaussians::default());
+    assert_eq!(temp.open(&none).count(), 0);
 }
 
 #[test]
-fn a_comment_that_looks_like_a_header_line_stays() {
-    let scratch = Scratch::new();
+fn a_comment_like_a_header_line_is_unchanged() {
+    let temp = TempPly::new();
     let text = String::from_utf8(file("ascii", "float", &names(), 2, "\n")).unwrap();
     let text = text.replace("comment SplatRenderMode: mip", "comment element vertex 2\ncomment format ascii 1.0");
-    let written = scratch.write(&scratch.open(text.as_bytes()), &kept([1]), &Gaussians::default());
-    let ply = scratch.open(&written);
+    let written = temp.write(&temp.open(text.as_bytes()), &kept([1]), &Gaussians::default());
+    let ply = temp.open(&written);
     assert_eq!((ply.count(), ply.comments()), (1, &["element vertex 2".to_owned(), "format ascii 1.0".to_owned()][..]));
 }
 
 #[test]
 fn a_text_template_becomes_little_endian_binary() {
-    let scratch = Scratch::new();
-    let ply = scratch.open(&file("ascii", "double", &names(), 4, "\n"));
-    let written = scratch.write(&ply, &kept(0..4), &Gaussians::default());
+    let temp = TempPly::new();
+    let ply = temp.open(&file("ascii", "double", &names(), 4, "\n"));
+    let written = temp.write(&ply, &kept(0..4), &Gaussians::default());
     assert!(written == file("binary_little_endian", "double", &names(), 4, "\n"));
 }
 
 #[test]
-fn a_proxy_replaces_its_columns_and_keeps_the_rest_of_its_leader() {
-    let scratch = Scratch::new();
+fn a_proxy_replaces_attributes_and_keeps_extra_properties() {
+    let temp = TempPly::new();
     let mut names = names();
     names.extend(["nx", "ny", "nz"].map(String::from));
     let foreign = ["nx", "ny", "nz", "confidence"];
     for format in ["ascii", "binary_little_endian", "binary_big_endian"] {
         for kind in ["float", "double", "int", "short"] {
-            let ply = scratch.open(&file(format, kind, &names, 6, "\n"));
+            let ply = temp.open(&file(format, kind, &names, 6, "\n"));
             let proxies = proxies(2, 1);
             let rows = [
                 OutRow { source: 4, proxy: Some(1) },
                 OutRow { source: 2, proxy: None },
                 OutRow { source: 4, proxy: Some(0) },
             ];
-            let written = scratch.write(&ply, &rows, &proxies);
-            let folder = Scratch::new();
+            let written = temp.write(&ply, &rows, &proxies);
+            let folder = TempPly::new();
             let out = folder.open(&written);
             let (before, after) = (all(&ply), all(&out));
             for column in Columns::all().iter() {
                 for plane in 0..after.column(column).width() {
-                    let source = |of: &Gaussians, i: usize| of.column(column).plane(plane)[i];
+                    let source = |gaussians: &Gaussians, i: usize| gaussians.column(column).plane(plane)[i];
                     let expected = [source(&proxies, 1), source(&before, 2), source(&proxies, 0)];
                     assert_eq!(after.column(column).plane(plane), expected, "{format} {kind} {}", column.name());
                 }
@@ -150,49 +150,49 @@ fn a_proxy_replaces_its_columns_and_keeps_the_rest_of_its_leader() {
 }
 
 #[test]
-fn a_change_adds_to_any_column_of_rows_and_proxies_and_zeros_leave_the_bytes() {
-    let scratch = Scratch::new();
+fn deltas_are_added_and_zeros_leave_the_bytes() {
+    let temp = TempPly::new();
     for (format, kind) in [("binary_little_endian", "float"), ("binary_big_endian", "double"), ("ascii", "short")] {
-        let ply = scratch.open(&file(format, kind, &names(), 3, "\n"));
+        let ply = temp.open(&file(format, kind, &names(), 3, "\n"));
         let proxies = proxies(1, 1);
         let rows = [OutRow { source: 2, proxy: None }, OutRow { source: 0, proxy: Some(0) }];
-        let plain = scratch.write(&ply, &rows, &proxies);
+        let plain = temp.write(&ply, &rows, &proxies);
         let mut by = Gaussians::zeros(2, 0);
         for column in Columns::all().difference(Columns::LOG_SCALE).iter() {
             by.column_mut(column).plane_mut(0).copy_from_slice(&[3.0, -2.0]);
         }
-        let written = scratch.write_changed(&ply, &rows, &proxies, &ParamDelta(by.clone()));
-        let (folder, other) = (Scratch::new(), Scratch::new());
+        let written = temp.write_changed(&ply, &rows, &proxies, &ParamDelta(by.clone()));
+        let (folder, other) = (TempPly::new(), TempPly::new());
         let mut expected = all(&folder.open(&plain));
         ParamDelta(by).add_to(&mut expected, Columns::all());
         assert!(all(&other.open(&written)) == expected, "{format} {kind}");
-        let zeros = scratch.write_changed(&ply, &rows, &proxies, &ParamDelta(Gaussians::zeros(2, 1)));
+        let zeros = temp.write_changed(&ply, &rows, &proxies, &ParamDelta(Gaussians::zeros(2, 1)));
         assert!(zeros == plain, "{format} {kind}");
     }
 }
 
 #[test]
-fn harmonics_above_a_degree_go_and_those_below_are_where_a_file_of_that_degree_has_them() {
-    let scratch = Scratch::new();
+fn lowering_the_sh_degree_gives_a_file_of_that_degree() {
+    let temp = TempPly::new();
     let whole = proxies(4, 3);
-    write_inria(&whole, &["of degree 3".to_owned()], &scratch.path("whole.ply")).unwrap();
-    let ply = Ply::open(&scratch.path("whole.ply")).unwrap();
+    write_inria(&whole, &["of degree 3".to_owned()], &temp.path("whole.ply")).unwrap();
+    let ply = Ply::open(&temp.path("whole.ply")).unwrap();
     for degree in 0..=4 {
         let mut fewer = whole.clone();
         fewer.drop_bands(degree);
         assert_eq!(fewer.sh_degree(), degree.min(3));
-        let [expected, found] = ["expected.ply", "found.ply"].map(|name| scratch.path(name));
+        let [expected, found] = ["expected.ply", "found.ply"].map(|name| temp.path(name));
         write_inria(&fewer, ply.comments(), &expected).unwrap();
         write_like(&ply, &kept(0..4), &Gaussians::default(), &ParamDelta::default(), degree, &found).unwrap();
         assert!(fs::read(&found).unwrap() == fs::read(&expected).unwrap(), "degree {degree}");
     }
-    // Proxies and changes have all of them; what is no attribute stays where it was.
-    let ply = scratch.open(&file("binary_big_endian", "double", &names(), 3, "\r\n"));
+    // Proxies and deltas have all SH coefficients; extra properties keep their place.
+    let ply = temp.open(&file("binary_big_endian", "double", &names(), 3, "\r\n"));
     let (rows, change) = ([OutRow { source: 2, proxy: Some(0) }, kept([1])[0]], ParamDelta(proxies(2, 1)));
-    let mut expected = all(&scratch.open(&scratch.write_changed(&ply, &rows, &proxies(1, 1), &change)));
-    let ply = scratch.open(&file("binary_big_endian", "double", &names(), 3, "\r\n"));
-    write_like(&ply, &rows, &proxies(1, 1), &change, 0, &scratch.path("out.ply")).unwrap();
-    let found = Ply::open(&scratch.path("out.ply")).unwrap();
+    let mut expected = all(&temp.open(&temp.write_changed(&ply, &rows, &proxies(1, 1), &change)));
+    let ply = temp.open(&file("binary_big_endian", "double", &names(), 3, "\r\n"));
+    write_like(&ply, &rows, &proxies(1, 1), &change, 0, &temp.path("out.ply")).unwrap();
+    let found = Ply::open(&temp.path("out.ply")).unwrap();
     expected.drop_bands(0);
     assert!(all(&found) == expected);
     let left: Vec<String> = names().into_iter().filter(|name| !name.starts_with("f_rest_")).collect();
@@ -205,24 +205,24 @@ fn harmonics_above_a_degree_go_and_those_below_are_where_a_file_of_that_degree_h
 }
 
 #[test]
-fn a_surfel_has_no_place_for_a_third_scale() {
-    let scratch = Scratch::new();
+fn a_surfel_file_drops_the_third_scale_of_proxies() {
+    let temp = TempPly::new();
     let names: Vec<String> = names().into_iter().filter(|name| name != "scale_2").collect();
-    let ply = scratch.open(&file("binary_little_endian", "float", &names, 1, "\n"));
+    let ply = temp.open(&file("binary_little_endian", "float", &names, 1, "\n"));
     let proxies = proxies(1, 1);
-    let written = scratch.write(&ply, &[OutRow { source: 0, proxy: Some(0) }], &proxies);
-    let out = Scratch::new();
+    let written = temp.write(&ply, &[OutRow { source: 0, proxy: Some(0) }], &proxies);
+    let out = TempPly::new();
     let out = all(&out.open(&written));
     assert_eq!(out.log_scale.row::<2>(0), proxies.log_scale.row::<2>(0));
     assert_eq!(out.rotation, proxies.rotation);
 }
 
 #[test]
-fn rows_and_proxies_that_do_not_exist_are_refused() {
-    let scratch = Scratch::new();
-    let ply = scratch.open(&file("binary_little_endian", "float", &names(), 2, "\n"));
+fn missing_rows_and_proxies_are_refused() {
+    let temp = TempPly::new();
+    let ply = temp.open(&file("binary_little_endian", "float", &names(), 2, "\n"));
     let refusal = |rows: &[OutRow], proxies: &Gaussians| {
-        write_like(&ply, rows, proxies, &ParamDelta::default(), ALL_HARMONICS, &scratch.path("none.ply"))
+        write_like(&ply, rows, proxies, &ParamDelta::default(), ALL_HARMONICS, &temp.path("none.ply"))
             .unwrap_err()
             .to_string()
     };
@@ -230,19 +230,19 @@ fn rows_and_proxies_that_do_not_exist_are_refused() {
     assert!(refusal(&[OutRow { source: 0, proxy: Some(1) }], &proxies(1, 1)).contains("proxy 1 "));
     assert!(refusal(&[OutRow { source: 0, proxy: Some(0) }], &proxies(1, 3)).contains("48 SH planes"));
     let short = ParamDelta(Gaussians::zeros(1, 1));
-    let path = scratch.path("none.ply");
+    let path = temp.path("none.ply");
     let message = write_like(&ply, &kept([0, 1]), &Gaussians::default(), &short, ALL_HARMONICS, &path);
     assert!(message.unwrap_err().to_string().contains("1 changes of 2 rows"));
-    assert!(!scratch.path("none.ply").exists());
+    assert!(!temp.path("none.ply").exists());
 }
 
 #[test]
-fn the_inria_layout_reads_back_bit_for_bit_at_every_degree() {
-    let scratch = Scratch::new();
+fn the_inria_layout_round_trips_at_every_degree() {
+    let temp = TempPly::new();
     for degree in 0..=3 {
         let mut gaussians = proxies(5, degree);
         gaussians.position.set_row(0, [f32::from_bits(0x7fc0_1234), -0.0, 1e-45]);
-        let path = scratch.path("a.ply");
+        let path = temp.path("a.ply");
         write_inria(&gaussians, &["SplatRenderMode: mip".to_owned(), "two\nlines".to_owned()], &path).unwrap();
         let ply = Ply::open(&path).unwrap();
         assert_eq!(ply.comments(), ["SplatRenderMode: mip", "two lines"]);
@@ -254,7 +254,7 @@ fn the_inria_layout_reads_back_bit_for_bit_at_every_degree() {
             assert_eq!(ply.row(0).len(), 248);
         }
     }
-    write_inria(&Gaussians::zeros(0, 2), &[], &scratch.path("empty.ply")).unwrap();
-    assert_eq!(Ply::open(&scratch.path("empty.ply")).unwrap().count(), 0);
-    assert!(write_inria(&Gaussians::default(), &[], &scratch.path("no_sh.ply")).is_err());
+    write_inria(&Gaussians::zeros(0, 2), &[], &temp.path("empty.ply")).unwrap();
+    assert_eq!(Ply::open(&temp.path("empty.ply")).unwrap().count(), 0);
+    assert!(write_inria(&Gaussians::default(), &[], &temp.path("no_sh.ply")).is_err());
 }

@@ -1,9 +1,8 @@
 //! A 4DGaussians model folder as a sequence of frames.
 //!
-//! Data in: `cfg_args`, `point_cloud/iteration_K/{point_cloud.ply, deformation.pth}`, time stamps.
-//! Data out: states of any Gaussians at any frame. Memory: the canonical cloud (44 + 12·(d+1)² bytes
-//! per Gaussian), the field's tensors, and per open reader the canonical rows again plus
-//! [`Field::bytes_per_gaussian`].
+//! Input: `cfg_args`, `point_cloud/iteration_K/{point_cloud.ply, deformation.pth}`, frame times. Output: states of any
+//! Gaussians at any frame. Memory: the canonical Gaussians (44 + 12·(d+1)² bytes per Gaussian at SH degree d), the
+//! tensors of the field, and per open reader a copy of its canonical rows plus [`Field::bytes_per_gaussian`].
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -23,35 +22,35 @@ use super::small_field::rounded;
 use crate::files::digest::hash_file;
 use crate::files::ply::{Ply, PlyOptions};
 use crate::files::state_dict::read_state_dict;
-use crate::models::iterations::iteration as iteration_folder;
+use crate::models::iterations::find_iteration;
 
-/// The files of a model folder.
+/// Paths of the files of a model folder.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ModelPaths {
-    /// The model folder.
+    /// Path of the model folder.
     pub root: PathBuf,
     /// K of `iteration_K`.
     pub iteration: u32,
-    /// `<root>/cfg_args`.
+    /// Path of `<root>/cfg_args`.
     pub cfg_args: PathBuf,
-    /// The canonical cloud.
+    /// Path of the point cloud file with the canonical Gaussians.
     pub point_cloud: PathBuf,
-    /// The deformation field's state dict.
+    /// Path of the state dict of the deformation field.
     pub deformation: PathBuf,
-    /// `deformation_table.pth`, if there is one.
+    /// Path of `deformation_table.pth`, if it exists.
     pub deformation_table: Option<PathBuf>,
-    /// `deformation_accum.pth`, if there is one.
+    /// Path of `deformation_accum.pth`, if it exists.
     pub deformation_accum: Option<PathBuf>,
 }
 
 impl ModelPaths {
-    /// Finds the files of the model at `root`: of `iteration`, or of the largest one.
+    /// Finds the files of the model at `root`, of `iteration` or of the largest one.
     ///
     /// # Errors
-    /// A folder or file that is missing; optional files may be.
+    /// Fails if a folder or a required file is missing.
     pub fn locate(root: &Path, iteration: Option<u32>) -> Result<Self> {
         let clouds = root.join("point_cloud");
-        let (iteration, folder) = iteration_folder(&clouds, iteration)?;
+        let (iteration, folder) = find_iteration(&clouds, iteration)?;
         let optional = |name: &str| Some(folder.join(name)).filter(|path| path.exists());
         let paths = ModelPaths {
             root: root.to_owned(),
@@ -64,19 +63,22 @@ impl ModelPaths {
         };
         for path in paths.required() {
             if !path.is_file() {
-                return Err(Error::input(path, "", "a file of the model folder", "none")
+                return Err(Error::input(path, "", "this file of the model folder", "no such file")
                     .hint("a 4DGaussians model folder holds cfg_args and point_cloud/iteration_K/{point_cloud.ply, deformation.pth}"));
             }
         }
         Ok(paths)
     }
 
-    /// The files a model cannot do without, in the order the digest reads them.
+    /// Returns the required files, in the order in which the digest reads them.
     fn required(&self) -> [&Path; 3] {
         [&self.point_cloud, &self.deformation, &self.cfg_args]
     }
 
-    /// xxh3-128 over the bytes of point cloud, deformation and `cfg_args`, as 32 hex digits.
+    /// Returns the xxh3-128 hash of the bytes of point cloud, deformation and `cfg_args`, as 32 hex digits.
+    ///
+    /// # Errors
+    /// Fails if a file cannot be read.
     pub fn digest(&self) -> Result<String> {
         let mut hash = Xxh3::new();
         self.required().into_iter().try_for_each(|path| hash_file(path, &mut hash))?;
@@ -84,9 +86,9 @@ impl ModelPaths {
     }
 }
 
-/// A trained 4DGaussians model: a canonical cloud and the field that deforms it.
+/// Trained 4DGaussians model: canonical Gaussians and the field that deforms them.
 ///
-/// The model is continuous in time; [`ModelFolder::with_times`] says which instants are its frames.
+/// The model is continuous in time; [`ModelFolder::with_times`] sets the times of its frames.
 #[derive(Debug, Clone)]
 pub struct ModelFolder {
     paths: ModelPaths,
@@ -101,8 +103,11 @@ pub struct ModelFolder {
 }
 
 impl ModelFolder {
-    /// Reads configuration and field of the model at `paths` within `memory`; `canonical` is its point cloud, of
-    /// `sh_degree`. The sequence has no frames yet.
+    /// Reads the configuration and field of the model at `paths` within `memory`. `canonical` holds its Gaussians, with
+    /// SH degree `sh_degree`. The sequence has no frames yet.
+    ///
+    /// # Errors
+    /// Fails if a file cannot be read, contradicts another, or needs more than `memory`.
     pub fn with_cloud(paths: ModelPaths, canonical: Gaussians, sh_degree: usize, memory: ReadLimit) -> Result<Self> {
         let config = ModelConfig::read(&paths.cfg_args)?;
         let tensors = read_state_dict(&paths.deformation, memory)?;
@@ -115,92 +120,100 @@ impl ModelFolder {
         Ok(ModelFolder { paths, config, canonical, field, tensor_bytes, info, states, notes, memory })
     }
 
-    /// What `cfg_args` and the weights say differently, and which of them is believed.
+    /// Returns notes on contradictions between `cfg_args` and the weights.
     pub fn notes(&self) -> &[String] {
         &self.notes
     }
 
-    /// Opens the model at `root`: of `iteration`, or of the largest one. The sequence has no frames yet.
+    /// Opens the model at `root`, of `iteration` or of the largest one. The sequence has no frames yet.
+    ///
+    /// # Errors
+    /// Fails if a file is missing or damaged.
     pub fn open(root: &Path, iteration: Option<u32>) -> Result<Self> {
         Self::open_with(root, iteration, &PlyOptions::default())
     }
 
-    /// [`ModelFolder::open`] with the limits of `options`.
+    /// Opens a model like [`ModelFolder::open`], with the limits of `options`.
     pub fn open_with(root: &Path, iteration: Option<u32>, options: &PlyOptions) -> Result<Self> {
         let paths = ModelPaths::locate(root, iteration)?;
         let ply = Ply::open_with(&paths.point_cloud, options)?;
         Self::with_cloud(paths, ply.whole()?, ply.sh_degree(), options.memory)
     }
 
-    /// Memory that reading the files of the model again may take.
+    /// Returns the memory limit for reading the files of the model again.
     pub(super) fn memory(&self) -> ReadLimit {
         self.memory
     }
 
-    /// The same field and frames with other Gaussians; of another SH degree only where no head deforms color.
+    /// Returns the same field and frames with other Gaussians. Their SH degree may differ only if no head deforms
+    /// color.
     pub fn with_canonical(&self, canonical: Gaussians) -> Self {
         let (count, sh_degree) = (canonical.len(), canonical.sh_degree());
         let info = SequenceInfo { count, sh_degree, ..self.info.clone() };
         ModelFolder { canonical: Arc::new(canonical.into()), info, ..self.clone() }
     }
 
-    /// The same model with the field that it has once that is stored in half precision.
+    /// Returns the model with the field that it has after storage in half precision.
     ///
     /// # Errors
-    /// A field that cannot be read any more.
+    /// Fails if the field can no longer be read.
     pub(super) fn rounded(self) -> Result<Self> {
         let (path, degree) = (&self.paths.deformation, self.info.sh_degree);
         let field = Field::new(&rounded(read_state_dict(path, self.memory)?), self.config.field(), degree, path)?;
         Ok(ModelFolder { field: Arc::new(field), ..self })
     }
 
-    /// The same model with another field, of the same configuration.
+    /// Returns the model with another field of the same configuration.
     pub fn with_field(self, field: Field) -> Self {
         ModelFolder { field: Arc::new(field), ..self }
     }
 
-    /// The same model with frames at `times`.
+    /// Returns the model with frames at `times`.
     ///
     /// # Errors
-    /// Times that are not finite or not strictly increasing; the error names the frames.
+    /// Fails if times are not finite or not strictly increasing; the message names the frames.
     pub fn with_times(mut self, times: Vec<f64>) -> Result<Self> {
         self.info = self.info.at(times)?;
         Ok(self)
     }
 
-    /// The model's files.
+    /// Returns the paths of the model's files.
     pub fn paths(&self) -> &ModelPaths {
         &self.paths
     }
 
-    /// The model's hyper-parameters.
+    /// Returns the hyperparameters of the model.
     pub fn config(&self) -> &ModelConfig {
         &self.config
     }
 
-    /// The raw parameters of every Gaussian, before any deformation.
+    /// Returns the raw parameters of every Gaussian, before any deformation.
     pub fn canonical(&self) -> &Gaussians {
         &self.canonical.gaussians
     }
 
-    /// The deformation field.
+    /// Returns the deformation field.
     pub fn field(&self) -> &Field {
         &self.field
     }
 
-    /// Bytes of the values of the field's tensors in single precision.
+    /// Returns the bytes of the field's tensors in single precision.
     pub(super) fn tensor_bytes(&self) -> u64 {
         self.tensor_bytes
     }
 
-    fn time_of(&self, frame: usize) -> Result<f64> {
+    /// Returns the time of a frame; fails if the frame does not exist.
+    fn frame_time(&self, frame: usize) -> Result<f64> {
         let times = &self.info.times;
         let missing = || Error::internal(format!("frame {frame} was asked for; the sequence has {}", times.len()));
         times.get(frame).copied().ok_or_else(missing)
     }
 
-    /// What the field would change at `time` about Gaussians at canonical `position` `[N, 3]`, which
-    /// need not be Gaussians of this model. [`Deltas::solve`] turns a wanted state into raw parameters.
+    /// Returns the field's deltas at `time` for Gaussians at canonical `position` `[N, 3]`, which need not belong to
+    /// this model. [`Deltas::solve`] computes raw parameters from a desired state.
+    ///
+    /// # Errors
+    /// Fails if the field cannot be evaluated.
     pub fn deltas_at(&self, position: &Column, time: f64) -> Result<Deltas> {
         let prepared = self.field.prepare(position);
         let mut deltas = Deltas::new(self.info.sh_degree);
@@ -236,7 +249,7 @@ impl FrameSource for ModelFolder {
         }))
     }
 
-    /// Nothing is decoded together, so that nothing is gained by what readers of all Gaussians would keep.
+    /// Reads blocks one by one: no frames are decoded together, so a reader of all Gaussians has nothing to keep.
     fn open_all(&self, _: &ReadPlan) -> Option<Result<Box<dyn BlockReader + '_>>> {
         Some(Ok(Box::new(InBlocks::new(self))))
     }
@@ -250,19 +263,20 @@ impl FrameSource for ModelFolder {
     }
 }
 
-/// Blocks at once.
+/// Evaluates blocks of Gaussians in parallel.
 impl Deformation for ModelFolder {
     fn stored(&self) -> &Raw {
         &self.canonical
     }
 
-    /// Under a mask, which counts as constant, moving a position is worse than leaving it where it is.
+    /// Excludes positions if the field has a mask. Derivatives treat the mask as constant, so a moved position would be
+    /// worse than an unchanged one.
     fn movable(&self) -> Columns {
         if self.field.has_mask() { Columns::all().difference(Columns::POSITION) } else { Columns::all() }
     }
 
     fn state(&self, frame: usize, stored: &Raw, want: Columns, out: &mut Gaussians) -> Result<()> {
-        let time = self.time_of(frame)?;
+        let time = self.frame_time(frame)?;
         let ids: Vec<u32> = (0..stored.len() as u32).collect();
         let nothing = || Gaussians::zeros(0, self.info.sh_degree);
         let parts = BlockSlices::split(out, want, ids.len());
@@ -281,7 +295,7 @@ impl Deformation for ModelFolder {
     }
 
     fn jacobian(&self, frame: usize, stored: &Raw, want: Columns) -> Result<Jacobian> {
-        let time = self.time_of(frame)?;
+        let time = self.frame_time(frame)?;
         let ids: Vec<u32> = (0..stored.len() as u32).collect();
         let of_block = |ids: &[u32]| {
             let mut raw = Gaussians::zeros(0, self.info.sh_degree);
@@ -295,6 +309,7 @@ impl Deformation for ModelFolder {
     }
 }
 
+/// Reader of some Gaussians of the model.
 struct FieldReader<'a> {
     model: &'a ModelFolder,
     raw: Gaussians,
@@ -305,7 +320,7 @@ struct FieldReader<'a> {
 
 impl BlockReader for FieldReader<'_> {
     fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
-        let time = self.model.time_of(frame)?;
+        let time = self.model.frame_time(frame)?;
         if !want.is_empty() {
             self.model.states.add(self.raw.len() as u64);
         }

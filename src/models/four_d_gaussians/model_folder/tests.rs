@@ -5,7 +5,7 @@ use super::*;
 use crate::model::Gradients;
 use crate::passes::gather;
 
-/// A trained model in `SPLATSIEVE_DATA`, else `../shared/data`, which must be there.
+/// Returns the folder of a trained model in `SPLATSIEVE_DATA`, else in `../shared/data`. The folder must exist.
 fn shared_model(name: &str) -> PathBuf {
     let folder = std::env::var_os("SPLATSIEVE_DATA")
         .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data"), PathBuf::from)
@@ -14,7 +14,7 @@ fn shared_model(name: &str) -> PathBuf {
     folder
 }
 
-/// Reads an INRIA PLY of float properties in the canonical order, degree 3: enough for these models.
+/// Reads a 3DGS PLY of float properties in the canonical order with SH degree 3, the layout of the test models.
 fn read_cloud(path: &Path) -> Gaussians {
     let bytes = fs::read(path).unwrap();
     let mark = b"end_header\n";
@@ -44,7 +44,7 @@ fn load(name: &str) -> (PathBuf, ModelFolder) {
     (root, ModelFolder::with_cloud(paths, cloud, 3, ReadLimit::NONE).unwrap())
 }
 
-/// Every array of an npz as f64.
+/// Reads every array of an npz as f64.
 fn read_npz(path: &Path) -> BTreeMap<String, Vec<f64>> {
     let mut archive = npyz::npz::NpzArchive::open(path).unwrap();
     let names: Vec<String> = archive.array_names().map(str::to_owned).collect();
@@ -207,7 +207,7 @@ fn times_that_do_not_increase_are_refused_with_their_frames() {
     assert!(reader.read(1, Columns::all(), &mut Gaussians::zeros(0, 3)).is_err(), "a frame beyond the last");
 }
 
-/// A folder laid out like a model, with empty files.
+/// Creates a folder with the layout of a model and placeholder files.
 fn folder(iterations: &[&str]) -> tempfile::TempDir {
     let root = tempfile::tempdir().unwrap();
     fs::write(root.path().join("cfg_args"), "Namespace()").unwrap();
@@ -221,7 +221,7 @@ fn folder(iterations: &[&str]) -> tempfile::TempDir {
 }
 
 #[test]
-fn the_largest_iteration_is_the_default_and_any_can_be_asked_for() {
+fn default_is_the_largest_iteration() {
     let root = folder(&["iteration_900", "iteration_14000", "iteration_x", "coarse_iteration_99999"]);
     assert_eq!(ModelPaths::locate(root.path(), None).unwrap().iteration, 14000);
     let paths = ModelPaths::locate(root.path(), Some(900)).unwrap();
@@ -232,7 +232,7 @@ fn the_largest_iteration_is_the_default_and_any_can_be_asked_for() {
 }
 
 #[test]
-fn a_missing_file_of_the_folder_is_named() {
+fn missing_file_of_the_folder_is_named() {
     let root = folder(&["iteration_1"]);
     for file in ["point_cloud/iteration_1/deformation.pth", "cfg_args"] {
         fs::remove_file(root.path().join(file)).unwrap();
@@ -245,7 +245,7 @@ fn a_missing_file_of_the_folder_is_named() {
 }
 
 #[test]
-fn the_digest_depends_on_every_byte_of_the_three_files() {
+fn digest_depends_on_all_three_files() {
     let root = folder(&["iteration_1"]);
     let paths = ModelPaths::locate(root.path(), None).unwrap();
     let mut digests = vec![paths.digest().unwrap()];
@@ -260,13 +260,13 @@ fn the_digest_depends_on_every_byte_of_the_three_files() {
 }
 
 #[test]
-fn derivatives_of_the_tiny_model_agree_with_differences_of_its_states_for_any_number_of_threads() {
+fn jacobian_agrees_with_differences_on_any_thread_count() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/tiny_model");
     let model = ModelFolder::open(&root, None).unwrap().with_times(vec![0.0, 0.4, 1.0]).unwrap();
     let n = model.info().count;
     let mut by_state = Gradients::new(n, Columns::all(), 3);
     for column in Columns::all().iter() {
-        // Low-discrepancy steps, as good as noise.
+        // Low-discrepancy values serve as noise.
         let sums = by_state.column_mut(column).planes_mut().iter_mut().enumerate();
         sums.for_each(|(k, sum)| *sum = (k as f32 * 0.618_034).fract() - 0.5);
     }
@@ -298,12 +298,12 @@ fn derivatives_of_the_tiny_model_agree_with_differences_of_its_states_for_any_nu
             let change = |c: usize| f64::from(at_high.plane(c)[i]) - f64::from(at_low.plane(c)[i]);
             let expected = (0..3).map(|c| f64::from(weights.plane(c)[i]) * change(c)).sum::<f64>() / apart;
             let got = f64::from(by_raw.column(Columns::POSITION).plane(axis)[i]);
-            // States are f32: about 1e-7 over 4e-4, times three.
+            // States are f32: an error of about 1e-7 over 4e-4, times three.
             off += usize::from((got - expected).abs() > 3e-3 * (1.0 + expected.abs()));
             through_field += usize::from((got - f64::from(weights.plane(axis)[i])).abs() > 1e-2);
         }
     }
-    // Within a step some cross the edge of a texel or a ReLU, where there is no one derivative.
+    // Within a step some positions cross the edge of a texel or a ReLU, where the derivative is not unique.
     assert!(off * 50 < 3 * n, "{off} of {} derivatives are off", 3 * n);
     assert!(through_field > n, "the field adds to {through_field} of {} derivatives only", 3 * n);
     assert!(model.jacobian(3, model.stored(), Columns::all()).is_err(), "there are three frames");

@@ -1,7 +1,8 @@
-//! Gaussians that move along straight lines and fade with the distance in time.
+//! Motion model of FreeTimeGS: Gaussians that move along straight lines and fade with the distance in time.
 //!
-//! dt = t − times; x = means + velocities·dt; opacity = max(σ(o)·exp(−½(dt/s)²), 1e-4), s = max(exp(durations), 0.02) + 1e-8.
-//! Source: `compute_positions_at_time`, `compute_temporal_opacity` of FreeTimeGsVanilla. Its viewer has neither bound.
+//! dt = t − times; x = means + velocities·dt; opacity = max(σ(o)·exp(−½(dt/s)²), 1e-4) with s = max(exp(durations),
+//! 0.02) + 1e-8. Source: `compute_positions_at_time`, `compute_temporal_opacity` of FreeTimeGsVanilla. Its viewer
+//! applies neither bound.
 
 use xxhash_rust::xxh3::Xxh3;
 
@@ -9,44 +10,51 @@ use crate::compressed_model::Cluster;
 use crate::error::Result;
 use crate::model::{Column, Columns, Gaussians, Jacobian, Raw, scale_rotation};
 use crate::models::in_checkpoint::ProxyRule;
-use crate::models::in_checkpoint::linear::{LinearPath, match_all};
-use crate::models::motion_model::window::{faded, odds, slope};
+use crate::models::in_checkpoint::linear::{LinearPath, match_proxies};
+use crate::models::motion_model::window::{faded_logit, inverse_odds, slope};
 use crate::models::motion_model::{MotionModel, MotionModelFrames, copy_stored};
 use crate::recipe::MergeParams;
 
-/// Planes of [`Raw::own`]: center in time, logarithm of the standard deviation, velocity.
+/// Plane of [`Raw::own`] with the center in time.
 pub(super) const TIME: usize = 0;
+/// Plane of [`Raw::own`] with the logarithm of the standard deviation in time.
 pub(super) const DURATION: usize = 1;
+/// First of three planes of [`Raw::own`] with the velocity.
 pub(super) const VELOCITY: usize = 2;
-/// How many there are.
+/// Number of planes of [`Raw::own`].
 pub(super) const OWN: usize = 5;
 
-/// Least standard deviation, and what is added to it.
-const DEVIATION: [f64; 2] = [0.02, 1e-8];
-/// Least opacity, and its logit.
-const OPACITY: f64 = 1e-4;
+/// Minimum standard deviation in time, and the value added to it.
+const DEVIATION_FLOOR: [f64; 2] = [0.02, 1e-8];
+/// Minimum opacity.
+const MIN_OPACITY: f64 = 1e-4;
 
-/// The law of the family.
+/// Motion model of FreeTimeGS.
 #[derive(Debug)]
 pub(super) struct FreeTime;
 
-/// 1/(2s²), and exp(−o).
+/// Time-independent values of the temporal windows of some Gaussians.
 #[derive(Debug)]
 pub(super) struct Windows {
+    /// 1/(2s²) of each Gaussian.
     rates: Vec<f64>,
-    odds: Vec<f64>,
+    /// exp(−o) of each opacity logit o.
+    inverse_odds: Vec<f64>,
 }
 
+/// Returns the standard deviation s in time from a stored duration.
 fn deviation(duration: f32) -> f64 {
-    f64::from(duration).exp().max(DEVIATION[0]) + DEVIATION[1]
+    f64::from(duration).exp().max(DEVIATION_FLOOR[0]) + DEVIATION_FLOOR[1]
 }
 
+/// Returns 1/(2s²) from a stored duration.
 fn rate(duration: f32) -> f64 {
     0.5 / deviation(duration).powi(2)
 }
 
-fn least() -> f64 {
-    (OPACITY / (1.0 - OPACITY)).ln()
+/// Returns the logit of the minimum opacity.
+fn min_logit() -> f64 {
+    (MIN_OPACITY / (1.0 - MIN_OPACITY)).ln()
 }
 
 impl MotionModel for FreeTime {
@@ -54,7 +62,10 @@ impl MotionModel for FreeTime {
 
     fn prepare(&self, raw: &Raw) -> Windows {
         let rates = raw.own.plane(DURATION).iter().map(|&duration| rate(duration)).collect();
-        Windows { rates, odds: raw.gaussians.opacity_logit.plane(0).iter().map(|&logit| odds(logit)).collect() }
+        Windows {
+            rates,
+            inverse_odds: raw.gaussians.opacity_logit.plane(0).iter().map(|&logit| inverse_odds(logit)).collect(),
+        }
     }
 
     fn varying(&self) -> Columns {
@@ -79,11 +90,12 @@ impl MotionModel for FreeTime {
             }
         }
         if want.contains(Columns::OPACITY) {
-            let least = least();
-            let to = out.opacity_logit.plane_mut(0).iter_mut().zip(centers).zip(&windows.rates).zip(&windows.odds);
-            to.for_each(|(((to, &center), &rate), &odds)| {
+            let min_logit = min_logit();
+            let to =
+                out.opacity_logit.plane_mut(0).iter_mut().zip(centers).zip(&windows.rates).zip(&windows.inverse_odds);
+            to.for_each(|(((to, &center), &rate), &inverse_odds)| {
                 let exponent = -rate * (time - f64::from(center)).powi(2);
-                *to = faded(odds, exponent).max(least) as f32;
+                *to = faded_logit(inverse_odds, exponent).max(min_logit) as f32;
             });
         }
         Ok(())
@@ -92,11 +104,15 @@ impl MotionModel for FreeTime {
     fn jacobian(&self, time: f64, raw: &Raw, windows: &Windows, want: Columns) -> Result<Jacobian> {
         let mut jacobian = Jacobian::default();
         if want.contains(Columns::OPACITY) {
-            let least = least();
-            let centers = raw.own.plane(TIME).iter().zip(&windows.rates).zip(&windows.odds);
-            let slopes = centers.map(|((&center, &rate), &odds)| {
+            let min_logit = min_logit();
+            let centers = raw.own.plane(TIME).iter().zip(&windows.rates).zip(&windows.inverse_odds);
+            let slopes = centers.map(|((&center, &rate), &inverse_odds)| {
                 let exponent = -rate * (time - f64::from(center)).powi(2);
-                if exponent < least || faded(odds, exponent) <= least { 0.0 } else { slope(odds, exponent) as f32 }
+                if exponent < min_logit || faded_logit(inverse_odds, exponent) <= min_logit {
+                    0.0
+                } else {
+                    slope(inverse_odds, exponent) as f32
+                }
             });
             *jacobian.column_mut(Columns::OPACITY) = Column::from_planes(1, slopes.collect());
         }
@@ -105,7 +121,7 @@ impl MotionModel for FreeTime {
 }
 
 impl ProxyRule for FreeTime {
-    fn proposed(model: &MotionModelFrames<FreeTime>, clusters: &[Cluster], rule: &MergeParams) -> Result<Raw> {
+    fn propose(model: &MotionModelFrames<FreeTime>, clusters: &[Cluster], rule: &MergeParams) -> Result<Raw> {
         let raw = model.raw();
         let line = |id: u32| {
             let id = id as usize;
@@ -116,13 +132,13 @@ impl ProxyRule for FreeTime {
                 deviation: deviation(raw.own.plane(DURATION)[id]),
             }
         };
-        let fades = |line: &LinearPath, time: f64| (-0.5 * ((time - line.center) / line.deviation).powi(2)).exp();
+        let window = |line: &LinearPath, time: f64| (-0.5 * ((time - line.center) / line.deviation).powi(2)).exp();
         let mut sh = vec![Vec::new(); clusters.len()];
-        let matched = match_all(model, clusters, rule, line, fades, Columns::SH, |seen| {
-            // The same at every frame.
+        let matched = match_proxies(model, clusters, rule, line, window, Columns::SH, |seen| {
+            // SH coefficients are the same at every frame.
             if sh[seen.proxy].is_empty() {
-                let of = &seen.state.sh;
-                sh[seen.proxy] = (0..of.width()).map(|c| of.plane(c)[seen.row]).collect();
+                let sh_at_frame = &seen.state.sh;
+                sh[seen.proxy] = (0..sh_at_frame.width()).map(|c| sh_at_frame.plane(c)[seen.row]).collect();
             }
         })?;
         let leaders: Vec<u32> = clusters.iter().map(|cluster| cluster.leader).collect();
@@ -132,9 +148,9 @@ impl ProxyRule for FreeTime {
             let Raw { gaussians, own } = &mut proxies;
             gaussians.position.set_row(row, line.position.map(|x| x as f32));
             own.plane_mut(TIME)[row] = line.center as f32;
-            own.plane_mut(DURATION)[row] = (line.deviation - DEVIATION[1]).max(DEVIATION[0]).ln() as f32;
+            own.plane_mut(DURATION)[row] = (line.deviation - DEVIATION_FLOOR[1]).max(DEVIATION_FLOOR[0]).ln() as f32;
             (0..3).for_each(|c| own.plane_mut(VELOCITY + c)[row] = line.velocity[c] as f32);
-            let Some((opacity, covariance)) = matched.seen else { continue };
+            let Some((opacity, covariance)) = matched.shape else { continue };
             let like = gaussians.rotation.row::<4>(row).map(f64::from);
             let (scales, rotation) = scale_rotation(covariance, like);
             gaussians.log_scale.set_row(row, scales.map(|scale| scale.ln() as f32));
@@ -145,5 +161,5 @@ impl ProxyRule for FreeTime {
         Ok(proxies)
     }
 
-    fn follow(&self, _: &mut Xxh3) {}
+    fn hash_settings(&self, _: &mut Xxh3) {}
 }

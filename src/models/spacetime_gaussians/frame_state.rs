@@ -1,39 +1,40 @@
-//! How the state of a Gaussian follows from what a model stores of it: [`SpacetimeMotion`] and its window.
+//! Computation of frame states from the stored parameters of a model: [`SpacetimeMotion`] and its temporal window.
 //!
-//! [`Raw::gaussians`] has position, quaternion, log scales and opacity logit as they are stored, and the color as harmonics of
-//! degree 0; [`Raw::own`] has the planes named here.
+//! [`Raw::gaussians`] holds position, quaternion, log scales and opacity logit as stored, and the color as SH of degree
+//! 0. [`Raw::own`] holds the planes named here.
 
 use super::decoder::{self, ColorDecoder};
 use super::motion::SpacetimeMotion;
 use crate::error::Result;
 use crate::model::{Column, Columns, Gaussians, Jacobian, Raw};
-use crate::models::motion_model::window::{faded, odds, slope};
+use crate::models::motion_model::window::{faded_logit, inverse_odds, slope};
 use crate::models::motion_model::{MotionModel, Shading, copy_stored};
 
-/// Plane of the center of the window.
-pub(super) const CENTRE: usize = 0;
-/// Plane of the natural log of its width.
+/// Plane of the center of the temporal window.
+pub(super) const CENTER: usize = 0;
+/// Plane of the natural logarithm of the width of the window.
 pub(super) const LOG_WIDTH: usize = 1;
-/// First of nine planes: coefficients of dt, dt², dt³, each of x, y, z.
+/// First of nine planes: coefficients of dt, dt², dt³, each for x, y, z.
 pub(super) const MOTION: usize = 2;
-/// First of four planes: change of the quaternion.
+/// First of four planes: change of the quaternion per unit of time.
 pub(super) const OMEGA: usize = 11;
-/// Planes of [`Raw::own`] that every variant has.
+/// Number of planes of [`Raw::own`] that both variants have.
 pub(super) const WIDTH: usize = 15;
-/// First of six planes of the full model: features that do not change, of which three are a color before it is acted upon.
+/// First of six planes of the full model: features that are constant in time. The first three are a color before the
+/// last function.
 pub(super) const FEATURES: usize = 15;
 /// First of three planes of the full model: features per unit of time.
 pub(super) const FEATURES_IN_TIME: usize = 21;
-/// Planes of [`Raw::own`] of the full model.
+/// Number of planes of [`Raw::own`] of the full model.
 pub(super) const FULL_WIDTH: usize = 24;
 
 impl SpacetimeMotion {
-    /// That of Gaussian `row`.
+    /// Returns the motion of Gaussian `row`.
     pub(super) fn from_raw(raw: &Raw, row: usize) -> SpacetimeMotion {
         let own = |plane: usize| f64::from(raw.own.plane(plane)[row]);
         let path = |k: usize| std::array::from_fn(|c| own(MOTION + 3 * k + c));
         SpacetimeMotion {
-            center: own(CENTRE),
+            center: own(CENTER),
             log_width: own(LOG_WIDTH),
             path: [raw.gaussians.position.row::<3>(row).map(f64::from), path(0), path(1), path(2)],
             rotation: raw.gaussians.rotation.row::<4>(row).map(f64::from),
@@ -41,10 +42,10 @@ impl SpacetimeMotion {
         }
     }
 
-    /// Makes it that of Gaussian `row`, rounded to f32.
+    /// Stores the motion as that of Gaussian `row`, rounded to f32.
     pub(super) fn write(&self, raw: &mut Raw, row: usize) {
         let mut own = |plane: usize, value: f64| raw.own.plane_mut(plane)[row] = value as f32;
-        own(CENTRE, self.center);
+        own(CENTER, self.center);
         own(LOG_WIDTH, self.log_width);
         for (k, terms) in self.path[1..].iter().enumerate() {
             terms.iter().enumerate().for_each(|(c, &term)| own(MOTION + 3 * k + c, term));
@@ -55,26 +56,27 @@ impl SpacetimeMotion {
     }
 }
 
-/// The law of both variants; colors of the full one are the cheap ones of [`Raw::gaussians`].
+/// Motion model of both variants. Colors of the full variant are those of [`Raw::gaussians`], without the network.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Spacetime {
-    /// Whether colors are features that a network reads.
+    /// Whether pixel colors are computed from features by a network (full model).
     pub(super) is_full: bool,
-    /// That network, where it is known.
+    /// The network, if it is known.
     pub(super) decoder: Option<ColorDecoder>,
 }
 
-/// What follows from a Gaussian once for all times.
+/// Time-independent values of some Gaussians.
 #[derive(Debug)]
 pub(super) struct PreparedGaussian {
-    /// 1 / width².
+    /// 1 / width² of each Gaussian.
     inverse_squared: Vec<f64>,
-    odds: Vec<f64>,
+    /// exp(−o) of each opacity logit o.
+    inverse_odds: Vec<f64>,
 }
 
-/// Logarithm of a window so long since its center.
+/// Returns the logarithm of the window at time `dt` from its center.
 #[inline(always)]
-fn exponent(dt: f64, inverse_squared: f64) -> f64 {
+fn window_exponent(dt: f64, inverse_squared: f64) -> f64 {
     -dt * dt * inverse_squared
 }
 
@@ -84,7 +86,7 @@ impl MotionModel for Spacetime {
     fn prepare(&self, raw: &Raw) -> PreparedGaussian {
         PreparedGaussian {
             inverse_squared: raw.own.plane(LOG_WIDTH).iter().map(|&log| (-2.0 * f64::from(log)).exp()).collect(),
-            odds: raw.gaussians.opacity_logit.plane(0).iter().map(|&logit| odds(logit)).collect(),
+            inverse_odds: raw.gaussians.opacity_logit.plane(0).iter().map(|&logit| inverse_odds(logit)).collect(),
         }
     }
 
@@ -92,7 +94,7 @@ impl MotionModel for Spacetime {
         Columns::POSITION | Columns::ROTATION | Columns::OPACITY
     }
 
-    /// A network reads the features of the full model: no color leads to them.
+    /// Excludes the colors of the full model: they are computed from features, so no derivative leads to them.
     fn movable(&self) -> Columns {
         if self.is_full { Columns::all().difference(Columns::SH) } else { Columns::all() }
     }
@@ -106,7 +108,7 @@ impl MotionModel for Spacetime {
         want: Columns,
         out: &mut Gaussians,
     ) -> Result<()> {
-        let (stored, own, centers) = (&raw.gaussians, &raw.own, raw.own.plane(CENTRE));
+        let (stored, own, centers) = (&raw.gaussians, &raw.own, raw.own.plane(CENTER));
         let since = |center: &f32| time - f64::from(*center);
         if want.contains(Columns::POSITION) {
             for c in 0..3 {
@@ -129,10 +131,12 @@ impl MotionModel for Spacetime {
             }
         }
         if want.contains(Columns::OPACITY) {
-            let of = centers.iter().zip(&prepared.inverse_squared).zip(&prepared.odds);
-            out.opacity_logit.plane_mut(0).iter_mut().zip(of).for_each(|(to, ((center, &inverse_squared), &odds))| {
-                *to = faded(odds, exponent(since(center), inverse_squared)) as f32;
-            });
+            let values = centers.iter().zip(&prepared.inverse_squared).zip(&prepared.inverse_odds);
+            out.opacity_logit.plane_mut(0).iter_mut().zip(values).for_each(
+                |(to, ((center, &inverse_squared), &inverse_odds))| {
+                    *to = faded_logit(inverse_odds, window_exponent(since(center), inverse_squared)) as f32;
+                },
+            );
         }
         copy_stored(raw, want.difference(self.varying()), out);
         Ok(())
@@ -141,12 +145,12 @@ impl MotionModel for Spacetime {
     fn jacobian(&self, time: f64, raw: &Raw, prepared: &PreparedGaussian, want: Columns) -> Result<Jacobian> {
         let mut found = Jacobian::default();
         if want.contains(Columns::OPACITY) {
-            let centers = raw.own.plane(CENTRE);
-            let of = |row: usize| {
+            let centers = raw.own.plane(CENTER);
+            let derivative = |row: usize| {
                 let dt = time - f64::from(centers[row]);
-                slope(prepared.odds[row], exponent(dt, prepared.inverse_squared[row])) as f32
+                slope(prepared.inverse_odds[row], window_exponent(dt, prepared.inverse_squared[row])) as f32
             };
-            *found.column_mut(Columns::OPACITY) = Column::from_planes(1, (0..raw.len()).map(of).collect());
+            *found.column_mut(Columns::OPACITY) = Column::from_planes(1, (0..raw.len()).map(derivative).collect());
         }
         Ok(found)
     }
@@ -157,10 +161,10 @@ impl MotionModel for Spacetime {
 }
 
 impl Shading for Spacetime {
-    /// Six that do not change, and three that grow with the time since the center.
+    /// Returns six constant features and three that grow with the time since the center.
     fn features(&self, time: f64, raw: &Raw) -> Column {
         let mut found = Column::zeros(decoder::FEATURES, raw.len());
-        let centers = raw.own.plane(CENTRE);
+        let centers = raw.own.plane(CENTER);
         for plane in 0..FEATURES_IN_TIME - FEATURES {
             found.plane_mut(plane).copy_from_slice(raw.own.plane(FEATURES + plane));
         }

@@ -1,17 +1,19 @@
-//! Tiles that wait outside a container between being encoded and being written.
+//! Serialization of encoded tiles that are kept outside a container between encoding and writing.
 
 use xxhash_rust::xxh3::xxh3_64;
 
 use crate::codec::EncodedTile;
 use crate::error::{Error, Result};
 use crate::layout::TileId;
-use crate::record::{RECORD, Record, TileRecord};
+use crate::record::{RECORD_BYTES, Record, TileRecord};
 
-/// Bytes before the stored ones: a record without a place, then width, length and bound.
-const HEAD: usize = RECORD as usize + 16;
+/// Length in bytes of the fields before the stored bytes of the tile: a record with offset 0, then width, length and
+/// bound.
+const HEAD_BYTES: usize = RECORD_BYTES as usize + 16;
 
 impl EncodedTile {
-    /// All of it, for [`EncodedTile::from_bytes`] of the same version of this library; no part of the file format.
+    /// Serializes the tile for [`EncodedTile::from_bytes`] of the same version of this library. The layout is not part
+    /// of the file format.
     pub fn to_bytes(&self) -> Vec<u8> {
         let record = TileRecord {
             id: TileId { column: 0, gaussian_block: 0, frame_block: 0 },
@@ -23,7 +25,7 @@ impl EncodedTile {
             checksum: self.checksum,
             stats: self.stats,
         };
-        let mut out = Vec::with_capacity(HEAD + self.bytes.len());
+        let mut out = Vec::with_capacity(HEAD_BYTES + self.bytes.len());
         out.extend_from_slice(&Record::Tile(record).to_bytes());
         out.extend_from_slice(&self.width.to_le_bytes());
         out.extend_from_slice(&self.len.to_le_bytes());
@@ -32,13 +34,13 @@ impl EncodedTile {
         out
     }
 
-    /// The tile that [`EncodedTile::to_bytes`] gave `bytes` for. Errors: it gave others.
+    /// Restores a tile from the output of [`EncodedTile::to_bytes`]. Fails if `bytes` were cut or changed.
     pub fn from_bytes(bytes: &[u8]) -> Result<EncodedTile> {
-        let other = || Error::usage(format!("{} bytes are no encoded tile", bytes.len()));
-        let (record, rest) = bytes.split_first_chunk().ok_or_else(other)?;
-        let (width, rest) = rest.split_first_chunk().ok_or_else(other)?;
-        let (len, rest) = rest.split_first_chunk().ok_or_else(other)?;
-        let (max_error, stored) = rest.split_first_chunk().ok_or_else(other)?;
+        let not_a_tile = || Error::usage(format!("{} bytes are not an encoded tile, or it was damaged", bytes.len()));
+        let (record, rest) = bytes.split_first_chunk().ok_or_else(not_a_tile)?;
+        let (width, rest) = rest.split_first_chunk().ok_or_else(not_a_tile)?;
+        let (len, rest) = rest.split_first_chunk().ok_or_else(not_a_tile)?;
+        let (max_error, stored) = rest.split_first_chunk().ok_or_else(not_a_tile)?;
         match Record::from_bytes(record, 0) {
             Ok(Record::Tile(tile))
                 if tile.stored_bytes as usize == stored.len() && tile.checksum == xxh3_64(stored) =>
@@ -55,7 +57,7 @@ impl EncodedTile {
                     bytes: stored.to_vec(),
                 })
             }
-            _ => Err(other()),
+            _ => Err(not_a_tile()),
         }
     }
 }
@@ -66,17 +68,17 @@ mod tests {
     use crate::codec::{Compression, encode_tile};
 
     #[test]
-    fn a_tile_that_waited_is_the_tile_and_one_that_changed_is_refused() {
+    fn tile_round_trips_and_damaged_bytes_are_refused() {
         let values: Vec<f32> = (0..2 * 3 * 50).map(|k| (k as f32 * 0.1).sin()).collect();
         let bounded = Compression::Bounded { max_error: 1e-3, level: 3 };
         for compression in [Compression::Raw, Compression::Zstd(1), bounded] {
             let tile = encode_tile(&values, 2, 3, 50, compression).unwrap();
             let bytes = tile.to_bytes();
             assert_eq!(EncodedTile::from_bytes(&bytes).unwrap(), tile);
-            for length in [0, 63, HEAD - 1, bytes.len() - 1] {
+            for length in [0, 63, HEAD_BYTES - 1, bytes.len() - 1] {
                 assert!(EncodedTile::from_bytes(&bytes[..length]).is_err(), "{compression:?}, {length} bytes");
             }
-            for byte in (0..RECORD as usize).chain(HEAD..bytes.len()) {
+            for byte in (0..RECORD_BYTES as usize).chain(HEAD_BYTES..bytes.len()) {
                 let mut flipped = bytes.clone();
                 flipped[byte] ^= 4;
                 assert!(EncodedTile::from_bytes(&flipped).is_err(), "{compression:?}, byte {byte}");

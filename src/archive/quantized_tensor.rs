@@ -1,51 +1,51 @@
-//! A tensor as channels of rows of values, each expected from those to the left of it and above.
+//! Codes a tensor as channels of rows of values; each value is predicted from its neighbors to the left and above.
 //!
-//! In: values `[channels, rows, columns]`, a class for every place of a channel that says how fine it is or that nobody
-//! reads it. Out: symbols, and the values as they come back. Memory: three rows.
+//! In: values `[channels, rows, columns]`, and a class for every place of a channel, which gives its step or marks it
+//! as unread. Out: symbols, and the restored values. Memory: three rows.
 
 use super::entropy::{SymbolDecoder, SymbolEncoder};
 use super::predict::{PredictorFit, PredictorWeights, expected, factors};
 use super::residual::Residuals;
 use super::step::QuantizationGrid;
 
-/// Values that others are expected from: left, above, above left, above right, two to the left, two above.
-pub(super) const NEIGHBOURS: usize = 6;
+/// Number of values from which a value is predicted: left, above, above left, above right, two to the left, two above.
+pub(super) const NEIGHBORS: usize = 6;
 
-/// Class of a place that nobody reads.
+/// Class of a place that is never read.
 pub(super) const UNREAD: u8 = u8::MAX;
 
-/// How a tensor lies on its grids.
+/// Tensor with its quantization grids.
 pub(super) struct QuantizedTensor<'a> {
     pub(super) channels: usize,
     pub(super) rows: usize,
     pub(super) columns: usize,
-    /// Rows that are stored; those before and after repeat the nearest of them.
+    /// Rows that are stored; rows before and after repeat the nearest stored row.
     pub(super) stored: std::ops::Range<usize>,
-    /// Of every place of a stored row, `[rows, columns]`, or of one row for all of them, `[columns]`.
+    /// Class of every place of a channel, `[rows, columns]`, or of one row that holds for all rows, `[columns]`.
     pub(super) classes: &'a [u8],
-    /// Of every class of every channel.
+    /// Grid of every class of every channel.
     pub(super) grids: &'a dyn Fn(usize, u8) -> QuantizationGrid,
     /// Number of classes.
     pub(super) class_count: usize,
-    /// What values differ from.
+    /// Mean that predictions start from.
     pub(super) mean: f32,
 }
 
-/// What lies around a place.
-struct Around {
+/// Values from which a place is predicted.
+struct Context {
     /// Differences from the mean.
-    values: [f32; NEIGHBOURS],
-    /// How large differences from what was expected were, in steps of this place.
+    values: [f32; NEIGHBORS],
+    /// Mean size of the prediction errors of the neighbors, in steps of this place.
     size: f32,
 }
 
 impl QuantizedTensor<'_> {
-    /// Mean of the values that are read.
+    /// Returns the mean of the values that are read.
     pub(super) fn mean(&self, data: &[f32]) -> f64 {
         let (mut sum, mut count) = (0.0, 0usize);
         for plane in data.chunks_exact((self.rows * self.columns).max(1)) {
             for row in self.stored.clone() {
-                let values = plane[row * self.columns..].iter().zip(self.classes_of(row));
+                let values = plane[row * self.columns..].iter().zip(self.row_classes(row));
                 for (value, _) in values.filter(|&(_, &class)| class != UNREAD) {
                     sum += f64::from(*value);
                     count += 1;
@@ -55,8 +55,8 @@ impl QuantizedTensor<'_> {
         sum / count.max(1) as f64
     }
 
-    /// Classes of a row.
-    fn classes_of(&self, row: usize) -> &[u8] {
+    /// Returns the classes of a row.
+    fn row_classes(&self, row: usize) -> &[u8] {
         if self.classes.len() == self.columns {
             self.classes
         } else {
@@ -64,30 +64,30 @@ impl QuantizedTensor<'_> {
         }
     }
 
-    /// The parts that expect the values best.
-    pub(super) fn fit(&self, data: &mut [f32]) -> PredictorWeights<NEIGHBOURS> {
+    /// Returns the predictor weights with the least squared error. `data` becomes the rounded values.
+    pub(super) fn fit(&self, data: &mut [f32]) -> PredictorWeights<NEIGHBORS> {
         let mut fit = PredictorFit::new();
-        self.walk(data, |_, value, around, grid| {
+        self.visit(data, |_, value, context, grid| {
             let value = grid.round(value);
-            fit.add(&around.values, value - self.mean);
+            fit.add(&context.values, value - self.mean);
             (value, 0.0)
         });
         fit.parts()
     }
 
-    /// Writes the values; `data` becomes what they come back as.
+    /// Writes the values; `data` becomes the restored values.
     pub(super) fn encode(
         &self,
-        parts: &PredictorWeights<NEIGHBOURS>,
+        parts: &PredictorWeights<NEIGHBORS>,
         models: &mut Residuals,
         data: &mut [f32],
         to: &mut SymbolEncoder,
     ) {
         let factors = factors(parts);
-        self.walk(data, |_, value, around, grid| {
-            let expected = grid.nearest(f64::from(expected(self.mean, &factors, &around.values)));
+        self.visit(data, |_, value, context, grid| {
+            let expected = grid.nearest(f64::from(expected(self.mean, &factors, &context.values)));
             let multiple = grid.multiple(value);
-            models.encode(multiple - expected, around.size, to);
+            models.encode(multiple - expected, context.size, to);
             (grid.value(multiple), (multiple - expected).unsigned_abs() as f32 * grid.size())
         });
     }
@@ -95,26 +95,26 @@ impl QuantizedTensor<'_> {
     /// Reads the values into `data`.
     pub(super) fn decode(
         &self,
-        parts: &PredictorWeights<NEIGHBOURS>,
+        parts: &PredictorWeights<NEIGHBORS>,
         models: &mut Residuals,
         data: &mut [f32],
         from: &mut SymbolDecoder<'_>,
     ) {
         let factors = factors(parts);
-        self.walk(data, |_, _, around, grid| {
-            let expected = grid.nearest(f64::from(expected(self.mean, &factors, &around.values)));
-            let residual = models.decode(around.size, from);
+        self.visit(data, |_, _, context, grid| {
+            let expected = grid.nearest(f64::from(expected(self.mean, &factors, &context.values)));
+            let residual = models.decode(context.size, from);
             let multiple = expected.wrapping_add(residual);
             (grid.value(multiple), residual.unsigned_abs() as f32 * grid.size())
         });
     }
 
-    /// Visits every place that is read, row by row; what `code` makes of the value there and how far that is from what
-    /// was expected is what later ones have around them. Places that nobody reads get the mean of those around them.
+    /// Visits every place that is read, row by row. `code` returns the value at the place and the absolute prediction
+    /// error, which become the context of later places. Places that are never read get the mean of their neighbors.
     #[inline(always)]
-    fn walk(&self, data: &mut [f32], mut code: impl FnMut(usize, f32, &Around, QuantizationGrid) -> (f32, f32)) {
+    fn visit(&self, data: &mut [f32], mut code: impl FnMut(usize, f32, &Context, QuantizationGrid) -> (f32, f32)) {
         let columns = self.columns;
-        // Two more to the left and one to the right.
+        // Two extra places at the left and one at the right.
         let line = || vec![0.0f32; columns + 3];
         let (mut above2, mut above, mut here) = (line(), line(), line());
         let (mut sizes_above, mut sizes) = (line(), line());
@@ -123,8 +123,8 @@ impl QuantizedTensor<'_> {
                 (0..self.class_count).map(|class| (self.grids)(channel, class as u8)).collect();
             [&mut above2, &mut above, &mut sizes_above].into_iter().for_each(|line| line.fill(0.0));
             for row in self.stored.clone() {
-                let classes = self.classes_of(row);
-                // Before the first there is what is above it.
+                let classes = self.row_classes(row);
+                // The places to the left of the first column repeat the value above it.
                 (here[0], here[1]) = (above[2], above[2]);
                 (sizes[0], sizes[1]) = (sizes_above[2], sizes_above[2]);
                 let out = &mut data[row * columns..][..columns];
@@ -141,13 +141,13 @@ impl QuantizedTensor<'_> {
                         continue;
                     };
                     let values = [left, up, up_left, up_right, here[at - 2], above2[at]];
-                    let around = Around { values, size: grid.in_steps(size) };
-                    let (coded, off) = code(row * columns + column, *value, &around, grid);
+                    let context = Context { values, size: grid.in_steps(size) };
+                    let (coded, off) = code(row * columns + column, *value, &context, grid);
                     *value = coded;
                     here[at] = coded - self.mean;
                     sizes[at] = off;
                 }
-                // After the last one there is that.
+                // The place to the right of the last column repeats its value.
                 (here[columns + 2], sizes[columns + 2]) = (here[columns + 1], sizes[columns + 1]);
                 std::mem::swap(&mut above2, &mut above);
                 std::mem::swap(&mut above, &mut here);

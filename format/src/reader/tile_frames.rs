@@ -1,0 +1,244 @@
+//! Reading of one tile frame by frame.
+
+use std::ops::Range;
+use std::sync::atomic::Ordering;
+
+use xxhash_rust::xxh3::{Xxh3, xxh3_64};
+
+use super::{MERGE_GAP_BYTES, Reader, TileBuffer, check_payload, decompress, plane_len, read_stored};
+use crate::codec::{Encoding, TileDecoder};
+use crate::error::Result;
+use crate::layout::TileId;
+use crate::record::TileRecord;
+
+/// Frames of one tile, decoded one at a time, fastest in increasing order; see [`Reader::load`].
+///
+/// Memory: a compressed tile takes 4 bytes per value of all its frames and 8 bytes per value of one frame. A raw tile
+/// takes no memory except its touched pages, if it is read in place, until they are released.
+#[derive(Debug, Default)]
+pub struct TileFrames {
+    tile: Option<TileRecord>,
+    decoder: TileDecoder,
+    /// Whether a raw tile is read in place, from the map.
+    in_place: bool,
+    /// Part of a raw tile that has been counted in [`Reader::tiles_read`].
+    counted: Counted,
+}
+
+/// Part of a raw tile that has been counted as read.
+#[derive(Debug, Default, Clone, Copy, PartialEq)]
+enum Counted {
+    #[default]
+    Nothing,
+    /// Frame that was read last.
+    Frame(usize),
+    /// Whole tile, counted when its checksum was verified.
+    Tile,
+}
+
+/// Byte ranges of tiles that were read in place and whose pages wait for [`Reader::release`].
+#[derive(Debug, Default)]
+pub struct Touched {
+    ranges: Vec<Range<u64>>,
+    bytes: u64,
+}
+
+impl Reader {
+    /// Prepares `frames` to return the frames of a tile: decompresses a compressed tile; verifies the checksum of a raw
+    /// tile if it has not been verified before. `buffer` holds no values of the tile afterwards.
+    ///
+    /// With `touched`, stored bytes are read in place from the map under the conditions of [`Reader::tile`], and their
+    /// range is added to `touched` for [`Reader::release`]. The pages of a compressed tile may be released after this
+    /// call, those of a raw tile after its last frame was read. Without `touched`, bytes are read by system calls as in
+    /// [`Reader::read_tile`]; this is cheaper if only one frame of a raw tile is read before its pages are released.
+    pub fn load(
+        &self,
+        at: TileId,
+        buffer: &mut TileBuffer,
+        frames: &mut TileFrames,
+        touched: Option<&mut Touched>,
+    ) -> Result<()> {
+        let (index, tile) = self.record(at)?;
+        // Set at the end: after an error `frames` holds no tile.
+        frames.tile = None;
+        frames.in_place = touched.is_some();
+        frames.counted = Counted::Nothing;
+        let mapped = match touched {
+            Some(touched) => {
+                touched.add(&tile);
+                Some(self.file.in_place(tile.offset, tile.stored_bytes.into())?)
+            }
+            None => None,
+        };
+        match (tile.encoding, mapped) {
+            (Encoding::Raw, mapped) => {
+                let verified = match mapped {
+                    Some(bytes) => self.verify_in_place(index, &tile, bytes)?,
+                    None => self.verify_raw(index, &tile, &mut buffer.stored)?,
+                };
+                self.count(1, if verified { tile.stored_bytes as usize } else { 0 });
+                if verified {
+                    frames.counted = Counted::Tile;
+                }
+            }
+            (Encoding::Filtered { .. } | Encoding::Bounded { .. }, mapped) => {
+                let TileBuffer { stored, zstd, .. } = buffer;
+                let stored = match mapped {
+                    Some(bytes) => {
+                        check_payload(&tile, xxh3_64(bytes)).map_err(|fault| fault.at(self.file.path()))?;
+                        bytes
+                    }
+                    None => {
+                        read_stored(&self.file, &tile, stored)?;
+                        stored
+                    }
+                };
+                self.count(1, stored.len());
+                decompress(&self.file, &self.layout, &tile, stored, zstd, &mut frames.decoder)?;
+            }
+        }
+        frames.tile = Some(tile);
+        Ok(())
+    }
+
+    /// Writes the values of frame `frame` of the loaded tile to `out`, laid out as `[width, len]`. Of a raw tile only
+    /// these bytes are read from the file, or copied from the map if the tile was loaded in place.
+    ///
+    /// # Panics
+    /// Panics if `out` has another size, if no tile was loaded into `frames` by this reader, or if the tile has no such
+    /// frame.
+    pub fn read_frame(&self, frames: &mut TileFrames, frame: usize, out: &mut [f32]) -> Result<()> {
+        let (tile, frame) = self.loaded_frame(frames, frame);
+        let plane = plane_len(&self.layout, &tile);
+        assert!(out.len() == plane, "{} values for a frame of {tile:?}", out.len());
+        match tile.encoding {
+            Encoding::Raw => {
+                self.count_frame(frames, frame, 4 * plane);
+                let (offset, bytes) = (frame_offset(&tile, frame, plane), bytemuck::cast_slice_mut(&mut *out));
+                match frames.in_place {
+                    true => bytes.copy_from_slice(self.file.in_place(offset, bytes.len() as u64)?),
+                    false => self.file.read_at(offset, bytes)?,
+                }
+                out.iter_mut().for_each(|value| *value = f32::from_bits(u32::from_le(value.to_bits())));
+            }
+            Encoding::Filtered { .. } | Encoding::Bounded { .. } => {
+                frames.decoder.frame(frame, bytemuck::cast_slice_mut(out));
+            }
+        }
+        Ok(())
+    }
+
+    /// Returns the values of frame `frame` of the loaded tile like [`Reader::read_frame`]: as a slice of the map if the
+    /// tile is raw and was loaded in place, otherwise in `buffer`.
+    ///
+    /// # Panics
+    /// Panics if no tile was loaded into `frames` by this reader, or if the tile has no such frame.
+    pub fn frame<'a>(&'a self, frames: &mut TileFrames, frame: usize, buffer: &'a mut Vec<f32>) -> Result<&'a [f32]> {
+        let (tile, stored) = self.loaded_frame(frames, frame);
+        let plane = plane_len(&self.layout, &tile);
+        if tile.encoding == Encoding::Raw && frames.in_place && cfg!(target_endian = "little") {
+            let bytes = self.file.in_place(frame_offset(&tile, stored, plane), 4 * plane as u64)?;
+            if let Ok(values) = bytemuck::try_cast_slice(bytes) {
+                self.count_frame(frames, stored, bytes.len());
+                return Ok(values);
+            }
+        }
+        buffer.resize(plane, 0.0);
+        self.read_frame(frames, frame, buffer)?;
+        Ok(buffer)
+    }
+
+    /// Writes all stored values of the loaded tile to `out`, laid out as `[frames, width, len]`; one frame for a
+    /// constant tile.
+    ///
+    /// # Panics
+    /// Panics if `out` has another size, or no tile was loaded.
+    pub fn read_frames(&self, frames: &mut TileFrames, out: &mut [f32]) -> Result<()> {
+        let (tile, _) = self.loaded_frame(frames, 0);
+        assert!(out.len() == tile.value_count(&self.layout), "{} values for {tile:?}", out.len());
+        let planes = out.chunks_exact_mut(plane_len(&self.layout, &tile)).enumerate();
+        planes.into_iter().try_for_each(|(frame, out)| self.read_frame(frames, frame, out))
+    }
+
+    /// Releases the pages of tiles that were read in place, so that they no longer count as memory of this process.
+    pub fn release(&self, touched: &mut Touched) {
+        touched.bytes = 0;
+        touched.ranges.sort_unstable_by_key(|range| range.start);
+        let mut merged: Range<u64> = 0..0;
+        for range in touched.ranges.drain(..) {
+            if range.start > merged.end + MERGE_GAP_BYTES {
+                self.file.release(std::mem::replace(&mut merged, range));
+            } else {
+                merged.end = merged.end.max(range.end);
+            }
+        }
+        self.file.release(merged);
+    }
+
+    /// Returns the loaded tile and the number of the stored frame for `frame` (0 for constant tiles).
+    fn loaded_frame(&self, frames: &TileFrames, frame: usize) -> (TileRecord, usize) {
+        let Some(tile) = frames.tile else { panic!("frame {frame} of no tile") };
+        assert!(frame < tile.frames as usize, "frame {frame} of {tile:?}");
+        (tile, if tile.constant { 0 } else { frame })
+    }
+
+    /// Counts the bytes of one frame of a raw tile, unless they have been counted.
+    fn count_frame(&self, frames: &mut TileFrames, frame: usize, bytes: usize) {
+        if frames.counted != Counted::Tile && frames.counted != Counted::Frame(frame) {
+            frames.counted = Counted::Frame(frame);
+            self.count(0, bytes);
+        }
+    }
+
+    /// Verifies the checksum of a raw tile by reading it in chunks through `chunk`, unless that was done before.
+    /// Returns whether it was verified now.
+    fn verify_raw(&self, index: usize, tile: &TileRecord, chunk: &mut Vec<u8>) -> Result<bool> {
+        if self.verified[index].load(Ordering::Relaxed) {
+            return Ok(false);
+        }
+        let mut hash = Xxh3::new();
+        self.file.read_chunks(tile.offset..tile.offset + u64::from(tile.stored_bytes), chunk, |_, bytes| {
+            hash.update(bytes);
+            Ok(())
+        })?;
+        check_payload(tile, hash.digest()).map_err(|fault| fault.at(self.file.path()))?;
+        self.verified[index].store(true, Ordering::Relaxed);
+        Ok(true)
+    }
+}
+
+impl TileFrames {
+    /// Returns the memory held, in bytes.
+    pub fn memory(&self) -> usize {
+        self.decoder.memory()
+    }
+
+    /// Returns whether the loaded tile is raw and read in place, from the map.
+    pub fn is_in_place(&self) -> bool {
+        self.in_place && self.tile.is_some_and(|tile| tile.encoding == Encoding::Raw)
+    }
+}
+
+impl Touched {
+    /// Returns the number of bytes of the map that wait to be released.
+    pub fn bytes(&self) -> u64 {
+        self.bytes
+    }
+
+    /// Moves all ranges of `other` to this list.
+    pub fn append(&mut self, other: &mut Touched) {
+        self.ranges.append(&mut other.ranges);
+        self.bytes += std::mem::take(&mut other.bytes);
+    }
+
+    /// Adds the stored bytes of a tile.
+    fn add(&mut self, tile: &TileRecord) {
+        self.bytes += u64::from(tile.stored_bytes);
+        self.ranges.push(tile.offset..tile.offset + u64::from(tile.stored_bytes));
+    }
+}
+
+/// Returns the offset in the file of a frame of a raw tile.
+fn frame_offset(tile: &TileRecord, frame: usize, plane: usize) -> u64 {
+    tile.offset + 4 * (frame * plane) as u64
+}

@@ -1,0 +1,306 @@
+//! Properties of an input from which memory and time are estimated, and the cost of common operations.
+
+use crate::files::frame_stream::StreamHeader;
+use crate::limits::Limits;
+use crate::model::{Camera, Columns, Rig, Schedule, SequenceInfo};
+use crate::models::MemoryProfile;
+use crate::models::trajectories::state_bytes;
+use crate::outputs::container::{FRAME_BLOCK, GAUSSIAN_BLOCK};
+use crate::passes::{BLOCK, VIEWS_PER_THREAD};
+use crate::render;
+
+/// Resident bytes per tile of an open container: whether the tile has been verified.
+const PER_TILE: u64 = 1;
+/// Resident bytes per column and block of Gaussians while a container is open or written: its last constant tile.
+const PER_SLOT: u64 = 80;
+/// Resident bytes per frame of a container that is written: its time stamp, in a list that grows by being copied to
+/// twice its length.
+const PER_WRITTEN_FRAME: u64 = 16;
+/// Resident bytes per frame of an open input: its time stamp in the container's index and in the sequence, and the
+/// number of Gaussians alive in it.
+const PER_FRAME: u64 = 8 + 8 + 8;
+/// Resident bytes per view in a list of views.
+const PER_PICTURE: u64 = 24;
+
+/// Bytes per Gaussian of a view that is rendered on all threads: the data of each thread, and the same data joined.
+pub const PICTURE_ON_ALL_THREADS: u64 = 2 * render::BYTES_PER_VISIBLE as u64;
+
+/// Named part of a stage's memory, in bytes.
+pub type MemoryPart = (&'static str, u64);
+
+/// Properties of an input and its cameras from which memory and time are estimated.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Workload {
+    /// Number of Gaussians, N.
+    pub gaussians: u64,
+    /// Number of frames, T; 0 for a stream, whose length is unknown.
+    pub frames: u64,
+    /// SH degree.
+    pub sh_degree: usize,
+    /// Columns that vary in time.
+    pub varying: Columns,
+    /// Memory that the input takes while it is open.
+    pub input: MemoryProfile,
+    /// Number of different view numbers of the cameras.
+    pub viewpoints: u64,
+    /// Number of pixels of the largest view.
+    pub pixels: u64,
+    /// Maximum number of views of one frame.
+    pub views: u64,
+    /// Number of views of all frames.
+    pub pictures: u64,
+    /// Bytes of the cameras and of the list of their shots, see [`Rig::bytes`].
+    pub rig: u64,
+    /// Number of threads.
+    pub threads: u64,
+    /// Measured speed of these threads.
+    pub pace: Throughput,
+}
+
+impl Workload {
+    /// Creates the workload of an open input without cameras.
+    pub fn new(info: &SequenceInfo, input: MemoryProfile) -> Workload {
+        Workload {
+            gaussians: info.count as u64,
+            frames: info.times.len() as u64,
+            sh_degree: info.sh_degree,
+            varying: info.varying,
+            input,
+            viewpoints: 0,
+            pixels: 0,
+            views: 0,
+            pictures: 0,
+            rig: 0,
+            threads: rayon::current_num_threads() as u64,
+            pace: Throughput::UNKNOWN,
+        }
+    }
+
+    /// Creates the workload of zero Gaussians.
+    pub fn nothing() -> Workload {
+        let info = SequenceInfo { count: 0, times: Vec::new(), sh_degree: 0, varying: Columns::empty() };
+        Workload::new(&info, MemoryProfile::of_tiles(0))
+    }
+
+    /// Adds the views of the cameras of `rig` in `schedule`.
+    pub fn seen(self, rig: &Rig, schedule: &Schedule) -> Workload {
+        self.seen_by(rig, schedule.most_views() as u64, schedule.pairs() as u64)
+    }
+
+    fn seen_by(self, rig: &Rig, views: u64, pairs: u64) -> Workload {
+        let mut numbers: Vec<u32> = rig.shots.iter().map(|shot| shot.view).collect();
+        numbers.sort_unstable();
+        numbers.dedup();
+        let pixels = |camera: &Camera| u64::from(camera.width) * u64::from(camera.height);
+        Workload {
+            pixels: rig.cameras.iter().map(pixels).max().unwrap_or(0),
+            views,
+            viewpoints: numbers.len() as u64,
+            pictures: pairs,
+            rig: rig.bytes(),
+            ..self
+        }
+    }
+
+    /// Creates the workload of a stream whose header has arrived, with the cameras of `rig`. The stream will be packed
+    /// into tiles of `frame_block` frames. `frames` is the assumed number of frames; 0: unknown.
+    pub fn of_stream(header: &StreamHeader, frame_block: usize, rig: &Rig, frames: u64) -> Workload {
+        let mut times: Vec<f64> = rig.shots.iter().filter_map(|shot| shot.time).collect();
+        times.sort_by(f64::total_cmp);
+        let together = times.chunk_by(|a, b| a == b).map(<[f64]>::len).max().unwrap_or(0);
+        let timeless = rig.shots.len() - times.len();
+        let views = (together + timeless) as u64;
+        let pairs = if frames > 0 { timeless as u64 * frames + times.len() as u64 } else { 0 };
+        let StreamHeader { count, sh_degree, varying, .. } = *header;
+        let info = SequenceInfo { count, times: Vec::new(), sh_degree, varying };
+        let work = Workload { frames, ..Workload::new(&info, MemoryProfile::of_tiles(frame_block as u64)) };
+        work.seen_by(rig, views, pairs)
+    }
+
+    /// Returns the number of Gaussians in a block of `block`; the input may have fewer.
+    pub fn at_most(&self, block: u64) -> u64 {
+        block.min(self.gaussians)
+    }
+
+    /// Returns the number of frames in a block of `block`; the input may have fewer, if their number is known.
+    fn frames_at_most(&self, block: u64) -> u64 {
+        if self.frames == 0 { block } else { block.min(self.frames) }
+    }
+
+    /// Returns the bytes of one Gaussian's columns `columns`.
+    pub fn state(&self, columns: Columns) -> u64 {
+        state_bytes(self.sh_degree, columns)
+    }
+
+    /// Returns the bytes per Gaussian of the frames that a reader of the columns `columns` keeps. A reader keeps no
+    /// frames if the limit is one frame, and two frames more than the limit otherwise.
+    pub fn held(&self, limits: &Limits, columns: Columns) -> u64 {
+        let frames = match (limits.frames_held as u64).min(self.input.frame_block) {
+            0..=1 => 0,
+            some => some + 2,
+        };
+        frames * self.state(columns & self.varying)
+    }
+
+    /// Returns the memory of the blocks that readers of all threads are reading, and of decoding them.
+    pub fn arriving(&self) -> MemoryPart {
+        let block = self.at_most(BLOCK as u64) * (self.state(Columns::all()) + self.input.reader);
+        ("arriving", self.decoding() + self.threads * block)
+    }
+
+    /// Returns the bytes of the buffers in which all threads decode or encode tiles: stored, shuffled and decoded bytes
+    /// of the largest tile.
+    fn decoding(&self) -> u64 {
+        let MemoryProfile { frame_block, gaussian_block, .. } = self.input;
+        let gaussian_block = self.at_most(gaussian_block);
+        let frame_block = self.frames_at_most(frame_block);
+        let frames = |column| if self.varying.contains(column) { frame_block } else { 1 };
+        let largest = Columns::all().iter().map(|column| self.state(column) * frames(column)).max().unwrap_or(0);
+        if frame_block == 0 { 0 } else { self.threads * 3 * gaussian_block * largest }
+    }
+
+    /// Returns the memory of a pass over views, per Gaussian and fixed: states of the columns `columns` that are ready,
+    /// states being read, and views being rendered with `sums` bytes of accumulators per Gaussian.
+    pub fn looking(&self, limits: &Limits, columns: Columns, sums: u64) -> (Vec<MemoryPart>, Vec<MemoryPart>) {
+        let pictures = self.threads.min(limits.pictures_together as u64);
+        let ready = VIEWS_PER_THREAD as u64 * self.threads;
+        let per_gaussian = vec![
+            ("states", ready.min(limits.frames_together as u64) * self.state(columns)),
+            ("readers", self.input.reader),
+            ("held", self.held(limits, columns)),
+            ("pictures", pictures * (render::BYTES_PER_VISIBLE as u64 + sums) + sums),
+        ];
+        let buffers = pictures * (render::STRIP_BYTES as u64 + 12 * self.pixels);
+        (per_gaussian, vec![self.arriving(), ("pictures", buffers)])
+    }
+
+    /// Returns the memory of a list of `pictures` views.
+    pub fn listed(pictures: f64) -> MemoryPart {
+        ("list", (PER_PICTURE as f64 * pictures).ceil() as u64)
+    }
+
+    /// Returns the memory of the buffers for writing a container, or one file per frame.
+    pub fn writing(&self) -> Vec<MemoryPart> {
+        self.writing_together(FRAME_BLOCK)
+    }
+
+    /// Returns the memory of the buffers for writing a container with `frames` frames per tile.
+    pub fn writing_together(&self, frames: usize) -> Vec<MemoryPart> {
+        let varying = self.frames_at_most(frames as u64) * self.state(self.varying);
+        let block =
+            self.at_most(GAUSSIAN_BLOCK as u64) * (2 * self.state(Columns::all()) + 3 * varying + self.input.reader);
+        vec![("blocks", 2 * self.threads * block), self.arriving(), ("index", self.written_index())]
+    }
+
+    /// Returns the memory that zstd takes at `level` for tiles of `frames` frames.
+    pub fn compressing(&self, level: i32, frames: usize) -> MemoryPart {
+        let widest = Columns::all().iter().map(|column| self.state(column)).max().unwrap_or(0);
+        ("zstd", self.threads * zstd_tables(level, (GAUSSIAN_BLOCK * frames) as u64 * widest))
+    }
+
+    /// Returns the maximum number of full reads of the input caused by reading `frames` evenly spread frames. Tiles are
+    /// read as a whole, and repeatedly if readers may keep only some of their frames.
+    pub fn reads(&self, frames: u64, limits: &Limits) -> f64 {
+        let (all, together) = (self.frames.max(1), self.input.frame_block);
+        if self.frames == 0 || together == 0 {
+            return frames.min(all) as f64 / all as f64;
+        }
+        let blocks = self.frames.div_ceil(together);
+        let of_block = frames.div_ceil(blocks).min(together);
+        let again = of_block.div_ceil(limits.frames_held.max(1) as u64);
+        (frames.min(blocks) * again) as f64 / blocks as f64
+    }
+
+    /// Returns [`Workload::reads`] for Gaussians at arbitrary ids that are read in blocks. A tile at the border of two
+    /// blocks is read for each of them.
+    pub fn scattered_reads(&self, frames: u64, limits: &Limits) -> f64 {
+        let shared = if self.input.frame_block == 0 { 1.0 } else { 2.0 };
+        shared * self.reads(frames, limits)
+    }
+
+    /// Returns the time in seconds of one processor for rendering `pictures` views of `gaussians` Gaussians at the
+    /// given cost.
+    pub fn picturing(&self, pictures: f64, gaussians: f64, RenderCost { gaussian, pixel, pace }: RenderCost) -> f64 {
+        pace(&self.pace) * pictures * (gaussians * gaussian + self.pixels as f64 * pixel)
+    }
+
+    /// Returns the time in seconds of one processor for reading the states of `gaussians` Gaussians at `frames` frames.
+    pub fn reading(&self, gaussians: f64, frames: f64) -> f64 {
+        self.pace.states * gaussians * frames * self.input.seconds_per_state
+    }
+
+    /// Returns N as a floating-point number; later stages are timed by fractions of it.
+    pub fn count(&self) -> f64 {
+        self.gaussians as f64
+    }
+
+    /// Returns the bytes of the input's index, time stamps and cameras, without its Gaussians.
+    pub(super) fn known_bytes(&self) -> u64 {
+        let index = match self.input.frame_block {
+            0 => 0,
+            frames => {
+                let slots = self.input.columns * self.gaussians.div_ceil(self.input.gaussian_block);
+                slots * (PER_SLOT + PER_TILE * self.frames.div_ceil(frames))
+            }
+        };
+        index + self.input.fixed + PER_FRAME * self.frames + self.rig
+    }
+
+    /// Returns the bytes of the index of a container that is being written.
+    fn written_index(&self) -> u64 {
+        let slots = Columns::all().iter().count() as u64 * self.gaussians.div_ceil(GAUSSIAN_BLOCK as u64);
+        PER_SLOT * slots + PER_WRITTEN_FRAME * self.frames
+    }
+}
+
+/// Speed of this machine for a scene: measured times as multiples of the costs in this module; 1 if nothing was
+/// measured.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Throughput {
+    /// Time of reading states and processing each of them.
+    pub states: f64,
+    /// Time of rendering a view, see [`LOOK`].
+    pub look: f64,
+    /// Time of finding removal errors in a view, see [`REMOVE`].
+    pub remove: f64,
+    /// Time of rendering and comparing a view, see [`RENDER`].
+    pub render: f64,
+    /// Mean number of processors available to this process during the measurement; `None` if nothing was measured.
+    pub processors: Option<f64>,
+}
+
+impl Throughput {
+    /// Speed of a machine and a scene without a measurement.
+    pub const UNKNOWN: Throughput = Throughput { states: 1.0, look: 1.0, remove: 1.0, render: 1.0, processors: None };
+}
+
+/// Cost of rendering one view for a certain purpose.
+#[derive(Debug, Clone, Copy)]
+pub struct RenderCost {
+    /// Seconds of one processor per Gaussian.
+    gaussian: f64,
+    /// Seconds of one processor per pixel.
+    pixel: f64,
+    pace: fn(&Throughput) -> f64,
+}
+
+/// Cost of rendering a view, fitted to runs on three trained models. `scripts/estimate.py` compares such estimates with
+/// the time of a run.
+pub const LOOK: RenderCost = RenderCost { gaussian: 1.6e-7, pixel: 5e-9, pace: |pace| pace.look };
+/// Cost of finding the removal error of every Gaussian in a view.
+pub const REMOVE: RenderCost = RenderCost { gaussian: 3.5e-7, pixel: 1.6e-8, pace: |pace| pace.remove };
+/// Cost of rendering a view and comparing it.
+pub const RENDER: RenderCost = RenderCost { gaussian: 3.5e-7, pixel: 3.2e-8, pace: |pace| pace.render };
+
+/// Returns the bytes of the match-finding tables of zstd at a level for `bytes` bytes of input: at most the maximum of
+/// the level's group, and at most 4 bytes for each entry of two tables with no more than twice as many entries as there
+/// are bytes.
+fn zstd_tables(level: i32, bytes: u64) -> u64 {
+    let most_mebibytes = match level {
+        ..=3 => 1,
+        4..=9 => 12,
+        10..=15 => 64,
+        _ => 80,
+    };
+    (16 * bytes.next_power_of_two()).min(most_mebibytes << 20)
+}

@@ -1,0 +1,149 @@
+//! Joining of tracks and choice of constant attributes, with their cost in PSNR of renders.
+
+use std::ops::Range;
+use std::path::Path;
+
+use super::memory::SAMPLED_FRAMES;
+use super::steady::{Bound, Steady, TrackSums};
+use super::tracks::LinkedTracks;
+use crate::error::Result;
+use crate::files::cameras::virtual_rig;
+use crate::metrics::psnr;
+use crate::model::RobustBox;
+use crate::model::{Columns, Gaussians};
+use crate::render::Renderer;
+use crate::tracking::{Joiner, Linker};
+
+/// Minimum PSNR of renders after a change (joined tracks, constant attributes) against renders before it, dB.
+const MIN_PSNR_DB: f64 = 40.0;
+/// Number of views rendered of each sampled frame.
+const VIEWS: usize = 3;
+/// Bounds of the change of an attribute that becomes constant, tried in this order: the change that trainers leave
+/// between tracks of one Gaussian, and half of that.
+const STEADY_BOUNDS: [Bound; 2] = [Bound { color: 0.04, other: 0.02 }, Bound { color: 0.02, other: 0.01 }];
+
+/// Joins tracks that `joiner` has seen, as loosely as the PSNR of renders allows. Returns a note for the user if any
+/// tracks could be joined.
+///
+/// # Errors
+/// Fails if a frame cannot be read.
+pub(super) fn join(joiner: Joiner, linker: &Linker, tracks: &mut LinkedTracks) -> Result<Option<String>> {
+    let (before, median_length) = (tracks.count(), tracks.lengths()?.median());
+    let mut note = None;
+    for (joined_tracks, count) in joiner.finish(linker) {
+        if count == before {
+            continue;
+        }
+        tracks.join(joined_tracks, count);
+        let psnr = joining_psnr(tracks)?;
+        if psnr.is_none_or(|psnr| psnr >= MIN_PSNR_DB) {
+            let cost = psnr_note(psnr.unwrap_or(f64::INFINITY));
+            let separate = format!("{before} tracks with a median length of {median_length} frames");
+            return Ok(Some(format!("{separate} were joined to {count} tracks: {cost}")));
+        }
+        tracks.undo_join();
+        let psnr = psnr.unwrap_or_default();
+        note = Some(format!(
+            "tracks that may be the same Gaussian were not joined: renders with joined tracks reach only \
+                          {psnr:.1} dB PSNR"
+        ));
+    }
+    Ok(note)
+}
+
+/// Replaces nearly constant attributes of `tracks` by their means, within the largest of [`STEADY_BOUNDS`] that the PSNR of
+/// renders allows. Returns a note for the user if any attribute became constant.
+///
+/// # Errors
+/// Fails if a frame cannot be read or a write to `scratch` fails.
+pub(super) fn hold_steady(tracks: &mut LinkedTracks, scratch: &Path) -> Result<Option<String>> {
+    let first = tracks.first();
+    for bound in STEADY_BOUNDS {
+        // Tracks are numbered in the order of their first frames.
+        let sums = |range: Range<usize>| sums(tracks, first[range.start].frame as usize, range);
+        let steady = Steady::from_sums(tracks.count(), tracks.frames().sh_degree(), sums, bound, scratch)?;
+        let parts = steady.parts();
+        if parts == [0.0; 4] {
+            return Ok(None);
+        }
+        let frames: Vec<u32> = (0..tracks.frames().paths().len() as u32).collect();
+        let states = |tracks: &LinkedTracks, frame: usize| {
+            tracks.states(&tracks.frames().frame(frame)?, &tracks.rows(frame, 0..tracks.count())?)
+        };
+        let before = sampled_frames(&frames).map(|frame| states(tracks, frame)).collect::<Result<Vec<_>>>()?;
+        tracks.set_steady(Some(steady));
+        let after = sampled_frames(&frames).map(|frame| states(tracks, frame)).collect::<Result<Vec<_>>>()?;
+        let psnr = mean_psnr(&before, &after);
+        if psnr >= MIN_PSNR_DB {
+            let [colors, scales, rotations, opacities] = parts.map(|part| format!("{:.0}%", 100.0 * part));
+            let Bound { color, other } = bound;
+            return Ok(Some(format!(
+                "nearly constant attributes of tracks were replaced by their means: {colors} of the colors (within \
+                 {color}), {scales} of the scales, {rotations} of the rotations and {opacities} of the opacities \
+                 (within {other}): {}",
+                psnr_note(psnr)
+            )));
+        }
+        tracks.set_steady(None);
+    }
+    Ok(None)
+}
+
+/// Sums the attributes along the tracks of `range`. None of them begins before the frame `born`.
+fn sums(tracks: &LinkedTracks, born: usize, range: Range<usize>) -> Result<TrackSums> {
+    let sh_degree = tracks.frames().sh_degree();
+    let (mut sums, mut state) = (TrackSums::new(range.len(), sh_degree), Gaussians::zeros(0, sh_degree));
+    for frame in born..tracks.frames().paths().len() {
+        let rows = tracks.rows(frame, range.clone())?;
+        for at in tracks.blended(&tracks.frames().frame(frame)?, &rows, &mut state)? {
+            sums.add(rows[at].track as usize - range.start, &state, at);
+        }
+    }
+    Ok(sums)
+}
+
+/// Returns the PSNR of renders with joined tracks against renders with separate ones; `None` if no frame has blended
+/// rows.
+fn joining_psnr(tracks: &LinkedTracks) -> Result<Option<f64>> {
+    let frames = tracks.lengths()?.blended;
+    if frames.is_empty() {
+        return Ok(None);
+    }
+    let (mut apart, mut joined) = (Vec::new(), Vec::new());
+    for frame in sampled_frames(&frames) {
+        let ply = tracks.frames().frame(frame)?;
+        let mut all = Gaussians::zeros(0, tracks.frames().sh_degree());
+        ply.gaussians(0..ply.count(), Columns::all(), &mut all)?;
+        apart.push(all);
+        joined.push(tracks.states(&ply, &tracks.rows(frame, 0..tracks.count())?)?);
+    }
+    Ok(Some(mean_psnr(&apart, &joined)))
+}
+
+/// Returns up to [`SAMPLED_FRAMES`] of `frames`, evenly spread.
+fn sampled_frames(frames: &[u32]) -> impl Iterator<Item = usize> {
+    let count = frames.len().min(SAMPLED_FRAMES);
+    (0..count).map(move |k| frames[(2 * k + 1) * frames.len() / (2 * count)] as usize)
+}
+
+/// Returns the PSNR of renders of `b` against renders of `a`: the mean over all frames and some views around the scene,
+/// dB.
+fn mean_psnr(a: &[Gaussians], b: &[Gaussians]) -> f64 {
+    let mut renderer = Renderer::on_all_threads();
+    let mut found = Vec::new();
+    for (a, b) in a.iter().zip(b) {
+        let around = RobustBox::from_positions(&a.position);
+        let rig = virtual_rig(around.middle, around.extent());
+        for view in 0..VIEWS {
+            let camera = &rig.cameras[view * rig.cameras.len() / VIEWS];
+            let [a, b] = [a, b].map(|state| renderer.render(state, camera, [0.0; 3]));
+            found.push(psnr(&a, &b));
+        }
+    }
+    found.iter().sum::<f64>() / found.len() as f64
+}
+
+/// Formats a PSNR for notes.
+fn psnr_note(psnr: f64) -> String {
+    if psnr.is_finite() { format!("renders stay within {psnr:.1} dB PSNR") } else { "renders are unchanged".to_owned() }
+}

@@ -1,0 +1,351 @@
+//! Tests of whole refinements.
+
+use std::time::Instant;
+
+use super::optimizer::RateSchedule;
+use super::optimizer_state::OptimizerState;
+use super::targets::Targets;
+use super::*;
+use crate::cache::CacheRequest;
+use crate::compressed_model::CompressedModel;
+use crate::diagnostics::demo_scene;
+use crate::error::Result;
+use crate::files::container::Container;
+use crate::journal::Journal;
+use crate::metrics::psnr;
+use crate::model::{Gaussians, Rig, SequenceInfo, Split};
+use crate::models::trajectories::write_sequence;
+use crate::models::{Link, OpenOptions};
+use crate::outputs::container::write_container;
+use crate::outputs::kind::OutputKind;
+use crate::passes::gather_all;
+use crate::pipeline::tests::{scene, score_scene};
+use crate::progress::Events;
+use crate::pruning::score::UserOverrides;
+use crate::recipe::Recipe;
+use crate::render::render;
+use crate::scene::{InputOptions, Scene, open_scene};
+use crate::source::{BlockReader, FrameSource, Ids};
+
+/// Refines the first `count` Gaussians of the ranking of `scene` in `steps` steps; those in `keep` are protected.
+fn refined(scene: &Scene, count: usize, steps: usize, keep: Vec<u32>) -> (CompressedModel, Journal) {
+    let recipe = Recipe::preset("default").unwrap();
+    let scored = score_scene(scene, &recipe, &UserOverrides { keep, ..UserOverrides::default() });
+    let reduction = CompressedModel::pruned(scored.ranked().take(count), &recipe.merge);
+    let mut journal = Journal::default();
+    let refine = RefineStage { steps, ..RefineStage::from_recipe(&recipe, None, false).unwrap() };
+    (refine.run(scene, &scored, reduction, count, &mut journal).unwrap(), journal)
+}
+
+/// Returns the mean PSNR of `reduction` over the test views of `rig`.
+fn test_psnr(scene: &Scene, rig: &Rig, reduction: &CompressedModel) -> f64 {
+    let schedule = rig.schedule(&scene.source().info().times, Some(Split::Test)).unwrap();
+    let result = scene.input.reduced(reduction).unwrap();
+    let frame_psnr = |(frame, views): (usize, &[(u32, u32)])| -> f64 {
+        let [original, now] =
+            [scene.source(), &*result].map(|source| gather_all(source, frame, Columns::all()).unwrap());
+        let view_psnr = |&(_, camera): &(u32, u32)| {
+            let rendered = |state| render(state, &schedule.cameras[camera as usize], scene.background);
+            psnr(&rendered(&now), &rendered(&original))
+        };
+        views.iter().map(view_psnr).sum()
+    };
+    schedule.iter().enumerate().map(frame_psnr).sum::<f64>() / schedule.pairs() as f64
+}
+
+#[test]
+fn refinement_improves_test_views() {
+    let folder = tempfile::tempdir().unwrap();
+    let scene = scene(folder.path());
+    let rig = scene.rig.clone();
+    let (plain, _) = refined(&scene, 300, 0, Vec::new());
+    let (moved, journal) = refined(&scene, 300, 200, Vec::new());
+    let [before, after] = [&plain, &moved].map(|reduction| test_psnr(&scene, &rig, reduction));
+    assert!(after > before + 3.0, "{before:.2} dB before, {after:.2} after");
+    assert_eq!((journal.left_out.len(), journal.notes.len()), (0, 1));
+    assert_eq!(moved.kept, plain.kept);
+}
+
+#[test]
+fn threads_and_limits_do_not_change_the_result() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut scene = scene(folder.path());
+    let keep: Vec<u32> = (100..140).collect();
+    let on = |threads: usize, scene: &Scene| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(|| refined(scene, 200, 110, keep.clone())).0
+    };
+    let one = on(1, &scene);
+    assert!(!one.change.is_empty());
+    assert!(on(3, &scene).change == one.change, "threads change it");
+    scene.limits = Limits { frames_held: 1, pictures_together: 1, ..Limits::NONE };
+    assert!(on(2, &scene).change == one.change, "limits change it");
+    for (place, id) in one.kept.iter().enumerate().filter(|(_, id)| keep.contains(id)) {
+        let moved = |column: Columns| {
+            let delta = one.change.0.column(column);
+            (0..delta.width()).any(|c| delta.plane(c)[place] != 0.0)
+        };
+        assert!(!Columns::all().iter().any(moved), "Gaussian {id} is protected and moved");
+    }
+}
+
+#[test]
+#[ignore = "needs time"]
+fn interrupted_runs_resume_to_the_same_result() {
+    let folder = tempfile::tempdir().unwrap();
+    let model = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/tiny_model");
+    let long = folder.path().join("long.gseq");
+    let demo = demo_scene::Scene::new(900, 16);
+    write_container(&demo, &long, gseq::Compression::Raw, Default::default(), |_| ()).unwrap();
+    let short = folder.path().join("scene.gseq");
+    drop(scene(folder.path()));
+    // States that are the stored parameters plus a delta, states from a deformation field, and time-varying deltas.
+    for (number, path, steps, pictures) in [(0, short, 120, 60), (1, model, 120, 60), (2, long, 300, 300)] {
+        let open = |work: Option<CacheRequest>| {
+            let cameras = (number == 1).then(|| path.clone());
+            let options = InputOptions { path: path.clone(), cameras, work, ..Default::default() };
+            let mut opened = open_scene(&options).unwrap();
+            opened.has_cameras = true;
+            if number == 2 {
+                opened.schedule = demo.rig().schedule(&demo.info().times, Some(Split::Train)).unwrap();
+            }
+            opened
+        };
+        let run = |scene: &Scene| -> Result<CompressedModel> {
+            let recipe = Recipe::preset("default").unwrap();
+            let scored = crate::pipeline::score_scene(scene, &recipe, &UserOverrides::default())?;
+            let count = scored.count();
+            let reduction = CompressedModel::pruned(scored.ranked().take(2 * count / 5), &recipe.merge);
+            let few = RefineStage {
+                steps,
+                cut_steps: 40,
+                pictures,
+                ..RefineStage::from_recipe(&recipe, None, true).unwrap()
+            };
+            few.run(scene, &scored, reduction, count / 4, &mut Journal::default())
+        };
+        let start = Instant::now();
+        let expected = run(&open(None)).unwrap();
+        let whole = start.elapsed();
+        let (place, away) = (folder.path().join(format!("work{number}")), folder.path().join("away"));
+        let asked = || Some(CacheRequest { folder: place.clone(), part: None });
+        let (mut cuts, mut found) = (0, None);
+        for delay in (0..40).map(|k| whole.mul_f64(0.1 * 1.15f64.powi(k))) {
+            let scene = open(asked());
+            // The cache folder is renamed while the run goes on, so its next checkpoint fails and the run ends.
+            let ended = std::thread::scope(|scope| {
+                scope.spawn(|| {
+                    std::thread::sleep(delay);
+                    std::fs::rename(&place, &away).unwrap();
+                });
+                run(&scene)
+            });
+            std::fs::rename(&away, &place).unwrap();
+            match ended {
+                Ok(reduction) => {
+                    found = Some(reduction);
+                    break;
+                }
+                Err(error) => {
+                    assert!(error.to_string().contains("work"), "{error}");
+                    cuts += 1;
+                }
+            }
+        }
+        let found = found.expect("it ends");
+        assert!(cuts > 1, "it was interrupted {cuts} times");
+        assert!(found.change == expected.change && !found.change.is_empty(), "{number}, interrupted {cuts} times");
+        assert!(found.course == expected.course, "{number}, interrupted {cuts} times: along time");
+        assert_eq!(expected.course.is_empty(), number < 2, "{number}");
+    }
+}
+
+/// A demo scene of which each frame shows a third of the Gaussians; the others have the given opacity logit.
+struct ShortLives(demo_scene::Scene, SequenceInfo, f32);
+
+struct Reader<'a>(Box<dyn BlockReader + 'a>, Vec<usize>, f32);
+
+impl FrameSource for ShortLives {
+    fn info(&self) -> &SequenceInfo {
+        &self.1
+    }
+
+    fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>> {
+        let ids_read = ids.iter().collect();
+        Ok(Box::new(Reader(self.0.open(ids)?, ids_read, self.2)))
+    }
+}
+
+impl BlockReader for Reader<'_> {
+    fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
+        self.0.read(frame, want, out)?;
+        if want.contains(Columns::OPACITY) {
+            let logits = out.opacity_logit.plane_mut(0).iter_mut().zip(&self.1);
+            logits.filter(|(_, id)| !(*id + frame).is_multiple_of(3)).for_each(|(logit, _)| *logit = self.2);
+        }
+        Ok(())
+    }
+}
+
+#[test]
+fn leaving_out_absent_gaussians_changes_no_result() {
+    let folder = tempfile::tempdir().unwrap();
+    let [away, unseen] = [-40.0, -25.0].map(|logit| {
+        let demo = demo_scene::Scene::new(900, 6);
+        let (rig, info) = (demo.rig(), SequenceInfo { varying: Columns::all(), ..demo.info().clone() });
+        let path = folder.path().join("scene.gseq");
+        let source = ShortLives(demo, info, logit);
+        write_container(&source, &path, gseq::Compression::Raw, Default::default(), |_| ()).unwrap();
+        let input = Box::new(Container::open(&path).unwrap());
+        let scene = Scene::new(path, input, rig, Some(Split::Train)).unwrap();
+        let recipe = Recipe::preset("default").unwrap();
+        let scored = score_scene(&scene, &recipe, &UserOverrides::default());
+        let reduction = CompressedModel::pruned(scored.ranked().take(600), &recipe.merge);
+        let few = RefineStage { steps: 100, cut_steps: 40, ..RefineStage::from_recipe(&recipe, None, true).unwrap() };
+        few.run(&scene, &scored, reduction, 250, &mut Journal::default()).unwrap()
+    });
+    assert!(!away.change.is_empty() && away.change == unseen.change);
+    assert_eq!(away.kept, unseen.kept);
+}
+
+#[test]
+#[ignore = "needs time"]
+fn explicit_frames_improve_along_time_in_every_output() {
+    let folder = tempfile::tempdir().unwrap();
+    let demo = demo_scene::Scene::new(900, 16);
+    let [packed, files] = ["scene.gseq", "frames"].map(|name| folder.path().join(name));
+    write_container(&demo, &packed, gseq::Compression::Raw, Default::default(), |_| ()).unwrap();
+    std::fs::create_dir(&files).unwrap();
+    write_sequence(&demo, OutputKind::PlySequence, &files, 1, &Events::IGNORED).unwrap();
+    let read = |source: &dyn FrameSource| -> Vec<Gaussians> {
+        (0..16).map(|frame| gather_all(source, frame, Columns::all()).unwrap()).collect()
+    };
+    for (name, path, link) in
+        [("packed", &packed, Link::Never), ("files", &files, Link::Never), ("linked", &files, Link::Apart)]
+    {
+        let input = crate::models::open(path, &OpenOptions { link, ..OpenOptions::default() }).unwrap();
+        let scene = Scene::new(path.clone(), input, demo.rig(), Some(Split::Train)).unwrap();
+        let recipe = Recipe::preset("default").unwrap();
+        let scored = score_scene(&scene, &recipe, &UserOverrides::default());
+        let given = read(scene.source());
+        let is_still = |states: &[Gaussians], column: Columns, row: usize| {
+            let values = |frame: &Gaussians| frame.column(column).pick(&[row as u32]);
+            states.iter().all(|frame| values(frame) == values(&states[0]))
+        };
+        // Of the Gaussians that are always present, keep half of the moving and an eighth of the static ones.
+        let is_there = |id: usize| given.iter().all(|frame| frame.opacity_logit.plane(0)[id] > -30.0);
+        let part = |&id: &u32| {
+            let one_in = if is_still(&given, Columns::POSITION, id as usize) { 8 } else { 2 };
+            id % one_in == 0 && is_there(id as usize)
+        };
+        let kept: Vec<u32> = (0..given[0].len() as u32).filter(part).collect();
+        let [constant, varying] = [0, 4].map(|keyframe_count| {
+            let reduction = CompressedModel::pruned(kept.clone(), &recipe.merge);
+            let few = RefineStage {
+                steps: 300,
+                knots: keyframe_count,
+                ..RefineStage::from_recipe(&recipe, None, false).unwrap()
+            };
+            few.run(&scene, &scored, reduction, kept.len(), &mut Journal::default()).unwrap()
+        });
+        assert_eq!((constant.course.0.len(), varying.course.0.len()), (0, 4));
+        assert!(varying.change == constant.change, "{name}");
+        // Some tracks join two Gaussians of this scene, with different colors.
+        assert!(link == Link::Apart || !varying.course.columns().contains(Columns::SH), "{name}");
+        let [before, after] = [&constant, &varying].map(|reduction| test_psnr(&scene, &demo.rig(), reduction));
+        // Moving Gaussians cover a small part of these views, and static ones must stay static.
+        assert!(after > before + 0.02, "{name}: {before:.2} dB constant in time, {after:.2} varying in time");
+        let expected = read(&*scene.input.reduced(&varying).unwrap());
+        // Attributes that are constant in the input stay constant, for every Gaussian.
+        let mut still = [0, 0];
+        for (place, &id) in varying.kept.iter().enumerate() {
+            for column in Columns::all().iter() {
+                let was_still = is_still(&given, column, id as usize);
+                assert!(!was_still || is_still(&expected, column, place), "{name}: {id}, {}", column.name());
+                still[usize::from(was_still && column == Columns::POSITION)] += 1;
+            }
+        }
+        assert!(still.iter().all(|&count| count > 20), "{name}: {still:?}");
+        for (kind, out) in [(OutputKind::Gseq, "out.gseq"), (OutputKind::PlySequence, "out")] {
+            let out = folder.path().join(format!("{name}_{out}"));
+            if kind == OutputKind::PlySequence {
+                std::fs::create_dir(&out).unwrap();
+            }
+            scene.input.write(&varying, kind, &out, &Limits::NONE, &Events::IGNORED).unwrap();
+            let options = OpenOptions { link: Link::Never, ..OpenOptions::default() };
+            let written = crate::models::open(&out, &options).unwrap();
+            assert!(read(written.source()) == expected, "{name} as {kind:?}");
+        }
+    }
+}
+
+#[test]
+fn without_bands_higher_sh_degrees_stay() {
+    let folder = tempfile::tempdir().unwrap();
+    let scene = scene(folder.path());
+    let recipe = Recipe::preset("default").unwrap();
+    let scored = score_scene(&scene, &recipe, &UserOverrides::default());
+    let reduction = CompressedModel::pruned(scored.ranked().take(300), &recipe.merge);
+    let (mut journal, count) = (Journal::default(), reduction.len());
+    let refine = RefineStage { steps: 100, ..RefineStage::from_recipe(&recipe, None, false).unwrap() }.without_bands();
+    let moved = refine.run(&scene, &scored, reduction, count, &mut journal).unwrap();
+    assert_eq!((moved.change.0.sh.width(), moved.change.0.sh.len()), (3, count));
+    assert!(scene.source().info().sh_degree > 0 && journal.notes.len() == 1, "{journal:?}");
+}
+
+#[test]
+fn models_without_possible_gain_stay_unchanged() {
+    let folder = tempfile::tempdir().unwrap();
+    let scene = scene(folder.path());
+    let (whole, journal) = refined(&scene, 1500, 120, Vec::new());
+    assert!(whole.change.is_empty());
+    assert_eq!((journal.left_out.len(), journal.left_out[0].what.as_str()), (1, "refinement"));
+    let (none, journal) = refined(&scene, 0, 120, Vec::new());
+    assert_eq!((none.len(), journal.left_out.len()), (0, 1));
+}
+
+#[test]
+fn the_optimizer_restarts_and_continues_with_a_subset() {
+    let folder = tempfile::tempdir().unwrap();
+    let explicit = scene(folder.path());
+    let model = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/tiny_model");
+    let options = InputOptions { path: model.clone(), cameras: Some(model), ..InputOptions::default() };
+    for scene in [explicit, open_scene(&options).unwrap()] {
+        let targets = Targets::new(&scene, 520).unwrap();
+        let count = scene.source().info().count;
+        let kept = (0..count as u32).step_by(2).collect();
+        let reduction = CompressedModel::pruned(kept, &Recipe::preset("default").unwrap().merge);
+        let result = scene.input.reduced(&reduction).unwrap();
+        let refine = RefineStage::from_recipe(&Recipe::preset("default").unwrap(), None, false).unwrap();
+        let fixed = vec![false; reduction.len()];
+        let mut optimizer = OptimizerState::new(&scene, &*result, &targets, refine.step_params(), fixed).unwrap();
+        let (views, schedule) = ([0, 7, 20], RateSchedule::new(20, 1.0, 1.0));
+        let start = optimizer.quality(&views).unwrap().psnr;
+        let no_delta = optimizer.change();
+        let run = |optimizer: &mut OptimizerState<'_>| (0..20).for_each(|k| optimizer.step(k, &schedule).unwrap());
+        run(&mut optimizer);
+        optimizer.reevaluate_states().unwrap();
+        optimizer.restart_from(&no_delta).unwrap();
+        let back = optimizer.quality(&views).unwrap().psnr;
+        assert!((back - start).abs() < 1e-3, "{start:.4} dB at the start, {back:.4} after the restart");
+        run(&mut optimizer);
+        optimizer.reevaluate_states().unwrap();
+        let (there, change) = (optimizer.quality(&views).unwrap().psnr, optimizer.change());
+        assert!(there > start + 0.5, "{start:.2} dB before, {there:.2} after");
+        run(&mut optimizer);
+        optimizer.restart_from(&change).unwrap();
+        let back = optimizer.quality(&views).unwrap().psnr;
+        assert!((back - there).abs() < 1e-3, "{there:.4} dB there, {back:.4} after the restart");
+
+        let some: Vec<u32> = (0..reduction.len() as u32).step_by(3).collect();
+        let whole = optimizer.change();
+        optimizer.pick(&some).unwrap();
+        let picked = optimizer.quality(&views).unwrap().psnr;
+        let picked_model = CompressedModel { change: whole.pick(&some), ..reduction.pick(&some) };
+        let result = scene.input.reduced(&picked_model).unwrap();
+        let fixed = vec![false; some.len()];
+        let fresh = OptimizerState::new(&scene, &*result, &targets, refine.step_params(), fixed).unwrap();
+        let expected = fresh.quality(&views).unwrap().psnr;
+        assert!((picked - expected).abs() < 1e-3, "got {picked:.4} dB, expected {expected:.4}");
+    }
+}

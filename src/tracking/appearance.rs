@@ -1,0 +1,132 @@
+//! Appearance of a Gaussian as far as it is compared, and the cost of differences.
+
+use rayon::prelude::*;
+
+use crate::model::{Column, Gaussians, SH_C0};
+
+/// Largest magnitude of the natural log of a scale; others are clamped to it, so that squares of scales stay finite in
+/// f32.
+const MAX_LOG_SCALE: f32 = 30.0;
+/// Differences in size (natural log), shape, opacity and color that cost 1 each.
+const SIZE_UNIT: f32 = std::f32::consts::LN_2 / 2.0;
+const SHAPE_UNIT: f32 = 0.25;
+const OPACITY_UNIT: f32 = 0.5;
+const COLOR_UNIT: f32 = 0.1;
+/// Parameters r and q of the [module](super) for near-duplicates.
+const DUPLICATE_REACH: f32 = 0.25;
+const DUPLICATE_STRICTNESS: f32 = 4.0;
+
+/// Attributes of a Gaussian at one frame that are compared.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct ComparedAppearance {
+    /// Position, scene units.
+    pub(super) position: [f32; 3],
+    /// Root mean square of the scales, scene units; `ln_size` is its natural log.
+    pub(super) size: f32,
+    pub(super) ln_size: f32,
+    /// Covariance divided by its trace: xx, yy, zz, and √2 times xy, xz, yz, so that the sum of squares is that of the
+    /// matrix.
+    shape: [f32; 6],
+    opacity: f32,
+    /// Base color: red, green, blue; 0 to 1 is the range of a screen.
+    color: [f32; 3],
+    /// Hash of the bits of position, rotation, scales, opacity and base color.
+    pub(super) bits: u64,
+}
+
+impl ComparedAppearance {
+    /// Returns the appearances of all Gaussians of a frame.
+    pub(super) fn all_from_state(state: &Gaussians) -> Vec<ComparedAppearance> {
+        (0..state.len())
+            .into_par_iter()
+            .with_min_len(4096)
+            .map(|i| ComparedAppearance::from_gaussian(state, i))
+            .collect()
+    }
+
+    fn from_gaussian(state: &Gaussians, i: usize) -> ComparedAppearance {
+        let row = |column: &Column| column.row::<3>(i);
+        let (position, rotation, log_scale) = (row(&state.position), state.rotation.row::<4>(i), row(&state.log_scale));
+        let (logit, dc) = (state.opacity_logit.row::<1>(i), row(&state.sh));
+        let values = position.iter().chain(&rotation).chain(&log_scale).chain(&logit).chain(&dc);
+        let bits = values.fold(0x9e37_79b9_7f4a_7c15, |hash, value| mix(hash ^ u64::from(value.to_bits())));
+        // A NaN stays NaN and fails every comparison.
+        let variance = log_scale.map(|log| (2.0 * log.clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE)).exp());
+        let trace: f32 = variance.iter().sum();
+        let size = (trace / 3.0).sqrt();
+        ComparedAppearance {
+            position,
+            size,
+            ln_size: size.ln(),
+            shape: shape(rotation, variance.map(|v| v / trace)),
+            opacity: 1.0 / (1.0 + (-logit[0]).exp()),
+            color: dc.map(|dc| 0.5 + SH_C0 as f32 * dc),
+            bits,
+        }
+    }
+
+    /// Returns the same appearance at another position.
+    pub(super) fn at(self, position: [f32; 3]) -> ComparedAppearance {
+        ComparedAppearance { position, ..self }
+    }
+
+    /// Returns the sum of the color channels, by which Gaussians of a crowded cell are selected.
+    pub(super) fn brightness(&self) -> f32 {
+        self.color.iter().sum()
+    }
+
+    /// Returns the difference A of the [module](super), which is symmetric.
+    pub(super) fn difference(&self, other: &ComparedAppearance) -> f32 {
+        let opacity = (self.opacity - other.opacity) / OPACITY_UNIT;
+        self.difference_without_opacity(other) + opacity * opacity
+    }
+
+    /// Returns whether both look the same except for opacity: closer than the first round's reach, with a small
+    /// difference.
+    pub(super) fn is_near_duplicate(&self, other: &ComparedAppearance) -> bool {
+        self.distance_cost(other, DUPLICATE_REACH, DUPLICATE_STRICTNESS) <= 1.0
+    }
+
+    /// Returns the cost |x_b − x_a|² / (r·min(s_a, s_b))² + q·A of the [module](super), opacity excluded, where r is
+    /// `reach` and q is `strictness`. If the distance alone costs more than 1, only that cost is returned.
+    pub(super) fn distance_cost(&self, other: &ComparedAppearance, reach: f32, strictness: f32) -> f32 {
+        let unit = reach * self.size.min(other.size);
+        let distance = squared_distance(&self.position, &other.position) / (unit * unit);
+        // Most Gaussians in the cells of a grid are too far away, so their difference is not computed.
+        if distance > 1.0 { distance } else { distance + strictness * self.difference_without_opacity(other) }
+    }
+
+    /// Returns the difference A without its opacity term.
+    fn difference_without_opacity(&self, other: &ComparedAppearance) -> f32 {
+        let size = (self.ln_size - other.ln_size) / SIZE_UNIT;
+        size * size
+            + squared_distance(&self.shape, &other.shape) / (SHAPE_UNIT * SHAPE_UNIT)
+            + squared_distance(&self.color, &other.color) / (COLOR_UNIT * COLOR_UNIT)
+    }
+}
+
+fn squared_distance(a: &[f32], b: &[f32]) -> f32 {
+    a.iter().zip(b).map(|(a, b)| (a - b) * (a - b)).sum()
+}
+
+/// Hashes `x` with a bijection in which every bit depends on all lower bits and, through the shift, on higher ones (S.
+/// Vigna, splitmix64, 2015, one round).
+pub(super) fn mix(x: u64) -> u64 {
+    let x = (x ^ (x >> 32)).wrapping_mul(0xd6e8_feb8_6659_fd93);
+    (x ^ (x >> 32)).wrapping_mul(0xd6e8_feb8_6659_fd93)
+}
+
+/// Returns R·diag(v)·Rᵀ for a wxyz quaternion of any length; a zero quaternion is the identity.
+fn shape(quaternion: [f32; 4], v: [f32; 3]) -> [f32; 6] {
+    let length = quaternion.iter().map(|x| x * x).sum::<f32>();
+    let [w, x, y, z] = if length == 0.0 { [1.0, 0.0, 0.0, 0.0] } else { quaternion };
+    let s = 2.0 / if length == 0.0 { 1.0 } else { length };
+    let r = [
+        [1.0 - s * (y * y + z * z), s * (x * y - w * z), s * (x * z + w * y)],
+        [s * (x * y + w * z), 1.0 - s * (x * x + z * z), s * (y * z - w * x)],
+        [s * (x * z - w * y), s * (y * z + w * x), 1.0 - s * (x * x + y * y)],
+    ];
+    let entry = |a: usize, b: usize| (0..3).map(|k| r[a][k] * v[k] * r[b][k]).sum::<f32>();
+    let root = std::f32::consts::SQRT_2;
+    [entry(0, 0), entry(1, 1), entry(2, 2), root * entry(0, 1), root * entry(0, 2), root * entry(1, 2)]
+}

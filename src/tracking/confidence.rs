@@ -1,0 +1,99 @@
+//! Probability that links are wrong, and removal of the doubtful ones.
+
+use super::appearance::ComparedAppearance;
+use super::links::Links;
+use super::track::{Candidates, NONE, OpenTrack, Round};
+
+/// Largest fraction of a frame's links that may be expected to be wrong.
+pub(super) const MAX_WRONG: f64 = 0.005;
+/// Difference below which two costs count as equal.
+const COST_TOLERANCE: f32 = 1e-6;
+/// Probability that a track is absent although an unrelated Gaussian lies within its reach.
+const ABSENCE_PROBABILITY: f32 = 0.25;
+
+/// Estimates of how many links of a frame are wrong.
+pub(super) struct LinkConfidence {
+    /// Expected number of wrong links.
+    expected_wrong: f64,
+    /// Tracks whose link is wrong with a probability above [`MAX_WRONG`], with that probability.
+    doubtful: Vec<(f32, u32)>,
+    /// For every linked track, the cost of its link and a rival's, divided by their cost with the Gaussians exchanged:
+    /// the largest ratio over all rivals.
+    ratios: Vec<f32>,
+}
+
+impl LinkConfidence {
+    pub(super) fn new(tracks: usize) -> LinkConfidence {
+        LinkConfidence { expected_wrong: 0.0, doubtful: Vec::new(), ratios: vec![0.0; tracks] }
+    }
+
+    /// Adds the links made in a round, given the candidates of the tracks that took part.
+    pub(super) fn add_round(
+        &mut self,
+        links: &Links,
+        candidates_by_track: &[(u32, Candidates)],
+        (tracks, appearances): (&[OpenTrack], &[ComparedAppearance]),
+        round: &Round,
+    ) {
+        let cost =
+            |track: u32, gaussian: u32| tracks[track as usize].cost(&appearances[gaussian as usize], round).min(1.0);
+        let (mut linked, mut surplus) = (Vec::with_capacity(candidates_by_track.len()), 0);
+        for (track, candidates) in candidates_by_track {
+            let own = links.gaussian_of_track[*track as usize];
+            let own_cost = if own == NONE { 0.0 } else { cost(*track, own) };
+            let others = candidates.iter().filter(|candidate| candidate.gaussian != own);
+            if own != NONE {
+                linked.push((*track, own_cost));
+                surplus += others.clone().count();
+            }
+            for candidate in others {
+                let other = links.track_of_gaussian[candidate.gaussian as usize];
+                let are_duplicate_tracks =
+                    |a: u32, b: u32| tracks[a as usize].appearance.is_near_duplicate(&tracks[b as usize].appearance);
+                let are_duplicates =
+                    |a: u32, b: u32| appearances[a as usize].is_near_duplicate(&appearances[b as usize]);
+                if (other != NONE && are_duplicate_tracks(*track, other))
+                    || (own != NONE && are_duplicates(own, candidate.gaussian))
+                {
+                    continue;
+                }
+                let now = own_cost + if other == NONE { 0.0 } else { cost(other, candidate.gaussian) };
+                let swapped = candidate.cost + if own == NONE || other == NONE { 0.0 } else { cost(other, own) };
+                let ratio = (now + COST_TOLERANCE) / (swapped + COST_TOLERANCE);
+                for (track, gaussian) in [(*track, own), (other, candidate.gaussian)] {
+                    if track != NONE && gaussian != NONE {
+                        let most = &mut self.ratios[track as usize];
+                        *most = most.max(ratio);
+                    }
+                }
+            }
+        }
+        let mean_surplus = surplus as f32 / linked.len().max(1) as f32;
+        for (track, cost) in linked {
+            let ratio = self.ratios[track as usize];
+            let fifth = ratio * ratio * ratio * ratio * ratio;
+            let probability =
+                (ABSENCE_PROBABILITY * mean_surplus * cost * cost.sqrt()).min(0.5).max(fifth / (1.0 + fifth));
+            self.expected_wrong += f64::from(probability);
+            if f64::from(probability) > MAX_WRONG {
+                self.doubtful.push((probability, track));
+            }
+        }
+    }
+
+    /// Drops the least certain links until at most the fraction [`MAX_WRONG`] of the remaining ones is expected to be
+    /// wrong. Returns the Gaussians of the dropped links.
+    pub(super) fn drop_doubtful(mut self, links: &mut Links) -> Vec<u32> {
+        self.doubtful.sort_unstable_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
+        let count = links.count();
+        let mut dropped = Vec::new();
+        for (probability, track) in self.doubtful {
+            if self.expected_wrong <= MAX_WRONG * (count - dropped.len()) as f64 {
+                break;
+            }
+            dropped.push(links.undo(track));
+            self.expected_wrong -= f64::from(probability);
+        }
+        dropped
+    }
+}

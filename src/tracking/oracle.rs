@@ -1,0 +1,365 @@
+//! Slow, independent implementation of the rules of the [module](super) in f64, which compares every pair of track and
+//! Gaussian. Tests compare the linker and the joiner with it.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use super::GAP;
+use crate::model::{Gaussians, SH_C0, opacity};
+
+/// Returns the root mean square of the scales of Gaussian `i`, scene units.
+pub(super) fn rms_size(state: &Gaussians, i: usize) -> f64 {
+    let squares = state.log_scale.row::<3>(i).map(|log| (2.0 * f64::from(log)).exp());
+    (squares.iter().sum::<f64>() / 3.0).sqrt()
+}
+
+/// Linker by the rules 1 to 4 of the [module](super), without cuts.
+#[derive(Default)]
+pub(super) struct SlowLinker {
+    tracks: Vec<SlowTrack>,
+    /// Number of tracks so far.
+    pub(super) born: u32,
+}
+
+/// Track that may continue.
+struct SlowTrack {
+    number: u32,
+    frames_since_seen: f64,
+    velocity: Option<[f64; 3]>,
+    seen: SeenGaussian,
+    is_succeeded: bool,
+}
+
+/// Appearance of a Gaussian at one frame.
+#[derive(Clone)]
+pub(super) struct SeenGaussian {
+    position: [f64; 3],
+    size: f64,
+    shape: [[f64; 3]; 3],
+    opacity: f64,
+    color: [f64; 3],
+    bits: Vec<u32>,
+}
+
+/// Returns the appearance of Gaussian `i`.
+pub(super) fn seen(state: &Gaussians, i: usize) -> SeenGaussian {
+    let [w, x, y, z] = {
+        let q = state.rotation.row::<4>(i).map(f64::from);
+        let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
+        q.map(|x| x / length)
+    };
+    // Rotation matrix: its columns are the rotated axes.
+    let r = glam::DMat3::from_quat(glam::DQuat::from_xyzw(x, y, z, w));
+    let variance = state.log_scale.row::<3>(i).map(|log| (2.0 * f64::from(log)).exp());
+    let covariance = r * glam::DMat3::from_diagonal(variance.into()) * r.transpose();
+    let trace: f64 = variance.iter().sum();
+    let columns = (covariance * trace.recip()).to_cols_array_2d();
+    let bits = |values: &[f32]| values.iter().map(|x| x.to_bits()).collect::<Vec<u32>>();
+    SeenGaussian {
+        position: state.position.row::<3>(i).map(f64::from),
+        size: rms_size(state, i),
+        shape: columns,
+        opacity: opacity(state.opacity_logit.plane(0)[i]),
+        color: state.sh.row::<3>(i).map(|dc| 0.5 + SH_C0 * f64::from(dc)),
+        bits: [
+            bits(&state.position.row::<3>(i)),
+            bits(&state.rotation.row::<4>(i)),
+            bits(&state.log_scale.row::<3>(i)),
+            bits(&state.opacity_logit.row::<1>(i)),
+            bits(&state.sh.row::<3>(i)),
+        ]
+        .concat(),
+    }
+}
+
+/// Returns the difference A of the [module](super) without its opacity term.
+fn difference(a: &SeenGaussian, b: &SeenGaussian) -> f64 {
+    let shape: f64 = (0..9).map(|k| (b.shape[k / 3][k % 3] - a.shape[k / 3][k % 3]).powi(2)).sum();
+    let color: f64 = (0..3).map(|c| (b.color[c] - a.color[c]).powi(2)).sum();
+    let size = (b.size / a.size).ln() / 2f64.sqrt().ln();
+    size * size + shape / 0.25f64.powi(2) + color / 0.1f64.powi(2)
+}
+
+/// Returns whether two Gaussians look the same except for opacity.
+fn is_near_duplicate(a: &SeenGaussian, b: &SeenGaussian) -> bool {
+    let distance: f64 = (0..3).map(|c| (b.position[c] - a.position[c]).powi(2)).sum();
+    distance / (0.25 * a.size.min(b.size)).powi(2) + 4.0 * difference(a, b) <= 1.0
+}
+
+impl SlowTrack {
+    /// Returns the cost that a Gaussian continues the track.
+    fn cost(&self, b: &SeenGaussian, r: f64, q: f64) -> f64 {
+        let v = self.velocity.unwrap_or_default();
+        let speed = v.iter().map(|v| v * v).sum::<f64>().sqrt();
+        let u = self.seen.size + (0.5 * self.frames_since_seen * speed).min(3.0 * self.seen.size);
+        let distance: f64 =
+            (0..3).map(|c| (b.position[c] - self.seen.position[c] - self.frames_since_seen * v[c]).powi(2)).sum();
+        distance / (r * u).powi(2) + q * (difference(&self.seen, b) + ((b.opacity - self.seen.opacity) / 0.5).powi(2))
+    }
+}
+
+impl SlowLinker {
+    /// Returns the probability that its link is wrong for every track that a round has linked. `candidates` are all
+    /// (cost, track, Gaussian) of the round.
+    fn probabilities(
+        candidates: &[(f64, usize, usize)],
+        gaussian_of: &BTreeMap<usize, usize>,
+        taken: &BTreeMap<usize, usize>,
+        cost: impl Fn(usize, usize) -> f64,
+        are_duplicates: impl Fn(usize, usize, Option<usize>, Option<usize>) -> bool,
+    ) -> Vec<(f64, usize)> {
+        let linked: BTreeMap<usize, usize> =
+            candidates.iter().filter_map(|&(_, a, _)| gaussian_of.get(&a).map(|&b| (a, b))).collect();
+        let rivals: Vec<_> = candidates.iter().filter(|(_, a, b)| gaussian_of.get(a) != Some(b)).collect();
+        let surplus = rivals.iter().filter(|(_, a, _)| linked.contains_key(a)).count();
+        let mean_surplus = surplus as f64 / linked.len().max(1) as f64;
+        let probability = |(&a, &b): (&usize, &usize)| {
+            let mut most = 0f64;
+            for &&(candidate_cost, c, d) in rivals.iter().filter(|(_, c, d)| *c == a || *d == b) {
+                if are_duplicates(c, d, linked.get(&c).copied(), taken.get(&d).copied()) {
+                    continue;
+                }
+                let (now, swapped) = match (linked.get(&c), taken.get(&d)) {
+                    (Some(&own), Some(&other)) => {
+                        (cost(c, own) + cost(other, d), candidate_cost + cost(other, own).min(1.0))
+                    }
+                    (Some(&own), None) => (cost(c, own), candidate_cost),
+                    (None, Some(&other)) => (cost(other, d), candidate_cost),
+                    (None, None) => continue,
+                };
+                most = most.max((now + 1e-6) / (swapped + 1e-6));
+            }
+            let by_rivals = most.powi(5) / (1.0 + most.powi(5));
+            ((0.25 * mean_surplus * cost(a, b).powf(1.5)).min(0.5).max(by_rivals), a)
+        };
+        linked.iter().map(probability).collect()
+    }
+
+    /// Links the next frame and returns the track of every Gaussian.
+    pub(super) fn link(&mut self, state: &Gaussians) -> Vec<u32> {
+        let all: Vec<SeenGaussian> = (0..state.len()).map(|i| seen(state, i)).collect();
+        let mut gaussian_of: BTreeMap<usize, usize> = BTreeMap::new();
+        let mut taken: BTreeMap<usize, usize> = BTreeMap::new();
+        for (a, track) in self.tracks.iter().enumerate() {
+            let free = |b: &usize| !taken.contains_key(b) && all[*b].bits == track.seen.bits;
+            if let Some(b) = (0..all.len()).find(free) {
+                gaussian_of.insert(a, b);
+                taken.insert(b, a);
+            }
+        }
+        let mut probabilities: Vec<(f64, usize)> = Vec::new();
+        for (r, q, includes_missing) in [(0.25, 4.0, false), (1.0, 1.0, true), (4.0, 4.0, true)] {
+            let cost = |a: usize, b: usize| self.tracks[a].cost(&all[b], r, q);
+            let mut by_cost: Vec<(f64, usize, usize)> = Vec::new();
+            for (a, track) in self.tracks.iter().enumerate() {
+                if gaussian_of.contains_key(&a)
+                    || (track.frames_since_seen > 1.0 && (!includes_missing || track.is_succeeded))
+                {
+                    continue;
+                }
+                let free = (0..all.len()).filter(|b| !taken.contains_key(b));
+                let mut own: Vec<(f64, usize, usize)> = free.map(|b| (cost(a, b), a, b)).collect();
+                own.retain(|candidate| candidate.0 <= 1.0);
+                own.sort_by(|x, y| x.partial_cmp(y).unwrap());
+                by_cost.extend(own.into_iter().take(4));
+            }
+            let candidates = by_cost.clone();
+            by_cost.sort_by(|x, y| x.partial_cmp(y).unwrap());
+            for (_, a, b) in by_cost {
+                if !gaussian_of.contains_key(&a) && !taken.contains_key(&b) {
+                    gaussian_of.insert(a, b);
+                    taken.insert(b, a);
+                }
+            }
+            for _ in 0..4 {
+                for &(candidate_cost, a, b) in &candidates {
+                    let (Some(&own), Some(&other)) = (gaussian_of.get(&a), taken.get(&b)) else { continue };
+                    let theirs = cost(other, own);
+                    if other != a && theirs <= 1.0 && candidate_cost + theirs < cost(a, own) + cost(other, b) {
+                        gaussian_of.extend([(a, b), (other, own)]);
+                        taken.extend([(b, a), (own, other)]);
+                    }
+                }
+            }
+            let close = |a: usize, b: usize| is_near_duplicate(&self.tracks[a].seen, &self.tracks[b].seen);
+            let are_duplicates = |c, d, own: Option<usize>, other: Option<usize>| {
+                other.is_some_and(|e| close(c, e)) || own.is_some_and(|b: usize| is_near_duplicate(&all[b], &all[d]))
+            };
+            probabilities.extend(Self::probabilities(&candidates, &gaussian_of, &taken, cost, are_duplicates));
+        }
+        // Drop links until at most one in two hundred is expected to be wrong.
+        probabilities.sort_by(|x, y| y.0.total_cmp(&x.0).then(x.1.cmp(&y.1)));
+        let mut expected_wrong: f64 = probabilities.iter().map(|(probability, _)| probability).sum();
+        for (probability, a) in probabilities {
+            if expected_wrong <= 0.005 * gaussian_of.len() as f64 {
+                break;
+            }
+            gaussian_of.remove(&a);
+            expected_wrong -= probability;
+        }
+        self.extend_tracks(&all, &gaussian_of)
+    }
+
+    /// Advances the open tracks by a frame and returns the track of every Gaussian.
+    fn extend_tracks(&mut self, all: &[SeenGaussian], gaussian_of: &BTreeMap<usize, usize>) -> Vec<u32> {
+        let mut numbers = vec![u32::MAX; all.len()];
+        for (a, track) in self.tracks.iter_mut().enumerate() {
+            let Some(&b) = gaussian_of.get(&a) else {
+                if track.frames_since_seen == 1.0 {
+                    let v = track.velocity.unwrap_or_default();
+                    let expected = SeenGaussian {
+                        position: [0, 1, 2].map(|c| track.seen.position[c] + v[c]),
+                        ..track.seen.clone()
+                    };
+                    track.is_succeeded = all.iter().any(|other| {
+                        let distance: f64 = (0..3).map(|c| (other.position[c] - expected.position[c]).powi(2)).sum();
+                        let unit = 0.25 * other.size.min(expected.size);
+                        distance / unit.powi(2) + difference(&expected, other) <= 1.0
+                    });
+                }
+                track.frames_since_seen += 1.0;
+                continue;
+            };
+            numbers[b] = track.number;
+            let step: [f64; 3] =
+                std::array::from_fn(|c| (all[b].position[c] - track.seen.position[c]) / track.frames_since_seen);
+            let velocity = track.velocity.map(|v| std::array::from_fn(|c| 0.5 * (v[c] + step[c])));
+            (track.velocity, track.seen, track.frames_since_seen) = (velocity.or(Some(step)), all[b].clone(), 1.0);
+            track.is_succeeded = false;
+        }
+        self.tracks.retain(|track| track.frames_since_seen <= 4.0);
+        for b in 0..all.len() {
+            if numbers[b] == u32::MAX {
+                numbers[b] = self.born;
+                let seen = all[b].clone();
+                let (number, frames_since_seen, velocity) = (self.born, 1.0, None);
+                self.tracks.push(SlowTrack { number, frames_since_seen, velocity, seen, is_succeeded: false });
+                self.born += 1;
+            }
+        }
+        numbers
+    }
+}
+
+/// Appearance of each track at the frames in which it was seen.
+pub(super) type History = Vec<BTreeMap<usize, SeenGaussian>>;
+
+/// Returns the position of a track, observed or extrapolated, at a frame after its first, and the number of frames
+/// since it was seen.
+fn position_at(track: &BTreeMap<usize, SeenGaussian>, frame: usize) -> ([f64; 3], usize) {
+    let seen: Vec<(&usize, &SeenGaussian)> = track.range(..=frame).collect();
+    let mut velocity: Option<[f64; 3]> = None;
+    for pair in seen.windows(2) {
+        let step: [f64; 3] =
+            std::array::from_fn(|c| (pair[1].1.position[c] - pair[0].1.position[c]) / (pair[1].0 - pair[0].0) as f64);
+        velocity = Some(velocity.map_or(step, |v| std::array::from_fn(|c| 0.5 * (v[c] + step[c]))));
+    }
+    let (&last, at) = seen[seen.len() - 1];
+    let v = velocity.unwrap_or_default();
+    (std::array::from_fn(|c| at.position[c] + (frame - last) as f64 * v[c]), frame - last)
+}
+
+/// Pairs of tracks by the later track and the bits of the cost: the earlier track, the number of frames in which both
+/// were present, whether they are close, and whether the earlier track has ended.
+type TrackPairs = BTreeMap<(usize, u64), (usize, usize, bool, bool)>;
+
+/// Joins tracks by rule 6 of the [module](super) with the parameters (r, q), and returns the joined track of every track.
+/// `in_doubt` are tracks that began because a link was doubtful; `succeeded` are pairs of a frame and a track that is
+/// succeeded in it.
+pub(super) fn slow_joined_tracks(
+    tracks: &History,
+    in_doubt: &BTreeSet<u32>,
+    succeeded: &BTreeSet<(usize, u32)>,
+    frames: usize,
+    (r, q): (f64, f64),
+) -> Vec<u32> {
+    let cost = |a: &SeenGaussian, at: [f64; 3], b: &SeenGaussian, (r, q): (f64, f64)| {
+        let distance: f64 = (0..3).map(|c| (at[c] - b.position[c]).powi(2)).sum();
+        let sizes_agree = a.size.max(b.size) <= 2f64.sqrt() * a.size.min(b.size);
+        let cost = distance / (r * a.size.min(b.size)).powi(2) + q * difference(a, b);
+        if sizes_agree { cost } else { f64::INFINITY }
+    };
+    let first = |track: usize| *tracks[track].keys().next().unwrap();
+    let is_gone = |track: usize, frame: usize| frame > tracks[track].keys().last().unwrap() + GAP as usize;
+    let last_seen = |track: usize, frame: usize| tracks[track].range(..=frame).last().unwrap().1;
+    let mut predecessor: Vec<Option<usize>> = vec![None; tracks.len()];
+    let mut has_successor = vec![false; tracks.len()];
+    let mut pairs = TrackPairs::new();
+    for frame in 0..frames {
+        let mut absorbed = Vec::new();
+        pairs.retain(|&(b, _), (a, shared_frames, close, ended)| {
+            if is_gone(*a, frame) {
+                *ended = true;
+                return true;
+            }
+            if is_gone(b, frame) {
+                if *close {
+                    absorbed.push((b, *a));
+                }
+                return false;
+            }
+            let (Some(seen_a), Some(seen_b)) = (tracks[*a].get(&frame), tracks[b].get(&frame)) else {
+                *shared_frames = shared_frames.saturating_sub(1);
+                return true;
+            };
+            *shared_frames += 1;
+            *close &= cost(seen_a, seen_a.position, seen_b, (1.0, 1.0)) <= 1.0;
+            *shared_frames <= 4 && cost(seen_a, seen_a.position, seen_b, (r, q)) <= 1.0
+        });
+        for (b, a) in absorbed {
+            predecessor[b] = predecessor[b].or(Some(a));
+        }
+        pairs.retain(|&(b, _), _| predecessor[b].is_none());
+        join_ended(&mut pairs, &mut predecessor, &mut has_successor);
+        for b in (0..tracks.len()).filter(|&b| first(b) == frame) {
+            let own = &tracks[b][&frame];
+            let mut candidates = Vec::new();
+            let may_continue = |&a: &usize| first(a) < frame && !succeeded.contains(&(frame, a as u32));
+            for a in (0..tracks.len()).filter(may_continue) {
+                let (at, missing) = position_at(&tracks[a], frame);
+                let appearance = last_seen(a, frame);
+                let all = cost(appearance, at, own, (r, q));
+                if missing <= GAP as usize && all <= 1.0 {
+                    let close = cost(appearance, at, own, (1.0, 1.0)) <= 1.0;
+                    candidates.push((all.to_bits(), (a, usize::from(missing == 0), close, false)));
+                }
+            }
+            candidates.sort_unstable();
+            candidates.truncate(4);
+            candidates.retain(|&(_, (_, _, close, _))| close || !in_doubt.contains(&(b as u32)));
+            pairs.extend(candidates.into_iter().map(|(cost, pair)| ((b, cost), pair)));
+        }
+    }
+    pairs.retain(|_, (a, _, close, ended)| {
+        *ended = *close || is_gone(*a, frames - 1) || !tracks[*a].contains_key(&(frames - 1));
+        *ended
+    });
+    join_ended(&mut pairs, &mut predecessor, &mut has_successor);
+    let (mut joined, mut count) = (Vec::<u32>::new(), 0);
+    for predecessor in predecessor {
+        joined.push(predecessor.map_or(count, |a| joined[a]));
+        count += u32::from(predecessor.is_none());
+    }
+    joined
+}
+
+/// Joins the later track of each cheapest pair to the earlier one if that has ended, until nothing changes.
+fn join_ended(pairs: &mut TrackPairs, predecessor: &mut [Option<usize>], has_successor: &mut [bool]) {
+    loop {
+        let mut firsts: BTreeMap<usize, (u64, usize, bool)> = BTreeMap::new();
+        for (&(b, cost), &(a, _, _, ended)) in pairs.iter() {
+            firsts.entry(b).or_insert((cost, a, ended));
+        }
+        let mut ended: Vec<(u64, usize, usize)> =
+            firsts.into_iter().filter(|(_, (_, _, ended))| *ended).map(|(b, (cost, a, _))| (cost, b, a)).collect();
+        ended.sort_unstable();
+        for &(_, b, a) in &ended {
+            if !has_successor[a] {
+                (predecessor[b], has_successor[a]) = (Some(a), true);
+            }
+        }
+        pairs.retain(|&(b, _), (a, _, _, has_ended)| predecessor[b].is_none() && !(*has_ended && has_successor[*a]));
+        if ended.is_empty() {
+            return;
+        }
+    }
+}
