@@ -110,13 +110,13 @@ fn view_name(picture: Picture) -> String {
 /// Checks that `folder` is a folder.
 fn check_folder(folder: &Path) -> Result<()> {
     if !fs::metadata(folder).map_err(Error::io("open", folder))?.is_dir() {
-        return Err(Error::usage(format!("{}: --ground-truth expects a folder of pictures", folder.shown())));
+        return Err(Error::usage(format!("{}: --ground-truth expects a folder of photographs", folder.shown())));
     }
     Ok(())
 }
 
-/// Returns the photograph of `picture`, whose camera names the file `named`. `cameras` are the camera folders of a DyNeRF
-/// rig.
+/// Returns the photograph of `picture`, whose camera names the file `named`. `cameras` are the camera folders of a
+/// DyNeRF rig.
 fn file_of(folder: &Path, named: Option<&Path>, picture: Picture, cameras: &[PathBuf]) -> Option<PathBuf> {
     let numbered = folder.join(format!("{}.png", picture.name()));
     if numbered.is_file() {
