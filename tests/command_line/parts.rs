@@ -170,8 +170,8 @@ fn missing_shard_is_named_and_computed_when_joining() {
 /// Returns the keys of the cached shards of `stage`.
 fn cached_shards(workplace: &Workplace, stage: &str) -> BTreeSet<String> {
     let cached_shards: Value = serde_json::from_str(&workplace.done("work work --json")).unwrap();
-    let of_stage = cached_shards.as_array().unwrap().iter().filter(|count| count["stage"] == stage);
-    of_stage.map(|count| count["key"].as_str().unwrap().to_owned()).collect()
+    let of_stage = cached_shards.as_array().unwrap().iter().filter(|entry| entry["stage"] == stage);
+    of_stage.map(|entry| entry["key"].as_str().unwrap().to_owned()).collect()
 }
 
 #[test]
@@ -327,7 +327,7 @@ fn cache_folder_is_listed_and_cleaned() {
     let text = workplace.done("work work");
     assert!(text.starts_with("scene.gseq (splatsieve ") && text.contains("3 parts, missing: 1, 3"), "{text}");
     let cached_shards: Value = serde_json::from_str(&workplace.done("work work --json")).unwrap();
-    let pack = cached_shards.as_array().unwrap().iter().find(|count| count["stage"] == "pack").unwrap();
+    let pack = cached_shards.as_array().unwrap().iter().find(|entry| entry["stage"] == "pack").unwrap();
     assert_eq!((&pack["parts"], &pack["missing"], &pack["damaged"]), (&json!(3), &json!([1, 3]), &json!([])));
     damage_cache_entries(&workplace);
     assert!(workplace.done("work work").contains("damaged: 2"));

@@ -52,9 +52,9 @@ fn result_files(workplace: &Workplace, name: &str) -> BTreeMap<OsString, Vec<u8>
 /// Returns the time of writing of every cache entry, except entries that are overwritten while their stage runs.
 fn cache_entries(folder: &Path) -> BTreeMap<String, SystemTime> {
     let Ok(entries) = fs::read_dir(folder) else { return BTreeMap::new() };
-    let of =
+    let entry_time =
         |entry: fs::DirEntry| Some((entry.file_name().into_string().ok()?, entry.metadata().ok()?.modified().ok()?));
-    let entries = entries.filter_map(|entry| of(entry.unwrap()));
+    let entries = entries.filter_map(|entry| entry_time(entry.unwrap()));
     entries.filter(|(name, _)| name.ends_with(".piece") && !name.starts_with("refine-steps.")).collect()
 }
 
