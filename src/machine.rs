@@ -51,7 +51,8 @@ fn add_job_limits(variable: &impl Fn(&str) -> Option<String>, limits: &mut Vec<(
     }
 }
 
-/// Parses a memory size as Slurm writes it and returns bytes: a number of mebibytes, or a number followed by K, M, G or T.
+/// Parses a memory size as Slurm writes it and returns bytes: a number of mebibytes, or a number followed by K, M, G or
+/// T.
 fn parse_slurm_size(text: &str) -> Option<u64> {
     let text = text.trim();
     let digits = text.trim_end_matches(|unit: char| unit.is_ascii_alphabetic());

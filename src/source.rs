@@ -15,7 +15,7 @@ use crate::model::{Column, Columns, Gaussians, Jacobian, Raw, SequenceInfo};
 pub enum Ids<'a> {
     /// Consecutive ids.
     Range(Range<usize>),
-    /// Any ids, in any order.
+    /// List of ids, in any order.
     List(&'a [u32]),
 }
 

@@ -1,12 +1,12 @@
-//! The structure of the library: neither its folders nor its files import one another in a cycle.
+//! Tests of the structure of the library: neither its folders nor its files import one another in a cycle.
 //!
-//! A name that a `mod.rs` passes on from one of its files counts as that file's.
+//! A name that a `mod.rs` re-exports from one of its files counts as a name of that file.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::{Path, PathBuf};
 
-/// Folders of the library, each of which uses only those before it.
+/// Folders of the library; each uses only folders before it.
 const FOLDERS: [&str; 27] = [
     "limits",
     "machine",
@@ -37,33 +37,33 @@ const FOLDERS: [&str; 27] = [
     "player",
 ];
 
-/// Names that the root of the library passes on from other crates.
+/// Names that the root of the library re-exports from other crates.
 const FROM_CRATES: [&str; 5] = ["deform", "error", "metrics", "model", "render"];
 
-fn place(folder: &str) -> Option<usize> {
+fn folder_index(folder: &str) -> Option<usize> {
     FOLDERS.iter().position(|name| *name == folder)
 }
 
-/// A path of names, from the root of the library.
+/// Path of names from the root of the library.
 type Names = Vec<String>;
 
-/// What a file of the library uses, and what it passes on under which name.
+/// Paths that a file of the library imports, and its re-exports by name.
 #[derive(Default)]
 struct Module {
     uses: Vec<Names>,
     passes_on: BTreeMap<String, Names>,
 }
 
-/// Every module of the library by its path; tests are left out.
+/// All modules of the library by path, without tests.
 struct Library(BTreeMap<Names, Module>);
 
 impl Library {
-    fn of(files: &BTreeMap<Names, String>) -> Library {
+    fn parse(files: &BTreeMap<Names, String>) -> Library {
         let read = |(at, text): (&Names, &String)| (at.clone(), Module::read(at, text, files));
         Library(files.iter().map(read).collect())
     }
 
-    /// The module in which a path ends: where its last name is defined.
+    /// Returns the module that defines the last name of a path.
     fn home(&self, path: &[String]) -> Names {
         self.follow(path, 0)
     }
@@ -85,8 +85,8 @@ impl Library {
         at
     }
 
-    /// For every module those that it uses.
-    fn arrows(&self) -> BTreeMap<Names, BTreeSet<Names>> {
+    /// Returns the modules that each module uses.
+    fn dependencies(&self) -> BTreeMap<Names, BTreeSet<Names>> {
         let used = |at: &Names, module: &Module| -> BTreeSet<Names> {
             let homes = module.uses.iter().map(|path| self.home(path));
             homes.filter(|home| home != at && !home.is_empty()).collect()
@@ -100,9 +100,9 @@ impl Module {
         let code = without_tests_and_comments(text);
         let mut module = Module::default();
         let mut rest = String::new();
-        // Statements end in semicolons; those that begin with `use` are imports.
+        // Statements end in semicolons; imports begin with `use`.
         for statement in code.split(';') {
-            let Some((visibility, tree)) = import_of(statement) else {
+            let Some((visibility, tree)) = parse_import(statement) else {
                 rest.push_str(statement);
                 rest.push(';');
                 continue;
@@ -115,8 +115,8 @@ impl Module {
                 }
             }
         }
-        let of_names = |c: char| c.is_alphanumeric() || c == '_' || c == ':';
-        for word in rest.split(|c: char| !of_names(c)).filter(|word| word.contains("::")) {
+        let is_path_char = |c: char| c.is_alphanumeric() || c == '_' || c == ':';
+        for word in rest.split(|c: char| !is_path_char(c)).filter(|word| word.contains("::")) {
             let path: Names = word.split("::").filter(|name| !name.is_empty()).map(str::to_owned).collect();
             module.uses.extend(from_root(at, &path, files));
         }
@@ -124,8 +124,8 @@ impl Module {
     }
 }
 
-/// Whether an import is passed on, and the tree of what it imports.
-fn import_of(statement: &str) -> Option<(bool, &str)> {
+/// Returns whether an import is a re-export, and the tree of its imports.
+fn parse_import(statement: &str) -> Option<(bool, &str)> {
     let line = statement.lines().map(str::trim_start).position(|line| {
         line.starts_with("use ") || (line.starts_with("pub") && line.split_whitespace().nth(1) == Some("use"))
     })?;
@@ -138,13 +138,13 @@ fn without_tests_and_comments(text: &str) -> String {
     let text = text.split("#[cfg(test)]\nmod ").next().unwrap_or("");
     let text = text.split("#[cfg(test)]\npub(crate) mod ").next().unwrap_or("");
     let text = text.lines().map(|line| line.split("//").next().unwrap_or("")).collect::<Vec<_>>().join("\n");
-    // Who may see something is not whom it uses.
+    // The path in `pub(in path)` is a visibility, not an import.
     let mut parts = text.split("pub(in ");
     let first = parts.next().unwrap_or("").to_owned();
     parts.fold(first, |code, part| code + "pub(crate)" + part.split_once(')').map_or("", |(_, after)| after))
 }
 
-/// Every path of a tree such as `crate::{a, b::{c, d}}`.
+/// Returns every path of an import tree such as `crate::{a, b::{c, d}}`.
 fn expand(tree: &str) -> Vec<Names> {
     let tree = tree.trim();
     let Some(open) = tree.find('{') else {
@@ -171,7 +171,7 @@ fn expand(tree: &str) -> Vec<Names> {
     branches.map(|branch| [&stem[..], &branch[..]].concat()).collect()
 }
 
-/// A path of the module `at` from the root, if it leads into the library.
+/// Returns the path from the root, as seen from the module `at`, if it leads into the library.
 fn from_root(at: &Names, path: &[String], files: &BTreeMap<Names, String>) -> Option<Names> {
     match path.first().map(String::as_str)? {
         "crate" => Some(path[1..].to_vec()),
@@ -187,7 +187,7 @@ fn from_root(at: &Names, path: &[String], files: &BTreeMap<Names, String>) -> Op
     }
 }
 
-/// The text of every file below `folder` but those of tests, by module path.
+/// Collects the text of every file below `folder` by module path, except tests.
 fn modules(folder: &Path, at: &Names, found: &mut BTreeMap<Names, String>) {
     let mut entries: Vec<PathBuf> = fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()).collect();
     entries.sort();
@@ -209,13 +209,13 @@ fn modules(folder: &Path, at: &Names, found: &mut BTreeMap<Names, String>) {
 fn library() -> Library {
     let mut files = BTreeMap::new();
     modules(&Path::new(env!("CARGO_MANIFEST_DIR")).join("src"), &Names::new(), &mut files);
-    Library::of(&files)
+    Library::parse(&files)
 }
 
-/// A circle of modules, if there is one.
-fn circle(arrows: &BTreeMap<Names, BTreeSet<Names>>) -> Option<Vec<Names>> {
-    let mut left = arrows.clone();
-    // Whoever uses nobody that is left is in no circle.
+/// Returns a cycle of modules if there is one.
+fn cycle(dependencies: &BTreeMap<Names, BTreeSet<Names>>) -> Option<Vec<Names>> {
+    let mut left = dependencies.clone();
+    // A module that uses no remaining module is in no cycle.
     while let Some(free) = left.iter().find(|(_, used)| used.is_empty()).map(|(at, _)| at.clone()) {
         left.remove(&free);
         left.values_mut().for_each(|used| _ = used.remove(&free));
@@ -233,12 +233,12 @@ fn circle(arrows: &BTreeMap<Names, BTreeSet<Names>>) -> Option<Vec<Names>> {
 #[test]
 fn folders_use_only_those_before_them() {
     let mut seen = 0;
-    for (at, used) in library().arrows() {
+    for (at, used) in library().dependencies() {
         let Some(folder) = at.first() else { continue };
-        let own = place(folder).unwrap_or_else(|| panic!("{folder} is missing in FOLDERS"));
+        let own = folder_index(folder).unwrap_or_else(|| panic!("{folder} is missing in FOLDERS"));
         for home in used {
             let other = &home[0];
-            let is_before = FROM_CRATES.contains(&other.as_str()) || place(other).is_some_and(|place| place <= own);
+            let is_before = FROM_CRATES.contains(&other.as_str()) || folder_index(other).is_some_and(|index| index <= own);
             seen += 1;
             assert!(is_before, "{} uses {}, which comes after it", at.join("::"), home.join("::"));
         }
@@ -247,15 +247,15 @@ fn folders_use_only_those_before_them() {
 }
 
 #[test]
-fn files_form_no_circle() {
-    if let Some(circle) = circle(&library().arrows()) {
-        let names: Vec<String> = circle.iter().map(|at| at.join("::")).collect();
+fn files_form_no_cycle() {
+    if let Some(cycle) = cycle(&library().dependencies()) {
+        let names: Vec<String> = cycle.iter().map(|at| at.join("::")).collect();
         panic!("these files use one another: {}", names.join(" -> "));
     }
 }
 
 #[test]
-fn what_breaks_the_rules_would_be_seen() {
+fn violations_are_detected() {
     let files = |list: &[(&str, &str)]| -> BTreeMap<Names, String> {
         let names = |at: &str| at.split("::").filter(|name| !name.is_empty()).map(str::to_owned).collect();
         list.iter().map(|&(at, text)| (names(at), text.to_owned())).collect()
@@ -266,14 +266,14 @@ fn what_breaks_the_rules_would_be_seen() {
         ("a::b", "use super::c::C;\nfn f() {}"),
         ("a::c", "use crate::a::{B, d};\n"),
     ]);
-    assert_eq!(circle(&Library::of(&round).arrows()).map(|found| found.len()), Some(2));
+    assert_eq!(cycle(&Library::parse(&round).dependencies()).map(|found| found.len()), Some(2));
     let inline = files(&[("", ""), ("a", "fn f() { crate::b::g(); }"), ("b", "fn g() { super::a::f() }")]);
-    assert!(circle(&Library::of(&inline).arrows()).is_some());
+    assert!(cycle(&Library::parse(&inline).dependencies()).is_some());
     let straight = files(&[
         ("", ""),
         ("a", "pub use b::B;\nmod b;"),
         ("a::b", "// use crate::a::c::C;\nuse crate::c::D;"),
         ("c", ""),
     ]);
-    assert!(circle(&Library::of(&straight).arrows()).is_none());
+    assert!(cycle(&Library::parse(&straight).dependencies()).is_none());
 }

@@ -1,5 +1,4 @@
-//! What opening linked frames keeps in memory, counted in bytes allocated: what it says itself, which is what `--memory`
-//! goes by.
+//! Memory of opening linked frames, counted in allocated bytes, against the estimate that `--memory` uses.
 
 #[path = "corpus/memory.rs"]
 mod memory;
@@ -16,15 +15,15 @@ static ALLOCATOR: memory::Counting = memory::Counting;
 
 const LIVING: usize = 20_000;
 const FRAMES: usize = 40;
-/// Frames that each lives, before another begins elsewhere.
+/// Number of frames that each Gaussian is alive before another one begins elsewhere.
 const LIFE: usize = 5;
 
-/// Even numbers in [0, 1) that follow from what they are for.
-fn uniform(of: usize) -> f32 {
-    (hash_id(of as u64) >> 40) as f32 / (1u64 << 24) as f32
+/// Returns a number evenly distributed in [0, 1) that depends only on `seed`.
+fn uniform(seed: usize) -> f32 {
+    (hash_id(seed as u64) >> 40) as f32 / (1u64 << 24) as f32
 }
 
-/// Frames of as many Gaussians each, in an order of their own.
+/// Writes frames with equal numbers of Gaussians, each frame in its own order.
 fn write_frames(folder: &Path) {
     for frame in 0..FRAMES {
         let mut out = Gaussians::zeros(LIVING, 1);
@@ -43,7 +42,7 @@ fn write_frames(folder: &Path) {
 }
 
 #[test]
-fn memory_of_opening_is_what_is_stated() {
+fn memory_of_opening_matches_the_estimate() {
     let folder = tempfile::tempdir().unwrap();
     rayon::ThreadPoolBuilder::new().num_threads(2).build_global().unwrap();
     write_frames(folder.path());
@@ -52,9 +51,9 @@ fn memory_of_opening_is_what_is_stated() {
     let tracks = input.source().info().count;
     assert!((LIVING * FRAMES / LIFE..LIVING * FRAMES / LIFE * 6 / 5).contains(&tracks), "{tracks}");
     let residence = input.residence();
-    let stated = tracks as u64 * (residence.opening + residence.per_gaussian);
-    eprintln!("{tracks} tracks: at most {peak} bytes, {stated} stated");
-    // What is stated counts the pages of files too, and all that a picture may take.
-    assert!(peak as u64 <= stated, "{peak} bytes, {stated} stated");
-    assert!(3 * peak as u64 >= stated, "{stated} stated for {peak} bytes");
+    let estimated = tracks as u64 * (residence.opening + residence.per_gaussian);
+    eprintln!("{tracks} tracks: at most {peak} bytes, {estimated} stated");
+    // The estimate also counts pages of files and the memory of a render.
+    assert!(peak as u64 <= estimated, "{peak} bytes, {estimated} stated");
+    assert!(3 * peak as u64 >= estimated, "{estimated} stated for {peak} bytes");
 }

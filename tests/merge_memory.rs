@@ -1,5 +1,5 @@
-//! What measuring pairs of Gaussians keeps in memory, counted in bytes allocated: bounded by the pairs measured
-//! together, whatever the number of frames.
+//! Memory of measuring pairs of Gaussians, counted in allocated bytes: it is bounded by the number of pairs measured
+//! together, for any number of frames.
 
 #[path = "corpus/memory.rs"]
 mod memory;
@@ -26,8 +26,8 @@ static ALLOCATOR: memory::Counting = memory::Counting;
 const COUNT: usize = 20_000;
 const FRAMES_HELD: usize = 2;
 
-/// Most bytes allocated at once while the six nearest neighbors of every Gaussian are measured, beyond what was
-/// before; and the number of pairs.
+/// Measures the six nearest neighbors of every Gaussian. Returns the largest number of bytes allocated at once beyond
+/// those allocated before, and the number of pairs.
 fn peak(folder: &Path, frames: usize, partitions: usize) -> (usize, usize) {
     let path = folder.join(format!("{frames}.gseq"));
     if !path.exists() {
@@ -69,23 +69,24 @@ fn peak(folder: &Path, frames: usize, partitions: usize) -> (usize, usize) {
 }
 
 #[test]
-fn memory_of_measuring_is_what_is_stated_and_does_not_grow_with_frames() {
+fn memory_of_pairs_is_estimated_and_ignores_frame_count() {
     let folder = tempfile::tempdir().unwrap();
-    // A few threads, as their buffers count too.
+    // Only two threads, because the buffers of each thread count too.
     rayon::ThreadPoolBuilder::new().num_threads(2).build_global().unwrap();
     let (whole, pairs) = peak(folder.path(), 64, 1);
     let (short, _) = peak(folder.path(), 64, 64);
     let (long, _) = peak(folder.path(), 256, 64);
     eprintln!("{pairs} pairs: {whole} bytes at once; in 64 partitions {short}, with four times the frames {long}");
     let together = pairs / 64 + 1;
-    // What is found; order and place of everybody and what gathering holds; one partition; buffers of two threads.
+    // The results; order and place of every Gaussian and the gathered frames; one partition; the buffers of two
+    // threads.
     let stated = KNOWN_BYTES * pairs
         + (12 + 8 + 16 * FRAMES_HELD) * COUNT
         + (BYTES_PER_PAIR + 2 * bytes_per_gaussian(FRAMES_HELD)) * together;
     let buffers = 3 << 20;
     assert!(short <= stated + buffers, "{short} bytes, {stated} stated and {buffers} for buffers");
-    // More frames are more chances for both threads' buffers to be full at once; a single frame of all trajectories
-    // that stayed would be 320,000 bytes, and there are 192 more.
+    // With more frames it is more likely that the buffers of both threads are full at the same time. If a single frame
+    // of all trajectories stayed in memory, it would take 320,000 bytes, and there are 192 more frames.
     assert!(long <= short + (1 << 20), "{long} bytes for four times the frames, {short} before");
     assert!(2 * short < whole, "{short} bytes in partitions, {whole} at once");
 }

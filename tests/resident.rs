@@ -1,5 +1,5 @@
-//! Reading through the map leaves no more of a file resident than readers may hold. One test, as what is resident
-//! belongs to the whole process.
+//! Reading a memory-mapped container keeps no more of the file resident than readers may hold. This file has one test,
+//! because resident memory belongs to the whole process.
 #![cfg(target_os = "linux")]
 
 use std::collections::BTreeMap;
@@ -17,7 +17,7 @@ use splatsieve::source::{BlockReader, FrameSource, Ids, ReadPlan};
 const COUNT: usize = 20_000;
 const FRAMES: usize = 1200;
 
-/// A line of `/proc/self/status`, in bytes.
+/// Returns a line of `/proc/self/status` in bytes.
 fn status(line: &str) -> usize {
     let status = fs::read_to_string("/proc/self/status").unwrap();
     let line = status.lines().find_map(|found| found.strip_prefix(line)).unwrap();
@@ -25,7 +25,7 @@ fn status(line: &str) -> usize {
 }
 
 #[test]
-fn a_container_of_raw_tiles_is_read_without_its_pages_staying_resident() {
+fn reading_raw_tiles_keeps_no_pages_resident() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("raw.gseq");
     write_container(&Scene::new(COUNT, FRAMES), &path, Compression::Raw, BTreeMap::new(), |_| ()).unwrap();
@@ -35,7 +35,7 @@ fn a_container_of_raw_tiles_is_read_without_its_pages_staying_resident() {
     let before = status("RssFile:");
     let mut most = 0;
 
-    // Block by block, as a scan does.
+    // Block by block, as in a scan.
     let mut state = Gaussians::zeros(0, container.info().sh_degree);
     for start in (0..COUNT).step_by(1024) {
         let mut reader = container.open(Ids::Range(start..COUNT.min(start + 1024))).unwrap();
@@ -53,7 +53,7 @@ fn a_container_of_raw_tiles_is_read_without_its_pages_staying_resident() {
         most = most.max(status("RssFile:"));
     }
     drop(frames);
-    // Some of all tiles, some frames of each.
+    // Some Gaussians of all tiles, some frames of each.
     let scattered: Vec<u32> = (0..COUNT as u32).step_by(7).collect();
     let wanted = ReadPlan::new((0..FRAMES).step_by(5));
     let mut frames = FrameReaders::open(&container, Ids::List(&scattered), varying, &wanted).unwrap();
@@ -66,7 +66,7 @@ fn a_container_of_raw_tiles_is_read_without_its_pages_staying_resident() {
     let grown = most.saturating_sub(before);
     assert!(grown < 6 << 20, "{grown} bytes more of files resident while reading {file}");
 
-    // Frame by frame, where a frame block of all Gaussians may be held.
+    // Frame by frame, when a frame block of all Gaussians may be held.
     let mut frames = FrameReaders::open(&container, Ids::Range(0..COUNT), varying, &ReadPlan::every()).unwrap();
     let mut state = frames.state();
     for frame in 0..FRAMES {
@@ -80,7 +80,7 @@ fn a_container_of_raw_tiles_is_read_without_its_pages_staying_resident() {
     let left = status("RssFile:").saturating_sub(before);
     assert!(left < 4 << 20, "{left} bytes of the file are left resident by readers that are gone");
 
-    // The measure sees what stays mapped.
+    // Check of the measurement: it sees pages that stay mapped.
     let reader = container.reader();
     let mut touched = 0;
     for gaussian_block in 0..reader.layout().gaussian_blocks() {

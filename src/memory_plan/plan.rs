@@ -36,8 +36,8 @@ pub struct Plan {
 }
 
 impl Plan {
-    /// Finds the fastest limits with which all stages of `estimates` fit into `budget`. Sends the plan to `events` if the
-    /// budget asks for it, even if the stages do not fit.
+    /// Finds the fastest limits with which all stages of `estimates` fit into `budget`. Sends the plan to `events` if
+    /// the budget asks for it, even if the stages do not fit.
     ///
     /// # Errors
     /// A budget that no limits fit; the error states the smallest budget that works.

@@ -259,7 +259,7 @@ impl Workload {
 pub struct Throughput {
     /// Time of reading states and processing each of them.
     pub states: f64,
-    /// Time of rendering a view, see [`LOOK`].
+    /// Time of finding the contributions in a view, see [`LOOK`].
     pub look: f64,
     /// Time of finding removal errors in a view, see [`REMOVE`].
     pub remove: f64,
@@ -284,8 +284,8 @@ pub struct RenderCost {
     pace: fn(&Throughput) -> f64,
 }
 
-/// Cost of rendering a view, fitted to runs on three trained models. `scripts/estimate.py` compares such estimates with
-/// the time of a run.
+/// Cost of finding the contribution of every Gaussian in a view, fitted to runs on three trained models.
+/// `scripts/estimate.py` compares such estimates with the time of a run.
 pub const LOOK: RenderCost = RenderCost { gaussian: 1.6e-7, pixel: 5e-9, pace: |pace| pace.look };
 /// Cost of finding the removal error of every Gaussian in a view.
 pub const REMOVE: RenderCost = RenderCost { gaussian: 3.5e-7, pixel: 1.6e-8, pace: |pace| pace.remove };

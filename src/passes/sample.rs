@@ -3,8 +3,8 @@
 use crate::model::{Picture, Schedule};
 use crate::recipe;
 
-/// Maximum number of views of one frame in a selection: the cost of reading the frame is shared by them, but more views
-/// of one frame add less than views of other frames.
+/// Number of views per frame for which a frame is worth reading. A selection of few views takes this many of each
+/// frame.
 pub const VIEWS_AT_ONCE: usize = 3;
 
 /// Selection of views frame by frame.

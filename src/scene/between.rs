@@ -11,11 +11,11 @@ const MIN_FRACTION: f64 = 0.15;
 /// camera is placed: about 127°. Halfway between opposite cameras, the viewing direction would be undefined.
 const MIN_COSINE: f64 = -0.6;
 
-/// Returns `count` cameras, each on the path between two of `cameras`; see [`interpolated_camera`] for its pose. The
-/// first is chosen at random, the second at random among those less than about 127° away as seen from the point where
-/// the optical axes meet, or else the nearest one at another position. (Paths between neighbors only would leave the
-/// middle of a rig empty.) Returns no camera if all cameras are at one position. The result depends on the arguments
-/// only.
+/// Returns `count` cameras, each on the path between two of `cameras`, with evenly interpolated rotation and distance.
+/// The first is chosen at random, the second at random among those less than about 127° away as seen from the point
+/// where the optical axes meet, or else the nearest one at another position. (Paths between neighbors only would leave
+/// the middle of a rig empty.) Returns no camera if all cameras are at one position. The result depends on the
+/// arguments only.
 pub fn between(cameras: &[Camera], count: usize) -> Vec<Camera> {
     let focus = meeting_point(cameras);
     let mut random = SplitMix64(0);
@@ -131,7 +131,7 @@ mod tests {
             let distance = camera.center().distance(focus);
             assert!((least - 1e-9..=most + 1e-9).contains(&distance), "{distance} of {least} to {most}");
             let ahead = (camera.rotation * focus + camera.translation).normalize();
-            assert!(ahead.z > 0.9, "the scene is off the picture: {ahead}");
+            assert!(ahead.z > 0.9, "the scene is outside the image: {ahead}");
             assert!(cameras.iter().all(|other| other.center().distance(camera.center()) > 1e-3));
         }
     }

@@ -121,8 +121,8 @@ pub fn open_scene(options: &InputOptions) -> Result<Scene> {
     scene_of(open_input(options)?, options)
 }
 
-/// Creates the scene of an opened input, seen by the cameras of the split in `options`. Without cameras, a rig is placed
-/// around the Gaussians of the first frame.
+/// Creates the scene of an opened input, seen by the cameras of the split in `options`. Without cameras, a rig is
+/// placed around the Gaussians of the first frame.
 ///
 /// # Errors
 /// Cameras of another scene; a split without views.

@@ -78,7 +78,10 @@ mod tests {
             assert!(angle > before, "{angle} after {before}");
             before = angle;
             let ahead = camera.rotation * DVec3::ZERO + camera.translation;
-            assert!(ahead.x.abs() < 1e-9 && ahead.y.abs() < 1e-9, "the middle is off the picture's: {ahead}");
+            assert!(
+                ahead.x.abs() < 1e-9 && ahead.y.abs() < 1e-9,
+                "the circle's center is not at the image center: {ahead}"
+            );
         }
         assert!((path[5].fx - 0.5 * (stops[0].fx + stops[1].fx)).abs() < 1e-9);
     }

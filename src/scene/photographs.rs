@@ -115,7 +115,7 @@ fn view_name(picture: Picture) -> String {
 /// Checks that `folder` is a folder.
 fn check_folder(folder: &Path) -> Result<()> {
     if !fs::metadata(folder).map_err(Error::io("open", folder))?.is_dir() {
-        return Err(Error::usage(format!("{}: --ground-truth expects a folder of pictures", folder.shown())));
+        return Err(Error::usage(format!("{}: --ground-truth expects a folder of photographs", folder.shown())));
     }
     Ok(())
 }

@@ -15,7 +15,7 @@ pub enum PictureSet {
     HeldOut,
     /// One split, which must not be empty.
     Split(Split),
-    /// All views.
+    /// Every view of the rig.
     All,
 }
 

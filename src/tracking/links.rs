@@ -11,7 +11,8 @@ const MAX_EXCHANGES: usize = 4;
 
 /// Links between open tracks and the Gaussians of a frame.
 pub(super) struct Links {
-    /// Gaussian of every track; `NONE` if the track is not linked. `track_of_gaussian` holds the track of every Gaussian.
+    /// Gaussian of every track; `NONE` if the track is not linked. `track_of_gaussian` holds the track of every
+    /// Gaussian.
     pub(super) gaussian_of_track: Vec<u32>,
     pub(super) track_of_gaussian: Vec<u32>,
 }

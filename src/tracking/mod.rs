@@ -16,9 +16,9 @@
 //!    |x_b − p_a|² / (r·u)² + q·A, with u = s_a + min(½·n·|v_a|, 3·s_a) and
 //!    A = (ln s_b/s_a / ln √2)² + ‖Ŝ_b − Ŝ_a‖² / ¼² + (α_b − α_a)² / ½² + |c_b − c_a|² / 0.1².
 //!    A link is possible only if its cost is at most 1. The candidates of a track are the four Gaussians of least cost;
-//!    ties are broken by their number. Candidates are linked in the order of cost, then track, then Gaussian, each track
-//!    and each Gaussian once. (Linking those that are mutually best until none are left gives the same result.) Then two
-//!    tracks exchange their Gaussians if that lowers their total cost, in the order of the tracks and of their
+//!    ties are broken by their number. Candidates are linked in the order of cost, then track, then Gaussian, each
+//!    track and each Gaussian once. (Linking those that are mutually best until none are left gives the same result.)
+//!    Then two tracks exchange their Gaussians if that lowers their total cost, in the order of the tracks and of their
 //!    candidates, in up to four rounds.
 //! 3. *Rounds.* The first round has r = ¼ and q = 4 and includes only tracks seen in the previous frame. The second has
 //!    r = 1 and q = 1, the third r = 4 and q = 4; both include all open tracks that are not linked yet. A track of the
@@ -39,14 +39,14 @@
 //!    is a cut, at which all tracks end.
 //! 6. *Joined tracks* ([`Joiner`]). Two tracks may be parts of one Gaussian that fades out as one and fades in as the
 //!    other. A track that begins is paired with the four earlier tracks of least cost
-//!    |x_b − x_a|² / (r·min(s_a, s_b))² + q·A, where A excludes opacity. The cost must be at most 1, the sizes must agree
-//!    within a factor of √2, and the earlier track must not be succeeded. There are two rules: r = 4 and q = 1/16
+//!    |x_b − x_a|² / (r·min(s_a, s_b))² + q·A, where A excludes opacity. The cost must be at most 1, the sizes must
+//!    agree within a factor of √2, and the earlier track must not be succeeded. There are two rules: r = 4 and q = 1/16
 //!    (*alike*), and r = q = 1 (*close*). A track that began because its link was doubtful (rule 4) is only paired with
 //!    close tracks. Both tracks of a pair may be present together in four frames, in each of which the rule must hold,
-//!    plus one more for each earlier frame in which one of them was missing. When the earlier track of the cheapest pair
-//!    has ended, the later track is joined to it. Joins are made in the order of cost, each end and each beginning once.
-//!    A later track that ends while the earlier one continues was a part of it if they were close. Tracks of one joined
-//!    track that are present together are [blended](blend).
+//!    plus one more for each earlier frame in which one of them was missing. When the earlier track of the cheapest
+//!    pair has ended, the later track is joined to it. Joins are made in the order of cost, each end and each beginning
+//!    once. A later track that ends while the earlier one continues was a part of it if they were close. Tracks of one
+//!    joined track that are present together are [blended](blend).
 //!
 //! Tracks are numbered in the order of their births, and within a frame in its order. A Gaussian with a NaN is never
 //! compared: it continues a track only as an exact repeat. Colors are compared without the higher SH degrees, which

@@ -262,9 +262,9 @@ fn position_at(track: &BTreeMap<usize, SeenGaussian>, frame: usize) -> ([f64; 3]
 /// were present, whether they are close, and whether the earlier track has ended.
 type TrackPairs = BTreeMap<(usize, u64), (usize, usize, bool, bool)>;
 
-/// Joins tracks by rule 6 of the [module](super) with the parameters (r, q), and returns the joined track of every track.
-/// `in_doubt` are tracks that began because a link was doubtful; `succeeded` are pairs of a frame and a track that is
-/// succeeded in it.
+/// Joins tracks by rule 6 of the [module](super) with the parameters (r, q), and returns the joined track of every
+/// track. `in_doubt` are tracks that began because a link was doubtful; `succeeded` are pairs of a frame and a track
+/// that is succeeded in it.
 pub(super) fn slow_joined_tracks(
     tracks: &History,
     in_doubt: &BTreeSet<u32>,

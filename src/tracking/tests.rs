@@ -6,9 +6,9 @@ use crate::model::hash_id;
 use crate::model::{Gaussians, opacity};
 
 /// Source of uniform pseudo-random numbers in [0, 1) that follow from a seed.
-struct Random(u64);
+struct UniformNumbers(u64);
 
-impl Random {
+impl UniformNumbers {
     fn unit(&mut self) -> f32 {
         self.0 += 1;
         (hash_id(self.0) >> 40) as f32 / (1u64 << 24) as f32
@@ -26,7 +26,7 @@ impl Random {
 }
 
 /// Returns Gaussians in a cube of side 1. About `crowd` of them lie within the largest scale of each.
-fn cloud(count: usize, crowd: f32, random: &mut Random) -> Gaussians {
+fn cloud(count: usize, crowd: f32, random: &mut UniformNumbers) -> Gaussians {
     let mut state = Gaussians::zeros(count, 1);
     let size = (crowd / count as f32).cbrt() * 0.5;
     for i in 0..count {
@@ -41,7 +41,7 @@ fn cloud(count: usize, crowd: f32, random: &mut Random) -> Gaussians {
 
 /// Returns the cloud `t` frames later. Each half of it moves on a circle, and all Gaussians jitter by `noise` of their
 /// size.
-fn later(cloud: &Gaussians, t: usize, noise: f32, random: &mut Random) -> Gaussians {
+fn later(cloud: &Gaussians, t: usize, noise: f32, random: &mut UniformNumbers) -> Gaussians {
     let mut state = cloud.clone();
     for i in 0..cloud.len() {
         let angle = 0.2 * t as f32 * if i % 2 == 0 { 1.0 } else { -1.0 };
@@ -54,7 +54,11 @@ fn later(cloud: &Gaussians, t: usize, noise: f32, random: &mut Random) -> Gaussi
 }
 
 /// Returns the Gaussians of `cloud` that `is_present` selects, in random order, and that order.
-fn shuffled_part(cloud: &Gaussians, random: &mut Random, is_present: impl Fn(u32) -> bool) -> (Gaussians, Vec<u32>) {
+fn shuffled_part(
+    cloud: &Gaussians,
+    random: &mut UniformNumbers,
+    is_present: impl Fn(u32) -> bool,
+) -> (Gaussians, Vec<u32>) {
     let order: Vec<u32> = random.order(cloud.len()).into_iter().filter(|&i| is_present(i)).collect();
     (cloud.pick(&order), order)
 }
@@ -62,7 +66,7 @@ fn shuffled_part(cloud: &Gaussians, random: &mut Random, is_present: impl Fn(u32
 #[test]
 fn tracks_equal_those_of_the_slow_linker() {
     for (seed, crowd, alike) in [(1, 0.5, false), (2, 4.0, false), (3, 30.0, false), (4, 4.0, true)] {
-        let mut random = Random(seed * 1_000_000);
+        let mut random = UniformNumbers(seed * 1_000_000);
         let mut cloud = cloud(250, crowd, &mut random);
         // Some of these nearly identical Gaussians could be linked to several tracks.
         if alike {
@@ -95,7 +99,7 @@ fn tracks_equal_those_of_the_slow_linker() {
 
 #[test]
 fn shuffled_frames_with_noise_keep_their_tracks() {
-    let mut random = Random(77);
+    let mut random = UniformNumbers(77);
     let cloud = cloud(3000, 4.0, &mut random);
     let mut linker = Linker::default();
     let mut last: Option<Vec<u32>> = None;
@@ -122,7 +126,7 @@ fn thread_count_does_not_change_links() {
     let run = |threads: usize| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         pool.install(|| {
-            let mut random = Random(5);
+            let mut random = UniformNumbers(5);
             let cloud = cloud(9000, 10.0, &mut random);
             let mut linker = Linker::default();
             let frames = (0..4)
@@ -138,7 +142,7 @@ fn thread_count_does_not_change_links() {
 
 #[test]
 fn tracks_survive_a_gap_of_three_frames_but_not_four() {
-    let mut random = Random(9);
+    let mut random = UniformNumbers(9);
     let cloud = cloud(40, 0.1, &mut random);
     for (away, continues) in [(3, true), (4, false)] {
         let mut linker = Linker::default();
@@ -161,7 +165,7 @@ fn tracks_survive_a_gap_of_three_frames_but_not_four() {
 
 #[test]
 fn moving_everything_at_once_is_a_cut() {
-    let mut random = Random(11);
+    let mut random = UniformNumbers(11);
     let cloud = cloud(2000, 4.0, &mut random);
     let mut elsewhere = cloud.clone();
     elsewhere.position.planes_mut().iter_mut().for_each(|x| *x += 100.0);
@@ -180,7 +184,7 @@ fn moving_everything_at_once_is_a_cut() {
 
 #[test]
 fn empty_and_single_frames_are_linked() {
-    let mut random = Random(13);
+    let mut random = UniformNumbers(13);
     let cloud = cloud(30, 1.0, &mut random);
     let mut linker = Linker::default();
     assert!(linker.link(&Gaussians::zeros(0, 1)).tracks.is_empty());
@@ -193,7 +197,7 @@ fn empty_and_single_frames_are_linked() {
 #[test]
 fn crowds_at_one_place_are_linked_in_linear_time() {
     let count = 100_000;
-    let mut random = Random(17);
+    let mut random = UniformNumbers(17);
     let mut cloud = Gaussians::zeros(count, 0);
     (0..count).for_each(|i| cloud.sh.set_row(i, [0; 3].map(|_| random.around(0.0, 1.7))));
     let mut linker = Linker::default();
@@ -215,7 +219,7 @@ fn crowds_at_one_place_are_linked_in_linear_time() {
 
 #[test]
 fn gaussians_with_nan_continue_only_as_exact_repeats() {
-    let mut random = Random(19);
+    let mut random = UniformNumbers(19);
     let mut cloud = cloud(40, 1.0, &mut random);
     cloud.position.set_row(3, [f32::NAN, 0.0, f32::INFINITY]);
     cloud.log_scale.set_row(4, [f32::NAN; 3]);
@@ -234,7 +238,7 @@ fn gaussians_with_nan_continue_only_as_exact_repeats() {
 
 #[test]
 fn kept_order_is_told_from_shuffled_order() {
-    let mut random = Random(23);
+    let mut random = UniformNumbers(23);
     let cloud = cloud(5000, 4.0, &mut random);
     let next = later(&cloud, 1, 0.02, &mut random);
     let kept = identity(&cloud, &next);
@@ -267,7 +271,7 @@ fn fading_frames(
     shortest: usize,
     overlap: usize,
     tint: f32,
-    random: &mut Random,
+    random: &mut UniformNumbers,
 ) -> Vec<(Gaussians, Vec<u32>)> {
     let mut rows: Vec<Vec<(u32, f32, [f32; 3])>> = vec![Vec::new(); frames];
     for i in 0..cloud.len() as u32 {
@@ -305,7 +309,7 @@ fn joined_tracks_equal_those_of_the_slow_joiner() {
     for (seed, shortest, overlap, tint) in
         [(21, 6, 2, 0.05), (22, 6, 0, 0.8), (23, 6, 3, 0.5), (24, 6, 5, 0.05), (25, 4, 2, 0.05)]
     {
-        let mut random = Random(seed * 1_000_000);
+        let mut random = UniformNumbers(seed * 1_000_000);
         // Sparse, because the grid does not visit all Gaussians of a crowded cell.
         let cloud = cloud(120, 0.03, &mut random);
         let frames = fading_frames(&cloud, 24, shortest, overlap, tint, &mut random);
@@ -341,7 +345,7 @@ fn fading_tracks_are_joined_and_others_are_not() {
     // In the second case, periods are so short that a Gaussian that fades out is linked to the one that fades in two
     // periods later.
     for (shortest, most) in [(6, 300), (4, 395)] {
-        let mut random = Random(31);
+        let mut random = UniformNumbers(31);
         let cloud = cloud(200, 1.0, &mut random);
         let frames = fading_frames(&cloud, 30, shortest, 2, 0.05, &mut random);
         let (mut linker, mut joiner) = (Linker::default(), Joiner::default());
@@ -366,7 +370,7 @@ fn fading_tracks_are_joined_and_others_are_not() {
 
 #[test]
 fn blend_follows_its_formula() {
-    let mut random = Random(41);
+    let mut random = UniformNumbers(41);
     let state = cloud(6, 1.0, &mut random);
     let rows = [4, 1, 3];
     let mut blended = state.clone();
@@ -402,5 +406,5 @@ fn blend_follows_its_formula() {
     (0..2).for_each(|i| gone.opacity_logit.set_row(i, [f32::NEG_INFINITY]));
     let before = gone.clone();
     blend(&mut gone, &[0, 1]);
-    assert!(gone == before, "what nobody sees stays as it is");
+    assert!(gone == before, "invisible Gaussians must not change");
 }

@@ -17,8 +17,8 @@ pub(super) const ROUNDS: [Round; 3] = [
     Round { reach: 4.0, strictness: 4.0, includes_missing: true },
 ];
 
-/// Parameters of a round: `reach` is r and `strictness` is q of the [module](super). `includes_missing` states whether tracks
-/// that were missing in the previous frame take part.
+/// Parameters of a round: `reach` is r and `strictness` is q of the [module](super). `includes_missing` states whether
+/// tracks that were missing in the previous frame take part.
 pub(super) struct Round {
     pub(super) reach: f32,
     pub(super) strictness: f32,

@@ -1,5 +1,5 @@
-//! Runs beside other runs, other programs and other people's files: what is not a run's own it leaves alone, and what
-//! is its own it takes away, however it ends.
+//! Tests of runs beside other runs, other programs and files of other people. A run leaves foreign files alone and
+//! removes its own temporary files, however it ends.
 
 #![cfg(unix)]
 
@@ -12,22 +12,22 @@ use std::time::{Duration, Instant};
 
 use crate::scene::{Workplace, files, lasting_files, program, tiny};
 
-/// The tiny model as a frame stream.
-fn stream(workplace: &Workplace) -> Vec<u8> {
+/// Returns the tiny model as a frame stream.
+fn tiny_stream(workplace: &Workplace) -> Vec<u8> {
     let output = Command::new(program()).arg("convert").arg(tiny()).arg("-").output().unwrap();
     assert!(output.status.success(), "{}", workplace.path("").display());
     output.stdout
 }
 
-/// Starts a command in the workplace, all of whose streams are pipes.
-fn started(workplace: &Workplace, mut command: Command) -> Child {
+/// Starts a command in the workplace with pipes for standard input, output and error.
+fn start_piped(workplace: &Workplace, mut command: Command) -> Child {
     let piped = command.current_dir(workplace.path("")).stdin(Stdio::piped());
     piped.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap()
 }
 
-/// Starts the program; it waits for what comes on standard input. Signals end it even where they are ignored in this
-/// process, as in one that a shell started in the background.
-fn waiting(workplace: &Workplace, arguments: &str) -> Child {
+/// Starts the program, which waits for its standard input. Resets the signal handlers to their defaults first, because
+/// this process may ignore signals (a shell that starts a job in the background makes it do so).
+fn start_program(workplace: &Workplace, arguments: &str) -> Child {
     let mut command = Command::new(program());
     command.args(arguments.split_whitespace());
     let reset = || {
@@ -37,16 +37,16 @@ fn waiting(workplace: &Workplace, arguments: &str) -> Child {
         }
         Ok(())
     };
-    // SAFETY: `signal` may be called between fork and exec, and nothing else is.
+    // SAFETY: `signal` is async-signal-safe, so it may be called between fork and exec; the closure calls nothing else.
     unsafe { command.pre_exec(reset) };
-    started(workplace, command)
+    start_piped(workplace, command)
 }
 
-fn told(output: &Output) -> String {
+fn stderr_text(output: &Output) -> String {
     String::from_utf8_lossy(&output.stderr).into_owned()
 }
 
-/// Waits until `folder` holds anything, for a run that goes on.
+/// Waits until `folder` holds a file. Panics if the run ends before that or after 60 s.
 fn wait_for_temporaries(folder: &Path, child: &mut Child) {
     let start = Instant::now();
     while files(folder).is_empty() {
@@ -60,10 +60,11 @@ fn send(signal: &str, child: &Child) {
     assert!(Command::new("kill").args([signal, &child.id().to_string()]).status().unwrap().success());
 }
 
-/// The program in a namespace of process ids of its own, as in a container, with a number above `before`.
-fn contained(workplace: &Workplace, before: usize, arguments: &str) -> Command {
+/// Returns a command that runs the program in its own process id namespace, as in a container, with a process id above
+/// `before`.
+fn in_container(workplace: &Workplace, before: usize, arguments: &str) -> Command {
     let mut command = crate::unshare(&["-p", "--fork", "--mount-proc"]);
-    // Every number up to `before` is taken by a process that has ended.
+    // Processes that have ended take every process id up to `before`.
     let script = format!("for i in $(seq {before}); do /bin/true; done; {} {arguments}; exit $?", program().display());
     command.args(["sh", "-c", &script]).current_dir(workplace.path(""));
     command
@@ -71,39 +72,39 @@ fn contained(workplace: &Workplace, before: usize, arguments: &str) -> Command {
 
 #[test]
 #[ignore = "needs namespaces of process ids"]
-fn runs_in_different_containers_share_their_folders_and_both_succeed() {
+fn runs_in_different_containers_can_share_folders() {
     let workplace = Workplace::new();
-    let stream = stream(&workplace);
+    let tiny_stream = tiny_stream(&workplace);
     fs::create_dir(workplace.path("scratch")).unwrap();
     for (first, second) in [
         ("compress - -o a.gseq --scratch-dir scratch", "compress - -o b.gseq --scratch-dir scratch"),
-        // The same name: whoever is last is refused, and takes nothing from the other meanwhile.
+        // Two runs with the same output: the one that finishes last is refused, and removes no file of the other.
         ("convert - c.gseq", "convert - c.gseq"),
     ] {
-        let command = contained(&workplace, 12, first);
+        let command = in_container(&workplace, 12, first);
         let before = files(&workplace.path("")).len();
-        let mut victim = started(&workplace, command);
+        let mut victim = start_piped(&workplace, command);
         let mut pipe = victim.stdin.take().unwrap();
-        pipe.write_all(&stream[..stream.len() / 2]).unwrap();
+        pipe.write_all(&tiny_stream[..tiny_stream.len() / 2]).unwrap();
         let start = Instant::now();
-        // The scratch file, or what the output is called meanwhile.
+        // Waits for the scratch file, or for the temporary file of the output.
         while files(&workplace.path("")).len() == before {
             assert!(start.elapsed() < Duration::from_secs(60) && victim.try_wait().unwrap().is_none());
             std::thread::sleep(Duration::from_millis(5));
         }
         std::thread::sleep(Duration::from_millis(100));
-        let mut other = started(&workplace, contained(&workplace, 2, second));
-        other.stdin.take().unwrap().write_all(&stream).unwrap();
+        let mut other = start_piped(&workplace, in_container(&workplace, 2, second));
+        other.stdin.take().unwrap().write_all(&tiny_stream).unwrap();
         let other = other.wait_with_output().unwrap();
-        assert!(other.status.success(), "{second}: {}", told(&other));
-        let finished = pipe.write_all(&stream[stream.len() / 2..]);
+        assert!(other.status.success(), "{second}: {}", stderr_text(&other));
+        let finished = pipe.write_all(&tiny_stream[tiny_stream.len() / 2..]);
         drop(pipe);
         let victim = victim.wait_with_output().unwrap();
         if first == second {
-            assert!(told(&victim).contains("exists already"), "{first}: {}", told(&victim));
+            assert!(stderr_text(&victim).contains("exists already"), "{first}: {}", stderr_text(&victim));
             assert_eq!(victim.status.code(), Some(2));
         } else {
-            assert!(victim.status.success() && finished.is_ok(), "{first}: {}", told(&victim));
+            assert!(victim.status.success() && finished.is_ok(), "{first}: {}", stderr_text(&victim));
         }
     }
     let left = lasting_files(&workplace.path(""));
@@ -112,9 +113,9 @@ fn runs_in_different_containers_share_their_folders_and_both_succeed() {
 }
 
 #[test]
-fn a_signal_takes_away_what_the_run_has_begun_and_ends_it_with_its_own_status() {
+fn signal_removes_partial_files_and_sets_exit_code() {
     let workplace = Workplace::new();
-    let half = stream(&workplace);
+    let half = tiny_stream(&workplace);
     let half = &half[..half.len() / 2];
     for (signal, code) in [("-INT", 130), ("-TERM", 143), ("-HUP", 129)] {
         for (arguments, input) in [
@@ -123,7 +124,7 @@ fn a_signal_takes_away_what_the_run_has_begun_and_ends_it_with_its_own_status() 
             ("demo --gaussians 100000 --frames 400 -o demo", &[]),
         ] {
             fs::create_dir(workplace.path("scratch")).unwrap();
-            let mut child = waiting(&workplace, arguments);
+            let mut child = start_program(&workplace, arguments);
             let mut pipe = child.stdin.take().unwrap();
             pipe.write_all(input).unwrap();
             let place = if arguments.contains("scratch") { "scratch" } else { "" };
@@ -134,7 +135,7 @@ fn a_signal_takes_away_what_the_run_has_begun_and_ends_it_with_its_own_status() 
             std::thread::sleep(Duration::from_millis(100));
             send(signal, &child);
             let output = child.wait_with_output().unwrap();
-            assert_eq!(output.status.code(), Some(code), "{signal} {arguments}: {}", told(&output));
+            assert_eq!(output.status.code(), Some(code), "{signal} {arguments}: {}", stderr_text(&output));
             _ = fs::remove_dir(workplace.path("scratch"));
             let left = files(&workplace.path(""));
             assert!(left.is_empty(), "{signal} {arguments}: left {:?}", left.keys());
@@ -143,31 +144,31 @@ fn a_signal_takes_away_what_the_run_has_begun_and_ends_it_with_its_own_status() 
 }
 
 #[test]
-fn a_signal_that_was_ignored_at_the_start_stays_ignored() {
+fn signal_ignored_at_start_stays_ignored() {
     let workplace = Workplace::new();
-    let stream = stream(&workplace);
+    let tiny_stream = tiny_stream(&workplace);
     let mut command = Command::new("sh");
     command.args(["-c", &format!("trap '' HUP INT; exec {} convert - out.gseq", program().display())]);
-    let mut child = started(&workplace, command);
+    let mut child = start_piped(&workplace, command);
     let mut pipe = child.stdin.take().unwrap();
-    pipe.write_all(&stream[..stream.len() / 2]).unwrap();
+    pipe.write_all(&tiny_stream[..tiny_stream.len() / 2]).unwrap();
     wait_for_temporaries(&workplace.path(""), &mut child);
     send("-HUP", &child);
     send("-INT", &child);
     std::thread::sleep(Duration::from_millis(200));
-    pipe.write_all(&stream[stream.len() / 2..]).unwrap();
+    pipe.write_all(&tiny_stream[tiny_stream.len() / 2..]).unwrap();
     drop(pipe);
     let output = child.wait_with_output().unwrap();
-    assert!(output.status.success(), "{}", told(&output));
+    assert!(output.status.success(), "{}", stderr_text(&output));
     assert_eq!(files(&workplace.path("")).len(), 1);
 }
 
 #[test]
 #[ignore = "needs time"]
-fn overwriting_leaves_every_file_that_the_earlier_result_does_not_name() {
+fn overwrite_keeps_files_of_other_programs() {
     let workplace = Workplace::new();
     workplace.done("compress {tiny} -o out");
-    // What evaluation code of other people writes into a model folder.
+    // Files that the evaluation code of the trainers writes into a model folder.
     let foreign = ["results.json", "test/ours_7/renders/00000.png", "point_cloud/iteration_7/notes.txt"];
     for name in foreign {
         fs::create_dir_all(workplace.path("out").join(name).parent().unwrap()).unwrap();
@@ -182,7 +183,7 @@ fn overwriting_leaves_every_file_that_the_earlier_result_does_not_name() {
     left.retain(|name, bytes| !bytes.is_empty() && !foreign.contains(&name.to_str().unwrap()));
     expected.retain(|_, bytes| !bytes.is_empty());
     assert!(left == expected, "{:?}, not {:?}", left.keys(), expected.keys());
-    // Of frames that the new result does not have nothing stays.
+    // Frames of the earlier result that the new result does not have are removed.
     workplace.done("convert {tiny} frames --as ply-sequence");
     fs::write(workplace.path("frames/notes.txt"), "precious").unwrap();
     workplace.done("demo --gaussians 400 --frames 3 -o shorter");
@@ -198,7 +199,7 @@ fn overwriting_leaves_every_file_that_the_earlier_result_does_not_name() {
 
 #[test]
 #[ignore = "needs time"]
-fn whenever_a_run_is_ended_its_output_is_the_old_or_the_new_one_whole_and_no_foreign_file_is_lost() {
+fn killed_run_leaves_old_or_new_output_and_foreign_files() {
     let workplace = Workplace::new();
     workplace.done("demo --gaussians 400 --frames 3 -o shorter");
     workplace.done("convert shorter/scene.gseq old --as ply-sequence");
@@ -211,12 +212,11 @@ fn whenever_a_run_is_ended_its_output_is_the_old_or_the_new_one_whole_and_no_for
     fs::write(workplace.path("frames/notes.txt"), "precious").unwrap();
     const ENDS: u32 = 24;
     for end in 0..ENDS {
-        let mut child =
-            waiting(&workplace, &format!("convert {} frames --as ply-sequence --overwrite", tiny().display()));
+        let mut child = start_program(&workplace, &format!("convert {} frames --as ply-sequence --overwrite", tiny().display()));
         std::thread::sleep(whole * end / ENDS);
-        let is_told = end % 2 == 0;
-        if is_told {
-            // It may have ended already.
+        let is_terminated = end % 2 == 0;
+        if is_terminated {
+            // The run may have ended already.
             _ = Command::new("kill").arg(child.id().to_string()).stderr(Stdio::null()).status();
         } else {
             child.kill().unwrap();
@@ -225,8 +225,8 @@ fn whenever_a_run_is_ended_its_output_is_the_old_or_the_new_one_whole_and_no_for
         let output = workplace.path("frames");
         let mut found = if output.exists() { lasting_files(&output) } else { Default::default() };
         let notes = found.remove(Path::new("notes.txt"));
-        assert!(found == old || found == new || (found.is_empty() && !is_told), "{end}: {:?}", found.keys());
-        if is_told {
+        assert!(found == old || found == new || (found.is_empty() && !is_terminated), "{end}: {:?}", found.keys());
+        if is_terminated {
             assert_eq!(notes.as_deref(), Some(&b"precious"[..]), "{end}");
             let mut left = files(&workplace.path(""));
             left.retain(|name, _| name.to_str().unwrap().starts_with('.'));
@@ -238,7 +238,7 @@ fn whenever_a_run_is_ended_its_output_is_the_old_or_the_new_one_whole_and_no_for
 }
 
 #[test]
-fn files_that_nothing_knows_as_results_are_replaced_by_force_alone() {
+fn unknown_files_are_replaced_only_with_force() {
     let workplace = Workplace::new();
     workplace.done("convert {tiny} scene.gseq");
     for (verb, name) in [
@@ -256,7 +256,7 @@ fn files_that_nothing_knows_as_results_are_replaced_by_force_alone() {
         workplace.done(&format!("{verb} {name} --overwrite"));
         assert_ne!(fs::read(workplace.path(name)).unwrap(), b"precious");
     }
-    // What says itself that it is ours, or lies beside a summary that names it.
+    // Files that identify themselves as results of the program, or that a summary beside them names.
     workplace.done("convert {tiny} a.gseq --overwrite");
     workplace.done("compress {tiny} --as ply -o a.ply --overwrite --count 100");
     fs::write(workplace.path("a.ply.mine"), "precious").unwrap();
@@ -265,7 +265,7 @@ fn files_that_nothing_knows_as_results_are_replaced_by_force_alone() {
 }
 
 #[test]
-fn a_log_gets_a_line_per_stage_and_a_quiet_run_none() {
+fn log_has_one_line_per_stage_and_quiet_none() {
     let workplace = Workplace::new();
     let run = workplace.run("compress {tiny} --cameras {tiny} -o out.gseq");
     assert_eq!(run.code, 0, "{}", run.stderr);
@@ -280,7 +280,7 @@ fn a_log_gets_a_line_per_stage_and_a_quiet_run_none() {
 }
 
 #[test]
-fn a_run_says_what_it_will_take_before_anything_else_is_done() {
+fn run_prints_its_estimate_before_any_work() {
     let workplace = Workplace::new();
     let real = workplace.run("compress {tiny} --cameras {tiny} -o real.gseq --no-refine");
     let first: Vec<&str> = real.stderr.lines().take(2).collect();

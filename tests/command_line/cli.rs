@@ -1,4 +1,4 @@
-//! The command line as scripts meet it: exit codes, streams, and failures that leave nothing behind.
+//! Tests of the command line as scripts use it: exit codes, standard streams, and failures that leave no files behind.
 
 use std::fs;
 use std::io::Read;
@@ -11,7 +11,7 @@ use splatsieve::files::container::Container;
 const CLOUD: &str = "model/point_cloud/iteration_7/point_cloud.ply";
 const FIELD: &str = "model/point_cloud/iteration_7/deformation.pth";
 
-/// A folder that holds a copy of the tiny model, to be damaged.
+/// Returns a folder with a copy of the tiny model in `model`, for tests to damage.
 fn with_model() -> Workplace {
     let workplace = Workplace::new();
     for (name, bytes) in files(&tiny()) {
@@ -26,7 +26,7 @@ fn with_model() -> Workplace {
     workplace
 }
 
-/// Every way to read the model refuses it with the same words.
+/// Checks that every command that reads the model refuses it with a message that contains all `parts`.
 fn model_refused(workplace: &Workplace, parts: &[&str]) {
     for verb in
         ["compress model -o out", "compress model -o out.gseq", "score model -o rows.npz", "convert model a.gseq"]
@@ -41,7 +41,7 @@ fn edit(path: &Path, change: impl FnOnce(&mut Vec<u8>)) {
     fs::write(path, bytes).unwrap();
 }
 
-/// Replaces the first occurrence of `from` by as many bytes.
+/// Replaces the first occurrence of `from` by `to`, which has the same length.
 fn replace(bytes: &mut [u8], from: &[u8], to: &[u8]) {
     assert_eq!(from.len(), to.len());
     let at = bytes.windows(from.len()).position(|window| window == from).expect("the bytes to replace");
@@ -49,7 +49,7 @@ fn replace(bytes: &mut [u8], from: &[u8], to: &[u8]) {
 }
 
 #[test]
-fn help_says_what_the_tool_is_and_then_examples_on_stdout() {
+fn help_describes_the_tool_and_shows_examples() {
     let workplace = Workplace::new();
     let help = workplace.done("--help");
     assert!(help.starts_with("Shrinks trained dynamic Gaussian-splatting models"), "{help}");
@@ -84,7 +84,7 @@ fn help_says_what_the_tool_is_and_then_examples_on_stdout() {
 }
 
 #[test]
-fn manual_pages_are_written_of_every_verb_with_its_options_and_examples() {
+fn manual_pages_cover_every_command_with_examples() {
     let workplace = Workplace::new();
     let said = workplace.done("man pages");
     let pages: Vec<_> = fs::read_dir(workplace.path("pages")).unwrap().map(|page| page.unwrap().path()).collect();
@@ -99,7 +99,7 @@ fn manual_pages_are_written_of_every_verb_with_its_options_and_examples() {
 }
 
 #[test]
-fn the_end_of_a_run_says_what_stays_what_it_costs_and_where_it_lies_in_few_lines() {
+fn final_report_has_count_size_quality_time_and_path() {
     let workplace = Workplace::new();
     let options = "compress {tiny} --cameras {tiny} --ratio 0.5";
     let most = workplace.done(&format!("{options} -o out"));
@@ -184,7 +184,7 @@ fn deformation_cut_short_or_damaged_is_refused() {
         fs::write(workplace.path(FIELD), &whole[..length]).unwrap();
         model_refused(&workplace, &["deformation.pth"]);
     }
-    // A flipped byte inside a tensor's values: the archive's checksum sees it.
+    // A flipped byte inside the values of a tensor fails the checksum of the archive.
     let mut flipped = whole.clone();
     let middle = whole.len() / 2;
     flipped[middle] ^= 0x40;
@@ -192,13 +192,14 @@ fn deformation_cut_short_or_damaged_is_refused() {
     model_refused(&workplace, &["deformation.pth"]);
 }
 
-/// A state dict whose pickle asks for a function outside of tensors: loading it in Python would run it.
+/// A state dict whose pickle calls a function other than tensor constructors must be refused; Python would run the
+/// function while loading.
 #[test]
-fn hostile_pickle_is_refused_and_not_run() {
+fn hostile_pickle_is_refused_and_not_executed() {
     let workplace = with_model();
     let target = workplace.path("owned");
     let command = format!("touch {}", target.display());
-    // cos.system, one argument, reduce.
+    // Pickle program: the global `os.system`, one argument, REDUCE.
     let mut pickle = b"\x80\x02cos\nsystem\nX".to_vec();
     pickle.extend((command.len() as u32).to_le_bytes());
     pickle.extend(command.as_bytes());
@@ -211,7 +212,7 @@ fn hostile_pickle_is_refused_and_not_run() {
     }
 }
 
-/// A zip archive of stored entries.
+/// Returns a zip archive of uncompressed entries.
 fn stored_zip(entries: &[(&str, &[u8])]) -> Vec<u8> {
     use std::io::Write;
     let mut archive = zip::ZipWriter::new(std::io::Cursor::new(Vec::new()));
@@ -228,7 +229,7 @@ fn missing_head_and_wrong_shape_name_the_tensor() {
     let workplace = with_model();
     let config = workplace.path("model/cfg_args");
     let text = fs::read_to_string(&config).unwrap();
-    // The configuration asks for a head the state dict calls otherwise.
+    // The configuration asks for a head that has another name in the state dict.
     let whole = fs::read(workplace.path(FIELD)).unwrap();
     let renamed = rewrite_pickle(&whole, b"pos_deform", b"pos_reform");
     fs::write(workplace.path(FIELD), renamed).unwrap();
@@ -236,17 +237,17 @@ fn missing_head_and_wrong_shape_name_the_tensor() {
     fs::write(&config, text.replace("no_dx=False", "no_dx=True")).unwrap();
     workplace.done("info model");
 
-    // static_mlp asks for a head that is not there.
+    // `static_mlp` asks for a head that the state dict lacks.
     fs::write(workplace.path(FIELD), &whole).unwrap();
     fs::write(&config, text.replace("static_mlp=False", "static_mlp=True")).unwrap();
     model_refused(&workplace, &["static_mlp", "does cfg_args belong"]);
 
-    // Frequencies triple the features the first layer must read.
+    // Positional encoding frequencies triple the features that the first layer must read.
     fs::write(&config, text.replace("grid_pe=0", "grid_pe=2")).unwrap();
     model_refused(&workplace, &["deformation_net.feature_out.0.weight", "shape"]);
 }
 
-/// The archive with `from` replaced by `to` throughout its pickle.
+/// Returns the archive with `from` replaced by `to` everywhere in its pickle.
 fn rewrite_pickle(archive: &[u8], from: &[u8], to: &[u8]) -> Vec<u8> {
     let mut read = zip::ZipArchive::new(std::io::Cursor::new(archive)).unwrap();
     let mut entries = Vec::new();
@@ -303,7 +304,7 @@ fn cameras_of_another_scene_are_refused() {
         document["frames"].as_array_mut().unwrap().iter_mut().for_each(edit);
         fs::write(workplace.path(file), document.to_string()).unwrap();
     };
-    // The same views from a thousand units away look past the scene.
+    // Cameras a thousand units away see nothing of the scene.
     elsewhere("away.json", &|frame| frame["transform_matrix"][2][3] = 1000.into());
     workplace.refused(
         2,
@@ -320,7 +321,7 @@ fn cameras_of_another_scene_are_refused() {
 fn times_that_do_not_match_are_refused() {
     let workplace = Workplace::new();
     let model = tiny().display().to_string();
-    // --frames 4 puts frames at 0, 1/4, 1/2, 3/4; the pictures were taken at ninths.
+    // `--frames 4` puts frames at 0, 1/4, 1/2 and 3/4; the images were taken at multiples of 1/9.
     workplace.refused(2, "compress {tiny} --frames 4 -o out", &["no frame of the sequence", "--frames"]);
     workplace.done("convert {tiny} frames --as ply-sequence");
     fs::remove_file(workplace.path("frames/frame_00009.ply")).unwrap();
@@ -329,7 +330,7 @@ fn times_that_do_not_match_are_refused() {
 }
 
 #[test]
-fn existing_outputs_stay_unless_overwritten_and_foreign_ones_always() {
+fn overwrite_is_needed_and_spares_foreign_outputs() {
     let workplace = with_model();
     for verb in ["compress model -o", "pack model -o", "score model -o"] {
         let name = if verb.starts_with("score") { "precious.npz" } else { "precious.gseq" };
@@ -347,7 +348,7 @@ fn existing_outputs_stay_unless_overwritten_and_foreign_ones_always() {
     ] {
         workplace.refused(2, verb, &["photos"]);
     }
-    // What lies beside a single file counts too.
+    // Files beside a single output file are protected too.
     fs::write(workplace.path("small.ply.recipe.toml"), "precious").unwrap();
     workplace.refused(2, "compress model -o small.ply", &["small.ply.recipe.toml"]);
 }
@@ -377,7 +378,7 @@ fn outputs_onto_around_or_inside_the_input_are_refused() {
 }
 
 #[test]
-fn kinds_that_do_not_fit_are_refused() {
+fn output_kinds_that_do_not_fit_are_refused() {
     let workplace = Workplace::new();
     workplace.done("convert {tiny} scene.gseq");
     workplace.refused(2, "compress scene.gseq -o out --as model", &["only a trained model"]);
@@ -386,7 +387,7 @@ fn kinds_that_do_not_fit_are_refused() {
 }
 
 #[test]
-fn damaged_containers_are_refused_and_cut_ones_recovered() {
+fn damaged_containers_are_refused_cut_ones_recovered() {
     let workplace = Workplace::new();
     workplace.done("convert {tiny} scene.gseq");
     let whole = fs::read(workplace.path("scene.gseq")).unwrap();
@@ -412,7 +413,7 @@ fn damaged_containers_are_refused_and_cut_ones_recovered() {
 }
 
 #[test]
-fn every_verb_answers_on_stdout_and_keeps_quiet_elsewhere_when_asked_to() {
+fn results_go_to_stdout_and_quiet_silences_stderr() {
     let workplace = Workplace::new();
     for (arguments, part) in [
         ("compress {tiny} -o out", "of 300 Gaussians"),
@@ -436,7 +437,7 @@ fn every_verb_answers_on_stdout_and_keeps_quiet_elsewhere_when_asked_to() {
     let rows = fs::read_to_string(workplace.path("rows.csv")).unwrap();
     assert_eq!(rows.lines().next().unwrap(), "id,D,kappa,V,life,C,E,vis,static_score,dynamic_score,score,keep,W");
     assert_eq!(rows.lines().count(), 301);
-    // Nobody has chosen the frames of a model that is continuous in time.
+    // A model that is continuous in time has no number of frames of its own.
     for (arguments, frames) in [
         ("info scene.gseq --json", serde_json::json!(10)),
         ("info {tiny} --json", serde_json::Value::Null),
@@ -450,7 +451,7 @@ fn every_verb_answers_on_stdout_and_keeps_quiet_elsewhere_when_asked_to() {
 }
 
 #[test]
-fn a_demo_without_an_output_names_no_place() {
+fn demo_without_output_names_no_path() {
     let workplace = Workplace::new();
     let text = workplace.done("demo --gaussians 400 --frames 4 --quiet");
     assert!(!text.contains("output  "), "{text}");
@@ -501,7 +502,7 @@ fn score_writes_one_array_per_column() {
 }
 
 #[test]
-fn reader_that_has_seen_enough_is_no_failure() {
+fn closed_stdout_is_no_failure() {
     for arguments in [&["recipe"][..], &["completions", "bash"], &["--help"]] {
         let mut child = Command::new(assert_cmd::cargo::cargo_bin("splatsieve"))
             .args(arguments)
@@ -509,7 +510,7 @@ fn reader_that_has_seen_enough_is_no_failure() {
             .stderr(Stdio::piped())
             .spawn()
             .unwrap();
-        // Nobody reads: the first write breaks.
+        // Without a reader of standard output the first write fails.
         drop(child.stdout.take());
         let output = child.wait_with_output().unwrap();
         let message = String::from_utf8(output.stderr).unwrap();
@@ -519,7 +520,7 @@ fn reader_that_has_seen_enough_is_no_failure() {
 
 #[test]
 #[ignore = "needs time"]
-fn no_stage_is_told_of_twice_and_what_is_undone_as_left_out() {
+fn stages_print_once_and_undone_merging_is_left_out() {
     let workplace = Workplace::new();
     workplace.done("demo -o demo");
     let compress = |rest: &str| {

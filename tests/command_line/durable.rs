@@ -1,5 +1,6 @@
-//! Every result is written through to the disk before it gets its name, and so is the name: what a power failure would
-//! tell, seen as the order of the system's calls. A library that notes them stands between the program and the system.
+//! Durability of results: a result is written through to disk (`fsync`) before it gets its name (`rename`), and the
+//! rename is made durable afterwards. The test checks the order of the system calls, which a preloaded library records;
+//! the order decides what survives a power failure.
 #![cfg(all(target_os = "linux", target_env = "gnu"))]
 
 use std::fs;
@@ -8,7 +9,8 @@ use std::process::Command;
 
 use crate::scene::{Workplace, files, tiny};
 
-/// `fsync` and `rename` as they are, each noted in the file that NOTES names, in their order.
+/// C source of the library that passes `fsync` and `rename` on unchanged and appends each call to the file named by
+/// NOTES, in order.
 const NOTES: &str = r#"
 #define _GNU_SOURCE
 #include <fcntl.h>
@@ -40,15 +42,15 @@ int rename(const char *from, const char *to) {
 }
 "#;
 
-/// What the program asked of the system.
+/// System call that the program made.
 #[derive(Debug, PartialEq)]
 enum Call {
     Sync(PathBuf),
     Rename(PathBuf, PathBuf),
 }
 
-/// Runs the program with all its `fsync` and `rename` noted.
-fn noted(workplace: &Workplace, shim: &Path, arguments: &str) -> Vec<Call> {
+/// Runs the program and returns all its `fsync` and `rename` calls in order.
+fn recorded_calls(workplace: &Workplace, shim: &Path, arguments: &str) -> Vec<Call> {
     let notes = workplace.path("notes");
     let _ = fs::remove_file(&notes);
     let words = arguments.split_whitespace().map(|word| if word == "{tiny}" { tiny() } else { workplace.path(word) });
@@ -72,7 +74,7 @@ fn noted(workplace: &Workplace, shim: &Path, arguments: &str) -> Vec<Call> {
 }
 
 #[test]
-fn what_gets_a_name_is_on_the_disk_before_and_its_name_after() {
+fn results_are_synced_before_and_after_renaming() {
     let workplace = Workplace::new();
     let (source, shim) = (workplace.path("notes.c"), workplace.path("notes.so"));
     fs::write(&source, NOTES).unwrap();
@@ -88,7 +90,7 @@ fn what_gets_a_name_is_on_the_disk_before_and_its_name_after() {
             &["small.gseq", "small.gseq.recipe.toml", "small.gseq.index_map.npy", "small.gseq.summary.json"],
         ),
     ] {
-        let calls = noted(&workplace, &shim, arguments);
+        let calls = recorded_calls(&workplace, &shim, arguments);
         for result in results.iter().map(|name| workplace.path(name)) {
             let named = |call: &Call| matches!(call, Call::Rename(_, to) if *to == result);
             let at = calls.iter().position(named).unwrap_or_else(|| panic!("{arguments}: {result:?} got no name"));

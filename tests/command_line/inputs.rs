@@ -1,4 +1,5 @@
-//! What people bring and how they ask for it: names, lists, text files, cameras of other programs; and what is said of it.
+//! Tests of inputs and requests: output names, lists, text files, cameras of other programs, and the messages about
+//! them.
 
 use std::fs;
 use std::path::Path;
@@ -7,11 +8,11 @@ use std::process::Command;
 use crate::scene::{Workplace, tiny};
 
 #[test]
-fn recovering_nothing_is_no_success_and_writes_nothing() {
+fn recovering_no_frame_fails_and_writes_nothing() {
     let workplace = Workplace::new();
     workplace.done("convert {tiny} scene.gseq");
     let whole = fs::read(workplace.path("scene.gseq")).unwrap();
-    // The header is whole, and no tile is.
+    // The header is complete, but no tile is.
     fs::write(workplace.path("cut.gseq"), &whole[..4096]).unwrap();
     workplace.refused(
         1,
@@ -21,7 +22,7 @@ fn recovering_nothing_is_no_success_and_writes_nothing() {
 }
 
 #[test]
-fn a_result_of_no_gaussians_is_no_success() {
+fn result_without_gaussians_is_an_error() {
     let workplace = Workplace::new();
     for options in ["-o out", "-o out.gseq --prune-only", "-o out.gsz", "-o out --no-refine"] {
         let parts = ["at least one Gaussian that stays", "none of 300", "--drop-ids"];
@@ -30,7 +31,7 @@ fn a_result_of_no_gaussians_is_no_success() {
 }
 
 #[test]
-fn a_name_that_no_output_has_is_refused_at_once_with_what_can_be_written() {
+fn unknown_output_extension_is_refused_with_choices() {
     let workplace = Workplace::new();
     let parts = ["x.txt", "NAME.gsz", "NAME.gseq", "NAME.ply", "a folder", "--as"];
     workplace.refused(2, "compress {tiny} -o x.txt", &parts);
@@ -39,14 +40,14 @@ fn a_name_that_no_output_has_is_refused_at_once_with_what_can_be_written() {
     workplace.refused(2, "convert {tiny} x.txt --as ply-sequence", &["x.txt", "a folder"]);
     workplace.refused(2, "report {tiny} {tiny} -o x.html", &["x.html", "a folder"]);
     workplace.refused(2, "render {tiny} --all -o x.zip", &["x.zip", "a folder"]);
-    // Said outright, or no ending of a file.
+    // The kind is given with `--as`, or the extension is not that of a file format.
     workplace.done("compress {tiny} -o small.v2 --prune-only --no-refine --quiet");
     assert!(workplace.path("small.v2/cfg_args").is_file());
     workplace.done("compress {tiny} -o x.model --as model --prune-only --no-refine --quiet");
 }
 
 #[test]
-fn an_empty_folder_is_no_obstacle_and_one_with_anything_in_it_is() {
+fn output_folder_may_exist_only_if_empty() {
     let workplace = Workplace::new();
     for (verb, made) in [
         ("compress {tiny} --prune-only --no-refine --quiet -o out", "cfg_args"),
@@ -90,7 +91,7 @@ fn lists_are_separated_by_commas() {
 }
 
 #[test]
-fn text_files_are_read_with_a_byte_order_mark_and_hints_fit_what_is_wrong() {
+fn text_files_may_have_byte_order_marks_and_hints_fit() {
     let workplace = Workplace::new();
     let cameras = fs::read(tiny().join("transforms_train.json")).unwrap();
     let with_mark = [b"\xef\xbb\xbf", &cameras[..]].concat();
@@ -121,10 +122,10 @@ fn text_files_are_read_with_a_byte_order_mark_and_hints_fit_what_is_wrong() {
     workplace.done("compress {tiny} --drop-ids ids.txt -o out --dry-run --prune-only --no-refine --quiet");
 }
 
-/// Messages are for people: what Rust shows its programmers is in none.
+/// Messages are for users: none may contain Rust debug formatting.
 #[test]
-fn no_message_is_made_of_debug_text() {
-    // Numbers, which read the same either way.
+fn no_message_contains_debug_formatting() {
+    // Numbers, which look the same in debug formatting.
     let numbers = [
         "array.shape()",
         "{shape:?}",
@@ -164,16 +165,16 @@ fn no_message_is_made_of_debug_text() {
         }
     }
     assert!(found.is_empty(), "{}", found.join("\n"));
-    // What no terminal shows is told by its code.
+    // Characters that a terminal does not show appear as their code point.
     let workplace = Workplace::new();
     fs::write(workplace.path("ids.txt"), "3\u{200b}x\u{7}\n").unwrap();
     workplace.refused(2, "compress {tiny} --drop-ids ids.txt -o out", &["\"3<U+200B>x<U+0007>\""]);
 }
 
-/// A disk of 24 KiB of its own, which each of these runs fills.
+/// Each run fills its own 24 KiB file system.
 #[test]
 #[ignore = "needs namespaces of process ids"]
-fn a_full_disk_is_blamed_on_what_was_being_written() {
+fn full_disk_error_names_the_file_being_written() {
     let workplace = Workplace::new();
     fs::create_dir(workplace.path("disk")).unwrap();
     let (program, tiny) = (env!("CARGO_BIN_EXE_splatsieve"), tiny());
@@ -199,7 +200,7 @@ fn a_full_disk_is_blamed_on_what_was_being_written() {
 }
 
 #[test]
-fn a_folder_inside_a_model_names_the_folder_above() {
+fn folder_inside_a_model_is_refused_naming_the_model() {
     let workplace = Workplace::new();
     for inside in ["point_cloud", "point_cloud/iteration_7"] {
         let run = workplace.run_words(["info", tiny().join(inside).to_str().unwrap()]);
@@ -210,14 +211,14 @@ fn a_folder_inside_a_model_names_the_folder_above() {
 }
 
 #[test]
-fn as_many_frames_as_the_cameras_have_times_are_these_times() {
+fn frames_take_camera_times_if_the_counts_match() {
     let workplace = Workplace::new();
     let with = workplace.done("evaluate {tiny} {tiny} --cameras {tiny} --frames 10 --json");
     assert_eq!(with, workplace.done("evaluate {tiny} {tiny} --cameras {tiny} --json"));
 }
 
 #[test]
-fn ground_truth_is_compared_where_it_exists_and_the_number_is_said() {
+fn ground_truth_is_compared_and_counted_where_it_exists() {
     let workplace = Workplace::new();
     workplace.done("render {tiny} --cameras {tiny} --all -o photos --quiet");
     let line = "evaluate {tiny} {tiny} --cameras {tiny} --ground-truth photos";
@@ -250,10 +251,10 @@ fn ground_truth_is_compared_where_it_exists_and_the_number_is_said() {
 }
 
 #[test]
-fn photographs_of_a_rig_lie_in_a_folder_per_camera() {
+fn photographs_are_found_in_one_folder_per_camera() {
     let workplace = Workplace::new();
     workplace.done("render {tiny} --cameras {tiny} --split all --all -o photos --quiet");
-    // As DyNeRF has them: numbers of cameras with a gap, frame by frame.
+    // File layout of DyNeRF: numbered cameras with gaps, one image per frame.
     for (place, camera) in ["cam00", "cam01", "cam03", "cam04", "cam07", "cam10"].iter().enumerate() {
         let images = workplace.path("rig").join(camera).join("images");
         fs::create_dir_all(&images).unwrap();
@@ -274,7 +275,7 @@ fn photographs_of_a_rig_lie_in_a_folder_per_camera() {
 }
 
 #[test]
-fn a_gap_among_frames_is_named_and_refused_unless_allowed() {
+fn frame_gap_is_refused_by_name_unless_allowed() {
     let workplace = Workplace::new();
     workplace.done("convert {tiny} frames --as ply-sequence");
     fs::remove_file(workplace.path("frames/summary.json")).ok();
@@ -296,7 +297,7 @@ fn a_gap_among_frames_is_named_and_refused_unless_allowed() {
         assert!(run.code == 1 && run.stderr.contains("a link to nothing"), "{}", run.stderr);
         fs::remove_file(workplace.path("frames/frame_00004.ply")).unwrap();
     }
-    // Every other frame is no gap.
+    // A sequence of every other frame has no gap.
     for odd in ["01", "03", "05", "07", "09"] {
         fs::remove_file(workplace.path(&format!("frames/frame_000{odd}.ply"))).unwrap();
     }
@@ -305,7 +306,7 @@ fn a_gap_among_frames_is_named_and_refused_unless_allowed() {
 }
 
 #[test]
-fn weights_that_contradict_cfg_args_are_believed_and_that_is_said() {
+fn weights_override_cfg_args_with_a_warning() {
     let workplace = Workplace::new();
     for (name, bytes) in crate::scene::files(&tiny()) {
         let path = workplace.path("model").join(&name);
@@ -328,7 +329,7 @@ fn weights_that_contradict_cfg_args_are_believed_and_that_is_said() {
 }
 
 #[test]
-fn cameras_that_see_nothing_of_the_scene_are_refused_and_its_own_pass_without_a_word() {
+fn cameras_that_see_nothing_are_refused() {
     let workplace = Workplace::new();
     let mut cameras: serde_json::Value =
         serde_json::from_slice(&fs::read(tiny().join("transforms_train.json")).unwrap()).unwrap();
@@ -337,7 +338,7 @@ fn cameras_that_see_nothing_of_the_scene_are_refused_and_its_own_pass_without_a_
     write(&cameras);
     assert!(!workplace.done(line).contains("warning"));
     for frame in cameras["frames"].as_array_mut().unwrap() {
-        // High above, where none of them looks down.
+        // Positions high above the scene, where no camera looks down.
         for (axis, place) in [1e4, 2e4, 9e4].into_iter().enumerate() {
             frame["transform_matrix"][axis][3] = place.into();
         }
@@ -347,10 +348,10 @@ fn cameras_that_see_nothing_of_the_scene_are_refused_and_its_own_pass_without_a_
 }
 
 #[test]
-fn a_still_scene_takes_cameras_of_every_kind_and_is_surrounded_where_there_are_none() {
+fn still_takes_any_cameras_or_a_virtual_rig() {
     let workplace = Workplace::new();
     workplace.done("compress {tiny} --cameras {tiny} -o still.ply --ratio 0.9 --no-refine --quiet");
-    // The project's own kind, one camera per picture.
+    // Camera file of this project, with one camera per image.
     let camera = |k: u32| {
         let (sin, cos) = f64::from(k).sin_cos();
         serde_json::json!({
@@ -365,14 +366,14 @@ fn a_still_scene_takes_cameras_of_every_kind_and_is_surrounded_where_there_are_n
         |more: &str| -> serde_json::Value { serde_json::from_str(&workplace.done(&format!("{line} {more}"))).unwrap() };
     let given = summary("--cameras orbit.json");
     assert_eq!(given["output"]["gaussians"], summary("")["output"]["gaussians"]);
-    // What is seen decides in both cases.
+    // Visible contribution decides in both cases.
     let stages = |summary: &serde_json::Value| summary["stages"].to_string();
     assert!(stages(&given).contains("visible") && stages(&summary("")).contains("visible"), "{}", stages(&given));
     assert!(summary("")["notes"].to_string().contains("24 cameras"), "{}", summary("")["notes"]);
 }
 
 #[test]
-fn everything_converts_to_what_others_open_and_what_does_not_fit_is_refused() {
+fn convert_writes_every_kind_and_refuses_misfits() {
     let workplace = Workplace::new();
     for output in ["a.splatv", "a.4dgs", "a.gseq", "frames --as ply-sequence", "model", "cloud.ply"] {
         let said = workplace.done(&format!("convert {{tiny}} {output} --cameras {{tiny}}"));
@@ -403,7 +404,7 @@ fn everything_converts_to_what_others_open_and_what_does_not_fit_is_refused() {
 
 #[test]
 #[ignore = "needs Python"]
-fn scripts_end_with_a_sentence_and_never_with_a_traceback() {
+fn scripts_report_errors_without_a_traceback() {
     let scripts = Path::new(env!("CARGO_MANIFEST_DIR")).join("scripts");
     let workplace = Workplace::new();
     fs::write(workplace.path("bad"), b"\xff\0no container, no table, no model").unwrap();
@@ -411,7 +412,7 @@ fn scripts_end_with_a_sentence_and_never_with_a_traceback() {
         .iter()
         .flat_map(|folder| fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()))
         .filter(|path| path.extension().is_some_and(|end| end == "py"))
-        // It is only imported.
+        // This module is only imported by others.
         .filter(|path| !path.ends_with("stream_writer.py"))
         .collect();
     named.sort();
@@ -431,7 +432,7 @@ fn scripts_end_with_a_sentence_and_never_with_a_traceback() {
             assert!(!told.contains("Traceback"), "{} {arguments:?}: {told}", script.display());
         }
     }
-    // Whoever reads the output has seen enough.
+    // The reader of standard output stops reading early.
     let line = format!(
         "python3 {} {1} {1} | true; python3 -c 'raise SystemExit(0)'",
         scripts.join("check_model_folder.py").display(),
@@ -441,9 +442,9 @@ fn scripts_end_with_a_sentence_and_never_with_a_traceback() {
     assert_eq!(String::from_utf8_lossy(&output.stderr), "");
 }
 
-/// What of a run of 300 Gaussians and 10 frames is in buffers is no more than these.
+/// The buffers of a run of 300 Gaussians and 10 frames take at most 60 MiB.
 #[test]
-fn memory_asks_for_what_is_needed_and_keeps_to_it() {
+fn named_minimum_memory_is_small_and_kept() {
     let workplace = Workplace::new();
     for output in ["out.gseq", "out"] {
         let run = workplace.run(&format!("compress {{tiny}} -o {output} --memory 1KiB --threads 2"));

@@ -1,7 +1,7 @@
-//! Sequences that are all length or all width, as files and as streams of which nobody knows how long they will be
-//! (EXTREMES 42): a budget holds for as many frames as there is room for, and what there is no room for is refused by name.
+//! Very long and very wide sequences, as files and as streams of unknown length (EXTREMES 42). A memory limit holds for
+//! as many frames as fit, and a run refuses more frames than that with a message that names the limit.
 //!
-//! `SPLATSIEVE_PROGRAM` names another program to run than the one built with this test: an optimized one.
+//! `SPLATSIEVE_PROGRAM` may name an optimized program to run in place of the one built with this test.
 
 use std::fs;
 use std::io::{BufWriter, Write};
@@ -13,19 +13,19 @@ use splatsieve::files::frame_stream::StreamHeader;
 use splatsieve::model::{Columns, Gaussians};
 use splatsieve::outputs::frame_stream::StreamWriter;
 
-/// Scores and prunes by formula: what looks at pictures takes time, not memory that grows with frames.
+/// Scores and prunes by formula, because stages that use renders take much time but no memory that grows with frames.
 const REQUEST: &str = "--set coverage=projected --prune-only --no-refine --set choose_by_views=false --ratio 0.5 \
      --set bands=all";
 
-/// A sequence of which positions alone move, to and fro: the first component of Gaussian 0 at frame t is sin(t / 50).
+/// Sequence in which only positions move, back and forth: the first component of Gaussian 0 at frame t is sin(t / 50).
 #[derive(Clone, Copy)]
-struct Walk {
+struct LongSequence {
     gaussians: usize,
     frames: usize,
 }
 
-impl Walk {
-    /// Writes it as a stream; whoever reads may stop early.
+impl LongSequence {
+    /// Writes the sequence as a stream. Stops without an error if the reader closes the pipe.
     fn write(self, to: impl Write) {
         let header =
             StreamHeader { count: self.gaussians, sh_degree: 0, varying: Columns::POSITION, is_unlinked: false };
@@ -55,29 +55,29 @@ impl Walk {
     }
 }
 
-/// Runs the program on `walk` as it arrives.
-fn piped(workplace: &Workplace, arguments: &str, walk: Walk) -> Output {
-    crate::scene::piped(&mut workplace.command(arguments), move |pipe| walk.write(pipe))
+/// Runs the program with the stream of `sequence` on its standard input.
+fn piped(workplace: &Workplace, arguments: &str, sequence: LongSequence) -> Output {
+    crate::scene::piped(&mut workplace.command(arguments), move |pipe| sequence.write(pipe))
 }
 
 /// Runs the program without an input.
-fn ran(workplace: &Workplace, arguments: &str) -> Output {
-    piped(workplace, arguments, Walk { gaussians: 0, frames: 0 })
+fn run_without_input(workplace: &Workplace, arguments: &str) -> Output {
+    piped(workplace, arguments, LongSequence { gaussians: 0, frames: 0 })
 }
 
-fn told(output: &Output) -> String {
+fn stderr_text(output: &Output) -> String {
     String::from_utf8_lossy(&output.stderr).into_owned()
 }
 
-/// What follows `before` up to `after`, as a number.
+/// Returns the number between `before` and `after` in `text`.
 fn number(text: &str, before: &str, after: &str) -> f64 {
     let (_, rest) = text.split_once(before).unwrap_or_else(|| panic!("{before:?} is not in {text:?}"));
     rest.split_once(after).unwrap().0.trim().parse().unwrap()
 }
 
-/// A run that must succeed and, where the system says what it took, have taken at most `budget` MiB.
-fn keeps_to(output: &Output, what: &str, budget: f64) {
-    let text = told(output);
+/// Checks that a run succeeded and used at most `budget` MiB, if the system reports memory use.
+fn assert_within_memory(output: &Output, what: &str, budget: f64) {
+    let text = stderr_text(output);
     assert!(output.status.success(), "{what}: {text}");
     if let Some(taken) = crate::scene::taken(&text) {
         println!("{what}: {taken} of {budget} MiB");
@@ -85,17 +85,18 @@ fn keeps_to(output: &Output, what: &str, budget: f64) {
     }
 }
 
-/// Packs `walk`, compresses it as a container and as a stream, all within `budget` MiB, and holds results together.
-fn both_ways(walk: Walk, budget: u64) {
+/// Packs `sequence`, compresses it as a container and as a stream, each within `budget` MiB, and checks that the
+/// results are equal.
+fn check_file_and_stream(sequence: LongSequence, budget: u64) {
     let workplace = Workplace::new();
     let limits = format!("--memory {budget}MiB --explain");
-    let output = piped(&workplace, &format!("convert - walk.gseq {limits}"), walk);
-    keeps_to(&output, "pack", budget as f64);
-    let output = ran(&workplace, &format!("compress walk.gseq -o file.gseq {REQUEST} {limits}"));
-    keeps_to(&output, "container", budget as f64);
+    let output = piped(&workplace, &format!("convert - walk.gseq {limits}"), sequence);
+    assert_within_memory(&output, "pack", budget as f64);
+    let output = run_without_input(&workplace, &format!("compress walk.gseq -o file.gseq {REQUEST} {limits}"));
+    assert_within_memory(&output, "container", budget as f64);
     fs::remove_file(workplace.path("walk.gseq")).unwrap();
-    let output = piped(&workplace, &format!("compress - -o stream.gseq {REQUEST} {limits}"), walk);
-    keeps_to(&output, "stream", budget as f64);
+    let output = piped(&workplace, &format!("compress - -o stream.gseq {REQUEST} {limits}"), sequence);
+    assert_within_memory(&output, "stream", budget as f64);
     for name in [".gseq", ".gseq.index_map.npy"] {
         let [file, stream] = ["file", "stream"].map(|of| fs::read(workplace.path(&format!("{of}{name}"))).unwrap());
         assert!(file == stream, "{name}: other bytes");
@@ -103,39 +104,39 @@ fn both_ways(walk: Walk, budget: u64) {
 }
 
 #[test]
-fn a_hundred_thousand_frames_fit_where_few_do() {
-    both_ways(Walk { gaussians: 10, frames: 100_000 }, 40);
+fn memory_for_many_frames_is_that_for_few() {
+    check_file_and_stream(LongSequence { gaussians: 10, frames: 100_000 }, 40);
 }
 
 #[test]
-fn a_million_gaussians_in_two_frames_fit() {
-    both_ways(Walk { gaussians: 1_000_000, frames: 2 }, 700);
+fn million_gaussians_in_two_frames_fit() {
+    check_file_and_stream(LongSequence { gaussians: 1_000_000, frames: 2 }, 700);
 }
 
-/// EXTREMES 42.
+/// Case 42 of EXTREMES: many frames.
 #[test]
 #[ignore = "slow: minutes unless optimised"]
 fn slow_a_million_frames_of_ten_gaussians_fit_64_mib() {
-    both_ways(Walk { gaussians: 10, frames: 1_000_000 }, 64);
+    check_file_and_stream(LongSequence { gaussians: 10, frames: 1_000_000 }, 64);
 }
 
-/// EXTREMES 42.
+/// Case 42 of EXTREMES: many Gaussians.
 #[test]
 #[ignore = "slow: minutes unless optimised"]
 fn slow_ten_million_gaussians_in_two_frames_fit() {
-    both_ways(Walk { gaussians: 10_000_000, frames: 2 }, 7000);
+    check_file_and_stream(LongSequence { gaussians: 10_000_000, frames: 2 }, 7000);
 }
 
 #[test]
-fn a_stream_longer_than_there_is_room_for_is_refused_and_the_memory_that_is_named_is_enough() {
-    let walk = Walk { gaussians: 10, frames: 60_000 };
+fn too_long_stream_is_refused_naming_enough_memory() {
+    let sequence = LongSequence { gaussians: 10, frames: 60_000 };
     for (verb, rest) in [("compress", REQUEST), ("convert", "")] {
         let workplace = Workplace::new();
         let request = |memory: u64| format!("{verb} - -o out.gseq {rest} --memory {memory}MiB --explain");
-        let output = piped(&workplace, &request(1), walk);
-        let least = number(&told(&output), "expected at least ", "MiB") as u64;
-        let output = piped(&workplace, &request(least), walk);
-        let text = told(&output);
+        let output = piped(&workplace, &request(1), sequence);
+        let least = number(&stderr_text(&output), "expected at least ", "MiB") as u64;
+        let output = piped(&workplace, &request(least), sequence);
+        let text = stderr_text(&output);
         assert_eq!(output.status.code(), Some(1), "{verb} in {least} MiB: {text}");
         for part in ["standard input, frame ", "at most ", &format!("{least}.0 MiB, as asked for"), "send fewer frames"]
         {
@@ -144,7 +145,7 @@ fn a_stream_longer_than_there_is_room_for_is_refused_and_the_memory_that_is_name
         assert!(fs::read_dir(workplace.path("")).unwrap().next().is_none(), "{verb}: something was left behind");
         let enough = number(&text, "MiB, which is enough for ", " frames") as usize;
         let named = number(&text, "use --memory ", "MiB") as u64;
-        let as_said = Walk { frames: enough, ..walk };
-        keeps_to(&piped(&workplace, &request(named), as_said), verb, named as f64);
+        let as_said = LongSequence { frames: enough, ..sequence };
+        assert_within_memory(&piped(&workplace, &request(named), as_said), verb, named as f64);
     }
 }

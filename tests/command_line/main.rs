@@ -1,4 +1,4 @@
-//! The command line as users and scripts meet it.
+//! Tests of the command line as users and scripts use it.
 
 mod beside_others;
 mod cli;
@@ -19,8 +19,8 @@ mod stream_input;
 
 use std::process::{Command, Stdio};
 
-/// Returns `unshare` with `flags`, which give it namespaces of its own, and as a user without privileges where the system
-/// refuses them to this one.
+/// Returns the command `unshare` with `flags`, which create new namespaces. Adds the flags for an unprivileged user
+/// namespace if the system refuses the plain call. Panics if neither works.
 fn unshare(flags: &[&str]) -> Command {
     let rootless = [&["-U", "-r"], flags].concat();
     let works = |flags: &[&str]| {

@@ -1,5 +1,5 @@
-//! The promise of `--memory`: a budget holds or is refused, the least that the refusal names works, and results do
-//! not depend on it.
+//! Tests of `--memory`: a limit is kept or refused, the minimum that the refusal names is enough, and results do not
+//! depend on the limit.
 
 use std::path::Path;
 use std::process::{Command, Stdio};
@@ -14,20 +14,20 @@ use splatsieve::source::{BlockReader, FrameSource, Ids};
 
 const GAUSSIANS: usize = 30_000;
 const FRAMES: usize = 48;
-/// Every picture of a camera that sees all, for cheap.
+/// Few small images from a camera that sees all Gaussians, which keeps the tests fast.
 const REQUEST: &str = "--cameras cameras.json --split all --set frame_stride=6";
 
 fn random(k: usize) -> f32 {
     (hash_id(k as u64) >> 40) as f32 / (1 << 24) as f32
 }
 
-/// Gaussians in a box, of which every value but the colors' differs in every frame: 63 MB of it.
-struct Restless(SequenceInfo);
+/// Gaussians in a box in which every value except the colors differs in every frame: 63 MB of values.
+struct ChangingScene(SequenceInfo);
 
-impl Restless {
+impl ChangingScene {
     fn new() -> Self {
         let times = (0..FRAMES).map(|t| t as f64).collect();
-        Restless(SequenceInfo {
+        ChangingScene(SequenceInfo {
             count: GAUSSIANS,
             times,
             sh_degree: 1,
@@ -36,7 +36,7 @@ impl Restless {
     }
 }
 
-impl FrameSource for Restless {
+impl FrameSource for ChangingScene {
     fn info(&self) -> &SequenceInfo {
         &self.0
     }
@@ -51,7 +51,7 @@ struct Block(Vec<usize>);
 impl BlockReader for Block {
     fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
         for column in want.iter() {
-            // Middle and size of what the values wander in; neighbors in id are neighbors in space.
+            // Center and amplitude of the values; Gaussians with close ids are close in space.
             let (middle, wander, shake) = match column {
                 Columns::POSITION => (0.0, 2.0, 1e-3),
                 Columns::LOG_SCALE => (-3.5, 0.2, 1e-3),
@@ -73,11 +73,11 @@ impl BlockReader for Block {
     }
 }
 
-/// A folder with the scene packed as `packed.gseq` and `raw.gseq`, and its cameras.
-fn prepared() -> Workplace {
+/// Returns a folder with the scene as `packed.gseq` and `raw.gseq`, and its cameras.
+fn scene_workplace() -> Workplace {
     let workplace = Workplace::new();
     for (name, compression) in [("packed.gseq", gseq::Compression::Zstd(1)), ("raw.gseq", gseq::Compression::Raw)] {
-        write_container(&Restless::new(), &workplace.path(name), compression, Default::default(), |_| ()).unwrap();
+        write_container(&ChangingScene::new(), &workplace.path(name), compression, Default::default(), |_| ()).unwrap();
     }
     let camera = r#"{"id": 0, "img_name": "a", "width": 96, "height": 64, "fx": 90, "fy": 90, "position": [0, -4, 0],
         "rotation": [[1, 0, 0], [0, 0, 1], [0, -1, 0]]}"#;
@@ -85,16 +85,17 @@ fn prepared() -> Workplace {
     workplace
 }
 
-/// The least that a refusal names, MiB.
-fn least(workplace: &Workplace, arguments: &str) -> u64 {
+/// Returns the minimum that the refusal of `--memory 1MiB` names, in MiB.
+fn minimum_memory(workplace: &Workplace, arguments: &str) -> u64 {
     let run = workplace.run(&format!("{arguments} --memory 1MiB"));
     assert_eq!(run.code, 2, "{}", run.stderr);
     let (_, after) = run.stderr.split_once("at least ").unwrap_or_else(|| panic!("{}", run.stderr));
     after.split_once("MiB").unwrap().0.parse().unwrap()
 }
 
-/// Largest resident memory that the summary beside `result` tells of, MiB; none where the system does not say.
-fn peak(result: &Path) -> Option<u64> {
+/// Returns the largest resident memory of any stage in the summary of `result`, in MiB; `None` if the system does not
+/// report it.
+fn peak_memory(result: &Path) -> Option<u64> {
     let text = std::fs::read_to_string(format!("{}.summary.json", result.display())).unwrap();
     let summary: serde_json::Value = serde_json::from_str(&text).unwrap();
     let stages = summary["stages"].as_array().unwrap();
@@ -103,8 +104,8 @@ fn peak(result: &Path) -> Option<u64> {
 
 #[test]
 #[ignore = "needs time"]
-fn the_least_that_is_named_works_holds_and_changes_no_byte() {
-    let workplace = prepared();
+fn named_minimum_memory_works_and_changes_no_byte() {
+    let workplace = scene_workplace();
     for (input, rest) in [
         ("packed.gseq", "--ratio 0.4 --set refine_steps=30 --set refine_cut_steps=5 --as archive"),
         ("packed.gseq", "--no-refine"),
@@ -118,21 +119,21 @@ fn the_least_that_is_named_works_holds_and_changes_no_byte() {
             std::fs::create_dir_all(workplace.path(name)).unwrap();
         }
         workplace.done(&format!("{} --memory 8GiB", request("free")));
-        let least = least(&workplace, &request("tight"));
-        workplace.done(&format!("{} --memory {least}MiB", request("tight")));
+        let minimum_memory = minimum_memory(&workplace, &request("tight"));
+        workplace.done(&format!("{} --memory {minimum_memory}MiB", request("tight")));
         let [free, tight] = ["free", "tight"].map(|name| workplace.path(name));
-        if let Some(peak) = peak(&tight.join("small.gseq")) {
-            assert!(peak <= least, "{input} {rest}: {peak} MiB resident, {least} promised");
-            assert!(least < 63 || rest != "--no-refine", "{input} {rest}: {least} MiB would hold the scene");
+        if let Some(peak_memory) = peak_memory(&tight.join("small.gseq")) {
+            assert!(peak_memory <= minimum_memory, "{input} {rest}: {peak_memory} MiB resident, {minimum_memory} promised");
+            assert!(minimum_memory < 63 || rest != "--no-refine", "{input} {rest}: {minimum_memory} MiB would hold the scene");
         }
-        assert!(lasting_files(&free) == lasting_files(&tight), "{input} {rest}: other bytes at {least} MiB");
+        assert!(lasting_files(&free) == lasting_files(&tight), "{input} {rest}: other bytes at {minimum_memory} MiB");
     }
 }
 
 #[test]
 #[ignore = "needs time"]
-fn every_verb_that_touches_frames_keeps_to_a_budget() {
-    let workplace = prepared();
+fn every_command_that_reads_frames_keeps_its_memory_limit() {
+    let workplace = scene_workplace();
     workplace.done(&format!("compress packed.gseq {REQUEST} --prune-only --ratio 0.5 -o small.gseq"));
     for arguments in [
         format!("score packed.gseq {REQUEST} -o rows.npz"),
@@ -145,21 +146,21 @@ fn every_verb_that_touches_frames_keeps_to_a_budget() {
         "convert packed.gseq within.gseq --max-error position=0.1%,rotation=1e-2,log_scale=1e-2,sh=1e-2".to_owned(),
         "convert packed.gseq plys --as ply-sequence".to_owned(),
     ] {
-        let least = least(&workplace, &arguments);
-        let run = workplace.run(&format!("{arguments} --memory {least}MiB --explain"));
+        let minimum_memory = minimum_memory(&workplace, &arguments);
+        let run = workplace.run(&format!("{arguments} --memory {minimum_memory}MiB --explain"));
         assert_eq!(run.code, 0, "{}", run.stderr);
         for part in ["memory: at most", "N x", "full reads of the input"] {
             assert!(run.stderr.contains(part), "{arguments}: {part:?} is not in {:?}", run.stderr);
         }
         if let Some(taken) = crate::scene::taken(&run.stderr) {
-            println!("{arguments}: {taken} of {least} MiB");
-            assert!(taken <= least as f64, "{arguments}: {taken} MiB resident, {least} promised");
+            println!("{arguments}: {taken} of {minimum_memory} MiB");
+            assert!(taken <= minimum_memory as f64, "{arguments}: {taken} MiB resident, {minimum_memory} promised");
         }
     }
 }
 
 #[test]
-fn a_plan_is_explained_before_it_is_refused_and_nonsense_is_no_size() {
+fn plan_is_printed_before_refusal_and_bad_sizes_fail() {
     let workplace = Workplace::new();
     workplace.done("demo --gaussians 1000 --frames 2 -o demo");
     workplace.refused(
@@ -174,11 +175,11 @@ fn a_plan_is_explained_before_it_is_refused_and_nonsense_is_no_size() {
 
 #[test]
 #[ignore = "needs time"]
-fn a_run_killed_at_any_moment_leaves_nothing_that_the_next_one_does_not_clean_up() {
-    let workplace = prepared();
+fn next_run_cleans_up_after_a_killed_run() {
+    let workplace = scene_workplace();
     let request = "--cameras cameras.json --split all --set frame_stride=24 --ratio 0.5 -o small.gseq";
-    let least = least(&workplace, &format!("compress packed.gseq {request}"));
-    let arguments = format!("compress packed.gseq {request} --memory {least}MiB");
+    let minimum_memory = minimum_memory(&workplace, &format!("compress packed.gseq {request}"));
+    let arguments = format!("compress packed.gseq {request} --memory {minimum_memory}MiB");
     let start = Instant::now();
     workplace.done(&arguments);
     let whole = start.elapsed();
@@ -209,7 +210,7 @@ fn a_run_killed_at_any_moment_leaves_nothing_that_the_next_one_does_not_clean_up
         if kill % 2 == 0 {
             std::thread::sleep(whole * (kill + 1) / KILLS);
         } else {
-            // What the run before left is gone once this one has begun, and the result is next.
+            // The next run first removes the temporary files of the run before; then its own temporary files appear.
             std::thread::sleep(whole / 4);
             while !unfinished() && child.try_wait().unwrap().is_none() {
                 std::thread::sleep(Duration::from_millis(1));

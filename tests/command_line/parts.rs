@@ -1,4 +1,4 @@
-//! Work that is divided among runs: whatever the number of parts and their order, the same bytes as one run's.
+//! Tests of work divided into shards: for any number and order of shards the joined result has the bytes of one run.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -10,11 +10,11 @@ use splatsieve::models::trajectories::write_sequence;
 use splatsieve::outputs::kind::OutputKind;
 use splatsieve::progress::Events;
 
-/// More than two frame blocks, one of them not full.
+/// Number of frames: two full frame blocks and one that is not full.
 const FRAMES: usize = 70;
 
-/// A folder with `scene.gseq`, `smaller.gseq` of fewer Gaussians, and `cameras.json`: small pictures of three views, of which
-/// one ends after 40 frames.
+/// Returns a folder with `scene.gseq`, `smaller.gseq` with fewer Gaussians, and `cameras.json`: small images of three
+/// views, of which one ends after 40 frames.
 fn workplace(gaussians: usize) -> Workplace {
     let workplace = Workplace::new();
     let made = Scene::new(gaussians, FRAMES);
@@ -39,18 +39,18 @@ fn workplace(gaussians: usize) -> Workplace {
     workplace
 }
 
-/// The numbers of parts that are tried. Of most stages there are fewer units than the last.
-const NUMBERS: [usize; 4] = [1, 2, 7, 64];
+/// Numbers of shards to test. Most stages have fewer units of work than the largest.
+const SHARD_COUNTS: [usize; 4] = [1, 2, 7, 64];
 
-/// Runs every part of `of` of `line`, the last first, until there is nothing to do any more, and the first once more; gives
-/// what the runs said.
-fn run_parts(workplace: &Workplace, line: &str, of: usize) -> Vec<String> {
+/// Runs all `count` shards of `line`, in descending order and then shard 1 again, until none has work left. Returns the
+/// outputs of all runs.
+fn run_parts(workplace: &Workplace, line: &str, count: usize) -> Vec<String> {
     let mut said = Vec::new();
     for _ in 0..100 {
-        let round: Vec<String> = (1..=of)
+        let round: Vec<String> = (1..=count)
             .rev()
             .chain([1])
-            .map(|index| workplace.done(&format!("--quiet {line} --cache work --shard {index}/{of}")))
+            .map(|index| workplace.done(&format!("--quiet {line} --cache work --shard {index}/{count}")))
             .collect();
         let is_done = round.iter().all(|said| said.contains("nothing to do"));
         said.extend(round);
@@ -61,8 +61,9 @@ fn run_parts(workplace: &Workplace, line: &str, of: usize) -> Vec<String> {
     panic!("{line}: parts without end: {:?}", said.last());
 }
 
-/// What `line`, which writes `output`, says and writes by itself, and that of a run that joins parts is the same.
-fn joins_to_the_same(workplace: &Workplace, line: &str, output: &str, numbers: &[usize]) {
+/// Checks that `line`, which writes `output`, prints and writes the same by itself and after its shards were computed
+/// separately.
+fn assert_joined_equals_single_run(workplace: &Workplace, line: &str, output: &str, numbers: &[usize]) {
     let run = |more: &str| {
         let said = workplace.done(&format!("--quiet {line} {more}"));
         let path = workplace.path(output);
@@ -71,39 +72,39 @@ fn joins_to_the_same(workplace: &Workplace, line: &str, output: &str, numbers: &
         (said, written)
     };
     let (said, written) = run("");
-    for &of in numbers {
+    for &count in numbers {
         _ = fs::remove_dir_all(workplace.path("work"));
-        run_parts(workplace, line, of);
-        assert!(!workplace.path(output).exists(), "{line}: a part of {of} wrote the output");
+        run_parts(workplace, line, count);
+        assert!(!workplace.path(output).exists(), "{line}: a part of {count} wrote the output");
         for what in ["joined", "found again"] {
             let (said_now, written_now) = run("--cache work");
-            assert_eq!(said, said_now, "{line}: {what} of {of} parts");
-            assert!(written == written_now, "{line}: {what} of {of} parts, other bytes");
+            assert_eq!(said, said_now, "{line}: {what} of {count} parts");
+            assert!(written == written_now, "{line}: {what} of {count} parts, other bytes");
         }
     }
 }
 
 #[test]
-fn an_evaluation_in_parts_is_that_of_one_run() {
+fn evaluation_in_shards_equals_one_run() {
     let workplace = workplace(300);
     workplace.done("--quiet render scene.gseq --cameras cameras.json --all --split all -o photographs");
     let models = "evaluate scene.gseq smaller.gseq --cameras cameras.json --csv scores.csv";
     for line in [
         format!("{models} --max-frames 9 --split all --json --flip --ground-truth photographs"),
-        // 24 pictures, and one view that is not in the last ones.
+        // 24 images; one view has none of the last frames.
         models.to_owned(),
     ] {
-        joins_to_the_same(&workplace, &line, "scores.csv", &NUMBERS);
+        assert_joined_equals_single_run(&workplace, &line, "scores.csv", &SHARD_COUNTS);
     }
 }
 
 #[test]
-fn a_report_in_parts_is_that_of_one_run_and_shares_the_parts_of_evaluate() {
+fn report_in_shards_equals_one_run_and_reuses_evaluate() {
     let workplace = workplace(300);
     workplace.done("--quiet compress scene.gseq --cameras cameras.json --no-refine -o small.gseq --ratio 0.6");
     let models = "scene.gseq small.gseq --cameras cameras.json";
     let rest = "--max-frames 9 --split all --flip";
-    joins_to_the_same(&workplace, &format!("report {models} {rest} -o page"), "page", &[1, 2, 7]);
+    assert_joined_equals_single_run(&workplace, &format!("report {models} {rest} -o page"), "page", &[1, 2, 7]);
 
     _ = fs::remove_dir_all(workplace.path("work"));
     run_parts(&workplace, &format!("evaluate {models} {rest}"), 3);
@@ -112,7 +113,8 @@ fn a_report_in_parts_is_that_of_one_run_and_shares_the_parts_of_evaluate() {
     };
     let said = part(2);
     assert!(said.contains("scan: part 2/3 is done"), "the comparison is there: {said}");
-    // Until the pictures are looked at again; of these two parts are made, and the run that joins names and makes the third.
+    // Computes shards until the stage that measures failures comes, then two of its three shards; the joining run names
+    // the third and computes it.
     let mut others = 0;
     while !part(1).contains("failure: part 1/3") {
         part(2);
@@ -129,24 +131,24 @@ fn a_report_in_parts_is_that_of_one_run_and_shares_the_parts_of_evaluate() {
 }
 
 #[test]
-fn a_container_packed_in_parts_is_that_of_one_run() {
+fn container_packed_in_shards_equals_one_run() {
     let workplace = workplace(1500);
     for how in ["", "--raw", "--max-error position=0.1%,sh=1e-2"] {
-        joins_to_the_same(&workplace, &format!("convert scene.gseq packed.gseq {how}"), "packed.gseq", &NUMBERS);
+        assert_joined_equals_single_run(&workplace, &format!("convert scene.gseq packed.gseq {how}"), "packed.gseq", &SHARD_COUNTS);
     }
-    joins_to_the_same(&workplace, "convert {tiny} packed.gseq", "packed.gseq", &[2]);
+    assert_joined_equals_single_run(&workplace, "convert {tiny} packed.gseq", "packed.gseq", &[2]);
 }
 
 #[test]
-fn pictures_rendered_in_parts_are_those_of_one_run() {
+fn renders_in_shards_equal_one_run() {
     let workplace = workplace(300);
     let line = "render scene.gseq --cameras cameras.json --all -o pictures";
-    joins_to_the_same(&workplace, line, "pictures", &NUMBERS);
-    joins_to_the_same(&workplace, &format!("{line} --as npy"), "pictures", &[2]);
+    assert_joined_equals_single_run(&workplace, line, "pictures", &SHARD_COUNTS);
+    assert_joined_equals_single_run(&workplace, &format!("{line} --as npy"), "pictures", &[2]);
 }
 
 #[test]
-fn a_missing_part_is_named_and_made_by_the_run_that_joins() {
+fn missing_shard_is_named_and_computed_when_joining() {
     let workplace = workplace(300);
     let line = "render scene.gseq --cameras cameras.json --all -o pictures --cache work";
     for index in [1, 3, 4] {
@@ -166,15 +168,15 @@ fn a_missing_part_is_named_and_made_by_the_run_that_joins() {
     assert!(files(&workplace.path("pictures")) == files(&workplace.path("other")));
 }
 
-/// Parts of `stage` that the work folder lists, by key.
-fn listed(workplace: &Workplace, stage: &str) -> BTreeSet<String> {
-    let listed: Value = serde_json::from_str(&workplace.done("work work --json")).unwrap();
-    let of_stage = listed.as_array().unwrap().iter().filter(|of| of["stage"] == stage);
-    of_stage.map(|of| of["key"].as_str().unwrap().to_owned()).collect()
+/// Returns the keys of the cached shards of `stage`.
+fn cached_shards(workplace: &Workplace, stage: &str) -> BTreeSet<String> {
+    let cached_shards: Value = serde_json::from_str(&workplace.done("work work --json")).unwrap();
+    let of_stage = cached_shards.as_array().unwrap().iter().filter(|entry| entry["stage"] == stage);
+    of_stage.map(|entry| entry["key"].as_str().unwrap().to_owned()).collect()
 }
 
 #[test]
-fn parts_of_other_inputs_and_options_are_not_taken() {
+fn shards_of_other_inputs_and_options_are_not_used() {
     let workplace = workplace(300);
     workplace.done("--quiet render scene.gseq --cameras cameras.json --all --split all -o photographs");
     fs::copy(workplace.path("scene.gseq"), workplace.path("same.gseq")).unwrap();
@@ -195,9 +197,9 @@ fn parts_of_other_inputs_and_options_are_not_taken() {
     for (done, line) in lines.iter().enumerate() {
         assert!(evaluate(line).contains("part 1/2 is done"), "{line}");
         assert!(evaluate(line).contains("part 1/2 is there already"), "{line}");
-        assert_eq!(listed(&workplace, "evaluate").len(), done + 1, "{line}");
+        assert_eq!(cached_shards(&workplace, "evaluate").len(), done + 1, "{line}");
     }
-    // A photograph that was changed is another; a model under another name is not.
+    // A changed photograph changes the cache key; another file name of the same model does not.
     fs::copy(workplace.path("photographs/t000_v00.png"), workplace.path("photographs/t007_v00.png")).unwrap();
     assert!(evaluate(&photographs).contains("part 1/2 is done"));
     assert!(evaluate("same.gseq smaller.gseq --cameras cameras.json").contains("part 1/2 is there already"));
@@ -208,7 +210,7 @@ fn parts_of_other_inputs_and_options_are_not_taken() {
             .enumerate()
     {
         assert!(pack(line).contains("part 1/2 is done"), "{line}");
-        assert_eq!(listed(&workplace, "pack").len(), done + 1, "{line}");
+        assert_eq!(cached_shards(&workplace, "pack").len(), done + 1, "{line}");
     }
     let render = |line: &str| {
         workplace.done(&format!("--quiet render {line} --cameras cameras.json --all -o x --cache work --shard 1/2"))
@@ -219,12 +221,12 @@ fn parts_of_other_inputs_and_options_are_not_taken() {
             .enumerate()
     {
         assert!(render(line).contains("part 1/2 is done"), "{line}");
-        assert_eq!(listed(&workplace, "render").len(), done + 1, "{line}");
+        assert_eq!(cached_shards(&workplace, "render").len(), done + 1, "{line}");
     }
 }
 
-/// Flips a byte in the middle of every piece of the work folder; gives how many there are.
-fn damage(workplace: &Workplace) -> usize {
+/// Flips a byte in the middle of every cache entry. Returns the number of entries.
+fn damage_cache_entries(workplace: &Workplace) -> usize {
     let pieces: Vec<_> = fs::read_dir(workplace.path("work")).unwrap().map(|entry| entry.unwrap().path()).collect();
     for path in &pieces {
         let mut bytes = fs::read(path).unwrap();
@@ -236,7 +238,7 @@ fn damage(workplace: &Workplace) -> usize {
 }
 
 #[test]
-fn damaged_parts_are_made_again() {
+fn damaged_shards_are_computed_again() {
     let workplace = workplace(300);
     for (line, output) in [
         ("evaluate scene.gseq smaller.gseq --cameras cameras.json --csv out", "out"),
@@ -249,12 +251,12 @@ fn damaged_parts_are_made_again() {
         workplace.done(&format!("--quiet {line}"));
         let whole = content();
         run_parts(&workplace, &format!("{line} --overwrite"), 3);
-        assert!(damage(&workplace) >= 4, "{line}");
+        assert!(damage_cache_entries(&workplace) >= 4, "{line}");
         let run = workplace.run(&format!("--quiet {line} --cache work --overwrite"));
         assert!(run.code == 0 && (run.stderr.contains("is damaged") || output == "out.gseq"), "{line}: {}", run.stderr);
         assert!(content() == whole, "{line}: other bytes");
-        // What a run has joined may be damaged, too.
-        damage(&workplace);
+        // Joined entries may be damaged, too.
+        damage_cache_entries(&workplace);
         assert_eq!(workplace.run(&format!("--quiet {line} --cache work --overwrite")).code, 0, "{line}");
         assert!(content() == whole, "{line}: other bytes");
         workplace.done("work work --clean");
@@ -262,44 +264,44 @@ fn damaged_parts_are_made_again() {
     }
 }
 
-/// What compressing in parts gives is what one run gives; gives the stages that were divided.
-fn compresses_to_the_same(workplace: &Workplace, line: &str, numbers: &[usize]) -> BTreeSet<String> {
+/// Checks that compressing in shards writes what one run writes. Returns the stages that were divided.
+fn assert_compresses_the_same(workplace: &Workplace, line: &str, numbers: &[usize]) -> BTreeSet<String> {
     let compress = format!("compress scene.gseq --cameras cameras.json -o out.gseq {line}");
     let outputs = ["out.gseq", "out.gseq.index_map.npy", "out.gseq.recipe.toml"];
     let written = || outputs.map(|name| fs::read(workplace.path(name)).unwrap());
     workplace.done(&format!("--quiet {compress} --overwrite"));
     let whole = written();
     let mut stages = BTreeSet::new();
-    for &of in numbers {
+    for &count in numbers {
         fs::remove_file(workplace.path("out.gseq")).unwrap();
         _ = fs::remove_dir_all(workplace.path("work"));
-        let said = run_parts(workplace, &format!("{compress} --overwrite"), of);
+        let said = run_parts(workplace, &format!("{compress} --overwrite"), count);
         assert!(!workplace.path("out.gseq").exists());
         stages.extend(said.iter().filter_map(|said| Some(said.split_once(": part ")?.0.to_owned())));
         workplace.done(&format!("--quiet {compress} --overwrite --cache work"));
-        assert!(written() == whole, "{line}: other bytes of {of} parts");
+        assert!(written() == whole, "{line}: other bytes of {count} parts");
     }
     stages
 }
 
 #[test]
-fn compressing_in_parts_gives_what_one_run_gives() {
+fn compressing_in_shards_equals_one_run() {
     let workplace = workplace(600);
-    let stages = compresses_to_the_same(&workplace, "--no-refine --ratio 0.7", &[2, 7]);
+    let stages = assert_compresses_the_same(&workplace, "--no-refine --ratio 0.7", &[2, 7]);
     assert!(["scan", "visible", "rounds-01", "rounds-02"].iter().all(|stage| stages.contains(*stage)), "{stages:?}");
-    let stages = compresses_to_the_same(&workplace, "--no-refine --ratio 0.85", &[64]);
+    let stages = assert_compresses_the_same(&workplace, "--no-refine --ratio 0.85", &[64]);
     assert!(stages.contains("rounds-01"), "{stages:?}");
 }
 
 #[test]
 #[ignore = "needs time"]
-fn pairs_measured_in_parts_merge_as_in_one_run() {
+fn pairs_measured_in_shards_merge_as_in_one_run() {
     let workplace = Workplace::new();
     workplace.done("--quiet demo -o demo --gaussians 40000 --frames 6 --no-refine");
     for name in ["scene.gseq", "cameras.json"] {
         fs::rename(workplace.path("demo").join(name), workplace.path(name)).unwrap();
     }
-    let stages = compresses_to_the_same(&workplace, "--preset paper --ratio 0.6", &[2, 7]);
+    let stages = assert_compresses_the_same(&workplace, "--preset paper --ratio 0.6", &[2, 7]);
     assert_eq!(stages.iter().collect::<Vec<_>>(), ["pairs", "scan"]);
 }
 
@@ -309,26 +311,26 @@ fn divided_stages_are_listed_with_their_units() {
     let list = |line: &str| {
         workplace.done(&format!("--quiet compress scene.gseq --cameras cameras.json -o out.gseq --list-stages {line}"))
     };
-    let listed = list("--no-refine --ratio 0.7");
-    let lines: Vec<&str> = listed.lines().collect();
+    let cached_shards = list("--no-refine --ratio 0.7");
+    let lines: Vec<&str> = cached_shards.lines().collect();
     assert_eq!(lines[0], "scan: 2 blocks of Gaussians");
-    assert!(lines[1].starts_with("visible: ") && lines[1].ends_with(" pictures"), "{listed}");
-    assert!(lines[2].starts_with("rounds-01: ") && lines.contains(&"pairs: pairs of neighbors"), "{listed}");
+    assert!(lines[1].starts_with("visible: ") && lines[1].ends_with(" pictures"), "{cached_shards}");
+    assert!(lines[2].starts_with("rounds-01: ") && lines.contains(&"pairs: pairs of neighbors"), "{cached_shards}");
     assert_eq!(list("--preset paper"), "scan: 2 blocks of Gaussians\npairs: pairs of neighbors\n");
     assert!(list("").contains("targets: pictures"));
     workplace.refused(2, "compress scene.gseq -o out.gseq --list-stages --cache work --shard 1/2", &["--shard"]);
 }
 
 #[test]
-fn a_work_folder_is_listed_and_cleaned() {
+fn cache_folder_is_listed_and_cleaned() {
     let workplace = workplace(300);
     workplace.done("--quiet convert scene.gseq packed.gseq --cache work --shard 2/3");
     let text = workplace.done("work work");
     assert!(text.starts_with("scene.gseq (splatsieve ") && text.contains("3 parts, missing: 1, 3"), "{text}");
-    let listed: Value = serde_json::from_str(&workplace.done("work work --json")).unwrap();
-    let pack = listed.as_array().unwrap().iter().find(|of| of["stage"] == "pack").unwrap();
+    let cached_shards: Value = serde_json::from_str(&workplace.done("work work --json")).unwrap();
+    let pack = cached_shards.as_array().unwrap().iter().find(|entry| entry["stage"] == "pack").unwrap();
     assert_eq!((&pack["parts"], &pack["missing"], &pack["damaged"]), (&json!(3), &json!([1, 3]), &json!([])));
-    damage(&workplace);
+    damage_cache_entries(&workplace);
     assert!(workplace.done("work work").contains("damaged: 2"));
     fs::write(workplace.path("work/mine.txt"), "kept").unwrap();
     assert!(workplace.done("work work --clean").starts_with("work: 2 files, "));
@@ -341,7 +343,7 @@ fn a_work_folder_is_listed_and_cleaned() {
 }
 
 #[test]
-fn what_cannot_be_divided_is_refused() {
+fn indivisible_commands_refuse_shards() {
     let workplace = workplace(300);
     for (line, part) in [
         ("convert - x.gseq --cache work", "splatsieve convert - NAME.gseq"),

@@ -1,6 +1,7 @@
-//! Runs that are cut short, and go on from their work folder: the same bytes, and nothing done twice that was done.
+//! Tests of runs that are interrupted and resumed from their cache: they write the same bytes and repeat no finished
+//! work.
 //!
-//! `SPLATSIEVE_PROGRAM` names another program to run than the one built with this test: an optimized one.
+//! `SPLATSIEVE_PROGRAM` may name an optimized program to run in place of the one built with this test.
 
 use std::collections::BTreeMap;
 use std::ffi::OsString;
@@ -12,8 +13,9 @@ use std::time::{Duration, Instant, SystemTime};
 
 use crate::scene::{Workplace, program};
 
-/// A scene of many Gaussians for its size on the disk, and a run of all that can be kept.
-const RUN: &str = "compress scene/scene.gseq --cameras scene/cameras.json --quiet --ratio 0.2 --set refine_steps=150";
+/// Run with many Gaussians for the file size of its scene, in which every stage can be cached.
+const RUN: &str =
+    "compress scene/scene.gseq --cameras scene/cameras.json --quiet --ratio 0.2 --set refine_steps=150";
 
 fn command(workplace: &Workplace, arguments: &str) -> Command {
     let mut command = Command::new(program());
@@ -22,23 +24,23 @@ fn command(workplace: &Workplace, arguments: &str) -> Command {
     command
 }
 
-fn ran(workplace: &Workplace, arguments: &str) -> Output {
+fn run_program(workplace: &Workplace, arguments: &str) -> Output {
     command(workplace, arguments).output().unwrap()
 }
 
-fn told(output: &Output) -> String {
+fn stderr_text(output: &Output) -> String {
     String::from_utf8_lossy(&output.stderr).into_owned()
 }
 
-fn made(gaussians: usize) -> Workplace {
+fn workplace_with_scene(gaussians: usize) -> Workplace {
     let workplace = Workplace::new();
-    let output = ran(&workplace, &format!("demo --gaussians {gaussians} --frames 8 -o scene --quiet --no-refine"));
-    assert!(output.status.success(), "{}", told(&output));
+    let output = run_program(&workplace, &format!("demo --gaussians {gaussians} --frames 8 -o scene --quiet --no-refine"));
+    assert!(output.status.success(), "{}", stderr_text(&output));
     workplace
 }
 
-/// A result but for its summary, in which times are.
-fn result(workplace: &Workplace, name: &str) -> BTreeMap<OsString, Vec<u8>> {
+/// Returns the files of a result except its summary, which contains times.
+fn result_files(workplace: &Workplace, name: &str) -> BTreeMap<OsString, Vec<u8>> {
     let mut found = BTreeMap::new();
     for ending in ["", ".recipe.toml", ".index_map.npy"] {
         let path = workplace.path(&format!("{name}{ending}"));
@@ -47,23 +49,23 @@ fn result(workplace: &Workplace, name: &str) -> BTreeMap<OsString, Vec<u8>> {
     found
 }
 
-/// Every piece of a work folder, but for those that are written over while their stage goes on: when it was written.
-fn pieces(folder: &Path) -> BTreeMap<String, SystemTime> {
+/// Returns the time of writing of every cache entry, except entries that are overwritten while their stage runs.
+fn cache_entries(folder: &Path) -> BTreeMap<String, SystemTime> {
     let Ok(entries) = fs::read_dir(folder) else { return BTreeMap::new() };
-    let of =
+    let entry_time =
         |entry: fs::DirEntry| Some((entry.file_name().into_string().ok()?, entry.metadata().ok()?.modified().ok()?));
-    let entries = entries.filter_map(|entry| of(entry.unwrap()));
+    let entries = entries.filter_map(|entry| entry_time(entry.unwrap()));
     entries.filter(|(name, _)| name.ends_with(".piece") && !name.starts_with("refine-steps.")).collect()
 }
 
-/// Kills a run with a work folder at `kills` moments, spread over as many runs as that takes.
-fn killed(gaussians: usize, kills: usize) {
-    let workplace = made(gaussians);
+/// Kills runs with a cache at `kills` moments in total, over as many complete runs as that takes.
+fn check_killed_runs(gaussians: usize, kills: usize) {
+    let workplace = workplace_with_scene(gaussians);
     let start = Instant::now();
-    let output = ran(&workplace, &format!("{RUN} -o plain.gseq"));
+    let output = run_program(&workplace, &format!("{RUN} -o plain.gseq"));
     let whole = start.elapsed();
-    assert!(output.status.success(), "{}", told(&output));
-    let expected = result(&workplace, "plain.gseq");
+    assert!(output.status.success(), "{}", stderr_text(&output));
+    let expected = result_files(&workplace, "plain.gseq");
     let (mut done, mut runs, mut steps) = (0, 0, 0);
     while done < kills {
         runs += 1;
@@ -72,7 +74,7 @@ fn killed(gaussians: usize, kills: usize) {
         let mut kept = BTreeMap::new();
         let ended = loop {
             let mut child = command(&workplace, &arguments).spawn().unwrap();
-            // Moments of all lengths, the same in every run of this test.
+            // Moments spread over the whole run, the same in every execution of this test.
             let part = (0.05 + 0.618_034 * (done + runs) as f64).fract();
             sleep(whole.mul_f64(0.5 * part));
             if let Some(_ended) = child.try_wait().unwrap() {
@@ -81,7 +83,7 @@ fn killed(gaussians: usize, kills: usize) {
             child.kill().unwrap();
             child.wait().unwrap();
             done += 1;
-            let now = pieces(&work);
+            let now = cache_entries(&work);
             for (name, written) in &kept {
                 assert_eq!(now.get(name), Some(written), "{name} was computed again, or has gone");
             }
@@ -93,8 +95,8 @@ fn killed(gaussians: usize, kills: usize) {
             }));
             assert!(done < 20 * kills, "it never ends");
         };
-        assert!(ended.status.success(), "{}", told(&ended));
-        assert_eq!(result(&workplace, &target), expected, "run {runs}");
+        assert!(ended.status.success(), "{}", stderr_text(&ended));
+        assert_eq!(result_files(&workplace, &target), expected, "run {runs}");
     }
     println!("{done} kills in {runs} runs of {:.1} s, {steps} of them while steps were kept", whole.as_secs_f64());
     assert!(steps > 0, "nothing was refined yet, whenever it was killed");
@@ -102,62 +104,61 @@ fn killed(gaussians: usize, kills: usize) {
 
 #[test]
 #[ignore = "needs time"]
-fn a_run_killed_at_some_moments_goes_on_and_writes_the_same_bytes() {
-    killed(700, 6);
+fn resumed_run_writes_the_same_bytes() {
+    check_killed_runs(700, 6);
 }
 
 #[test]
 #[ignore = "slow: some minutes"]
-fn slow_a_run_killed_at_50_moments_goes_on_and_writes_the_same_bytes() {
-    killed(4000, 50);
+fn slow_run_resumed_50_times_writes_the_same_bytes() {
+    check_killed_runs(4000, 50);
 }
 
 #[cfg(unix)]
 #[test]
-fn a_run_told_to_end_leaves_a_valid_folder_and_exits_with_143() {
-    let workplace = made(700);
+fn terminated_run_leaves_a_valid_cache_and_exits_143() {
+    let workplace = workplace_with_scene(700);
     let arguments = format!("{RUN} -o told.gseq --cache work");
     let child = command(&workplace, &arguments).spawn().unwrap();
-    while pieces(&workplace.path("work")).len() < 4 {
+    while cache_entries(&workplace.path("work")).len() < 4 {
         sleep(Duration::from_millis(5));
     }
     Command::new("kill").args(["-TERM", &child.id().to_string()]).status().unwrap();
     let output = child.wait_with_output().unwrap();
-    assert_eq!(output.status.code(), Some(143), "{}", told(&output));
-    let listed = ran(&workplace, "work work --json");
+    assert_eq!(output.status.code(), Some(143), "{}", stderr_text(&output));
+    let listed = run_program(&workplace, "work work --json");
     let listed: serde_json::Value = serde_json::from_slice(&listed.stdout).unwrap();
     let listed = listed.as_array().unwrap();
     assert!(listed.len() >= 4 && listed.iter().all(|of| of["damaged"].as_array().unwrap().is_empty()), "{listed:?}");
-    assert!(ran(&workplace, &arguments).status.success());
-    assert!(ran(&workplace, &format!("{RUN} -o plain.gseq")).status.success());
-    assert_eq!(result(&workplace, "told.gseq"), result(&workplace, "plain.gseq"));
+    assert!(run_program(&workplace, &arguments).status.success());
+    assert!(run_program(&workplace, &format!("{RUN} -o plain.gseq")).status.success());
+    assert_eq!(result_files(&workplace, "told.gseq"), result_files(&workplace, "plain.gseq"));
 }
 
 #[test]
-fn two_runs_in_one_work_folder_write_the_same_bytes() {
-    let workplace = made(700);
+fn two_runs_with_one_cache_write_the_same_bytes() {
+    let workplace = workplace_with_scene(700);
     let runs = ["one", "two", "three"]
         .map(|name| (name, command(&workplace, &format!("{RUN} -o {name}.gseq --cache work")).spawn().unwrap()));
     for (name, child) in runs {
         let output = child.wait_with_output().unwrap();
-        assert!(output.status.success(), "{name}: {}", told(&output));
+        assert!(output.status.success(), "{name}: {}", stderr_text(&output));
     }
-    let [one, two, three] = ["one", "two", "three"].map(|name| result(&workplace, &format!("{name}.gseq")));
+    let [one, two, three] = ["one", "two", "three"].map(|name| result_files(&workplace, &format!("{name}.gseq")));
     assert!(one == two && two == three);
     let left = fs::read_dir(workplace.path("work")).unwrap().map(|entry| entry.unwrap().file_name());
     assert!(left.into_iter().all(|name| name.to_str().unwrap().ends_with(".piece")), "something unfinished is left");
 }
 
 #[test]
-fn a_changed_recipe_computes_only_what_depends_on_it() {
-    let workplace = made(700);
+fn changed_recipe_recomputes_only_dependent_stages() {
+    let workplace = workplace_with_scene(700);
     let run = |name: &str, options: &str| {
-        let before = pieces(&workplace.path("work"));
-        let run = RUN
-            .replace("--set refine_steps=150", if options.contains("steps") { "" } else { "--set refine_steps=150" });
-        let output = ran(&workplace, &format!("{run} -o {name}.gseq --cache work {options}"));
-        assert!(output.status.success(), "{}", told(&output));
-        let after = pieces(&workplace.path("work"));
+        let before = cache_entries(&workplace.path("work"));
+        let run = RUN.replace("--set refine_steps=150", if options.contains("steps") { "" } else { "--set refine_steps=150" });
+        let output = run_program(&workplace, &format!("{run} -o {name}.gseq --cache work {options}"));
+        assert!(output.status.success(), "{}", stderr_text(&output));
+        let after = cache_entries(&workplace.path("work"));
         assert!(before.iter().all(|(name, written)| after.get(name) == Some(written)), "a piece was written again");
         let stage = |name: &String| {
             name.split('.').next().unwrap().trim_end_matches(|c: char| "-0123456789".contains(c)).to_owned()
@@ -174,7 +175,8 @@ fn a_changed_recipe_computes_only_what_depends_on_it() {
     let no_steps =
         |new: Vec<String>| new.into_iter().filter(|name| name != "refine-cut" && name != "bands").collect::<Vec<_>>();
     assert_eq!(no_steps(run("steps", "--set refine_steps=160")), ["refine"]);
-    // Frames and targets are not read again; what was ranked by fewer pictures is, and what follows only if it differs.
+    // Frames and target views are not read again. Ranking by fewer views is computed again; later stages only if the
+    // ranking differs.
     let look = run("look", "--set look_pictures=12");
     let is_new = |stage: &str| look.iter().any(|name| name == stage);
     assert!(is_new("visible") && is_new("score") && is_new("rounds"), "{look:?}");
@@ -184,26 +186,26 @@ fn a_changed_recipe_computes_only_what_depends_on_it() {
 }
 
 #[test]
-fn a_stream_cannot_be_gone_on_with_and_a_part_needs_a_folder() {
+fn streams_cannot_resume_and_shards_need_a_cache() {
     let workplace = Workplace::new();
-    let output = ran(&workplace, "compress - -o out.gseq --cache work");
+    let output = run_program(&workplace, "compress - -o out.gseq --cache work");
     assert_eq!(output.status.code(), Some(2));
-    assert!(told(&output).contains("splatsieve convert -"), "{}", told(&output));
+    assert!(stderr_text(&output).contains("splatsieve pack -"), "{}", stderr_text(&output));
     for (arguments, part) in [
         ("compress in.gseq -o out.gseq --shard 1/2", "--cache"),
         ("compress in.gseq -o out.gseq --cache work --shard 3/2", "3/8"),
         ("work nowhere", "nowhere"),
     ] {
-        let output = ran(&workplace, arguments);
-        assert!(!output.status.success() && told(&output).contains(part), "{arguments}: {}", told(&output));
+        let output = run_program(&workplace, arguments);
+        assert!(!output.status.success() && stderr_text(&output).contains(part), "{arguments}: {}", stderr_text(&output));
     }
 }
 
-/// A disk that is full, of its own: where the system lets a test make one.
+/// A small full file system of its own, if the system allows tests to mount one.
 #[test]
 #[ignore = "needs namespaces of process ids"]
-fn a_full_disk_under_the_work_folder_is_named_and_more_room_goes_on() {
-    let workplace = made(700);
+fn full_cache_disk_is_named_and_a_larger_one_resumes() {
+    let workplace = workplace_with_scene(700);
     fs::create_dir(workplace.path("disk")).unwrap();
     let run = format!("{RUN} -o full.gseq --cache disk/work");
     let script = format!(
@@ -212,9 +214,9 @@ fn a_full_disk_under_the_work_folder_is_named_and_more_room_goes_on() {
     );
     let mut shell = crate::unshare(&["-m"]);
     let output = shell.args(["sh", "-c", &script]).current_dir(workplace.path("")).output().unwrap();
-    let told = told(&output);
-    assert!(output.status.success(), "{told}");
-    assert!(told.contains("code 1") && told.contains("disk/work") && told.contains("No space left"), "{told}");
-    assert!(ran(&workplace, &format!("{RUN} -o plain.gseq")).status.success());
-    assert_eq!(result(&workplace, "full.gseq"), result(&workplace, "plain.gseq"));
+    let stderr_text = stderr_text(&output);
+    assert!(output.status.success(), "{stderr_text}");
+    assert!(stderr_text.contains("code 1") && stderr_text.contains("disk/work") && stderr_text.contains("No space left"), "{stderr_text}");
+    assert!(run_program(&workplace, &format!("{RUN} -o plain.gseq")).status.success());
+    assert_eq!(result_files(&workplace, "full.gseq"), result_files(&workplace, "plain.gseq"));
 }

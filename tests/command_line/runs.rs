@@ -1,12 +1,13 @@
-//! What a run says about itself is true: its recipe repeats it, its summary reads back, its plan of reads holds, and a
-//! dry run says what the run would say.
+//! Tests of what a run states about itself: its recipe repeats it, its summary can be read back, its planned number of
+//! reads holds, and a dry run states what the run states.
 
 use crate::scene::{Run, Workplace, lasting_files, shared};
 use serde_json::Value;
 use splatsieve::pipeline::summary::{SCHEMA, Summary};
 
-/// Runs a compression twice: as asked, then by the recipe it wrote, and expects the same files.
-fn repeats(workplace: &Workplace, name: &str, arguments: &str) -> Run {
+/// Runs a compression as asked and again with the recipe it wrote, and checks that both write the same files. Returns
+/// the first run.
+fn assert_recipe_repeats(workplace: &Workplace, name: &str, arguments: &str) -> Run {
     let first = workplace.run(&format!("compress {arguments} -o {name}_first"));
     assert_eq!(first.code, 0, "{}", first.stderr);
     let input = arguments.split_whitespace().next().unwrap();
@@ -14,7 +15,7 @@ fn repeats(workplace: &Workplace, name: &str, arguments: &str) -> Run {
         true => format!("{name}_first/recipe.toml"),
         false => format!("{name}_first.recipe.toml"),
     };
-    // A recipe names no folder far from itself, so cameras that lie elsewhere are given again.
+    // A recipe does not name folders outside its own, so the cameras are given again.
     let cameras = if arguments.contains("--cameras {tiny}") { "--cameras {tiny}" } else { "" };
     let again = workplace.run(&format!("compress {input} --recipe {recipe} {cameras} -o {name}_again"));
     assert_eq!(again.code, 0, "{}", again.stderr);
@@ -25,7 +26,7 @@ fn repeats(workplace: &Workplace, name: &str, arguments: &str) -> Run {
 }
 
 #[test]
-fn the_recipe_beside_a_result_repeats_its_run() {
+fn recipe_beside_a_result_repeats_its_run() {
     let workplace = Workplace::new();
     for (k, options) in [
         "--cameras {tiny} --ratio 0.4",
@@ -39,13 +40,13 @@ fn the_recipe_beside_a_result_repeats_its_run() {
     .iter()
     .enumerate()
     {
-        let run = repeats(&workplace, &format!("run{k}"), &format!("{{tiny}} {options}"));
+        let run = assert_recipe_repeats(&workplace, &format!("run{k}"), &format!("{{tiny}} {options}"));
         assert!(!run.stdout.contains("another input"), "{}", run.stdout);
     }
 }
 
 #[test]
-fn a_recipe_of_another_input_is_noted_and_flags_go_before_it() {
+fn flags_override_recipes_and_foreign_recipes_are_noted() {
     let workplace = Workplace::new();
     workplace.done("compress {tiny} --cameras {tiny} --ratio 0.5 -o half");
     workplace.done("demo --gaussians 600 --frames 4 -o demo");
@@ -59,7 +60,7 @@ fn a_recipe_of_another_input_is_noted_and_flags_go_before_it() {
 }
 
 #[test]
-fn a_summary_reads_back_as_it_was_written_and_says_its_schema() {
+fn summary_reads_back_and_names_its_schema() {
     let workplace = Workplace::new();
     workplace.done("demo --gaussians 900 --frames 6 -o demo");
     for (k, options) in ["", "--preset strong", "--preset paper", "--prune-only"].iter().enumerate() {
@@ -80,7 +81,7 @@ fn every_field_of_a_summary_is_described() {
     let described = include_str!("../../format/SUMMARY.md");
     let mut pending = vec![("".to_owned(), &summary)];
     while let Some((name, value)) = pending.pop() {
-        // Counts of a pass are described where they are counted.
+        // The counts inside `passes` are described in another place.
         let inner: Vec<(String, &Value)> = match value {
             Value::Object(fields) if name != "passes" => fields.iter().map(|(k, v)| (k.clone(), v)).collect(),
             Value::Array(values) => values.iter().map(|value| (name.clone(), value)).collect(),
@@ -94,7 +95,7 @@ fn every_field_of_a_summary_is_described() {
 }
 
 #[test]
-fn a_dry_run_says_what_the_run_would_say() {
+fn dry_run_reports_what_the_run_reports() {
     let workplace = Workplace::new();
     let options = "{tiny} --cameras {tiny} --ratio 0.5 -o out";
     let dry = workplace.summary(&format!("{options} --dry-run"));
@@ -103,13 +104,13 @@ fn a_dry_run_says_what_the_run_would_say() {
     for field in ["gaussians", "cameras", "output"] {
         assert_eq!(dry[field], wet[field], "{field}");
     }
-    // What something would have taken is expected, by measurements that differ.
+    // Stages that are left out are predicted; the measured reasons may differ.
     let said = |summary: &Value| -> Vec<String> {
         let left_out = summary["left_out"].as_array().unwrap().iter().map(|left| left["what"].to_string());
         left_out.chain(summary["notes"].as_array().unwrap().iter().map(Value::to_string)).collect()
     };
-    let in_the_end = said(&wet);
-    assert!(said(&dry).iter().all(|said| in_the_end.contains(said)), "{:?} {in_the_end:?}", said(&dry));
+    let said_by_run = said(&wet);
+    assert!(said(&dry).iter().all(|said| said_by_run.contains(said)), "{:?} {said_by_run:?}", said(&dry));
     for written in dry["would_write"].as_array().unwrap() {
         assert!(workplace.path(written.as_str().unwrap()).exists(), "{written}");
     }
@@ -124,20 +125,20 @@ fn a_dry_run_says_what_the_run_would_say() {
     }
 }
 
-/// Runs a compression of a container, and expects no more reads than its plan named; gives what it read.
+/// Runs a compression of a container and checks that it read no more than planned. Returns the number of full reads.
 fn reads_as_planned(workplace: &Workplace, arguments: &str) -> f64 {
     let summary = workplace.summary(arguments);
     let planned = summary["planned_reads"].as_f64().unwrap();
     let read: f64 =
         summary["stages"].as_array().unwrap().iter().map(|stage| stage["full_reads"].as_f64().unwrap()).sum();
-    // What stays in memory since the machine was measured by it is not read again.
+    // Tiles that are still in memory from the timing measurement are not read again.
     assert!(read > 0.2 && read <= 1.1 * planned, "{arguments}: read {read} times, planned at most {planned}");
     read
 }
 
 #[test]
 #[ignore = "needs time"]
-fn no_preset_reads_more_than_its_plan_named_however_little_memory_there_is() {
+fn presets_read_no_more_than_planned_in_any_memory() {
     let workplace = Workplace::new();
     workplace.done("demo --gaussians 3000 --frames 64 -o demo");
     for preset in ["default", "paper", "gentle", "strong"] {
@@ -152,7 +153,8 @@ fn no_preset_reads_more_than_its_plan_named_however_little_memory_there_is() {
                 "demo/scene.gseq --cameras demo/cameras.json --preset {preset} {options} --set refine_steps=60 --set refine_cut_steps=10 -o {output}"
             );
             let read = reads_as_planned(&workplace, &arguments);
-            // What fits into memory is read once; two threads may begin the same tile at once.
+            // An input that fits into memory is read once; two threads may start to read the same tile at the same
+            // time.
             assert!(k > 0 || read <= 1.1, "{preset}: {read}");
         }
     }
@@ -160,7 +162,7 @@ fn no_preset_reads_more_than_its_plan_named_however_little_memory_there_is() {
 
 #[test]
 #[ignore = "needs the trained models"]
-fn a_default_run_reads_the_container_of_a_trained_model_at_most_two_and_a_half_times() {
+fn default_run_reads_a_container_at_most_2_5_times() {
     let model = shared("deform2");
     let workplace = Workplace::new();
     let model = model.display();

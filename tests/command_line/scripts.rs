@@ -1,4 +1,4 @@
-//! The Python scripts against the program: what one writes the other reads, to the bit.
+//! Tests of the Python scripts against the program: each reads what the other writes, to the bit.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -9,7 +9,7 @@ use splatsieve::files::container::Container;
 use splatsieve::model::Columns;
 use splatsieve::source::FrameSource;
 
-/// A Python, which must have `modules`. `PYTHON` names another than python3.
+/// Returns a Python that has `modules`: `python3`, or the one that `PYTHON` names. Panics if a module is missing.
 fn python(modules: &str) -> PathBuf {
     let python = std::env::var_os("PYTHON").map_or_else(|| PathBuf::from("python3"), PathBuf::from);
     let found = Command::new(&python).args(["-c", &format!("import {modules}")]).stderr(Stdio::null()).status();
@@ -21,14 +21,14 @@ fn script(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("scripts").join(name)
 }
 
-/// Runs Python in the workplace, which must succeed; gives its standard output.
+/// Runs Python in the workplace, checks that it succeeds and returns its standard output.
 fn run(command: &mut Command, workplace: &Workplace) -> Vec<u8> {
     let output = command.current_dir(workplace.path("")).output().unwrap();
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     output.stdout
 }
 
-/// Packs the stream that `exporter` writes.
+/// Packs the stream that `exporter` writes and opens the container.
 fn packed(workplace: &Workplace, exporter: &mut Command, name: &str) -> Container {
     let stream = run(exporter, workplace);
     fs::write(workplace.path("stream"), stream).unwrap();
@@ -42,7 +42,7 @@ fn packed(workplace: &Workplace, exporter: &mut Command, name: &str) -> Containe
     Container::open(&workplace.path(name)).unwrap()
 }
 
-/// Values of the scene at `frame` as float32 files, one per column, Gaussian after Gaussian.
+/// Writes the values of the scene at `frame` as float32 files, one per attribute, Gaussian by Gaussian.
 fn write_columns(workplace: &Workplace, scene: &Container, frame: usize) {
     let state = state(scene, frame);
     for column in Columns::all().iter() {
@@ -56,7 +56,7 @@ fn write_columns(workplace: &Workplace, scene: &Container, frame: usize) {
 
 #[test]
 #[ignore = "needs numpy and zstandard"]
-fn lives_that_a_script_cuts_are_linked_and_it_says_how_well() {
+fn tracks_cut_by_a_script_are_linked_and_scored() {
     let python = python("numpy, zstandard");
     let workplace = Workplace::new();
     workplace.done("convert {tiny} tiny.gseq --frames 9");
@@ -77,14 +77,14 @@ fn lives_that_a_script_cuts_are_linked_and_it_says_how_well() {
 
 #[test]
 #[ignore = "needs numpy"]
-fn arrays_exported_as_a_stream_arrive_bit_for_bit() {
+fn exported_arrays_arrive_bit_for_bit() {
     let python = python("numpy");
     let workplace = Workplace::new();
     workplace.done("convert {tiny} scene.gseq");
     let scene = Container::open(&workplace.path("scene.gseq")).unwrap();
     (0..10).for_each(|frame| write_columns(&workplace, &scene, frame));
     let times: Vec<String> = scene.info().times.iter().map(|time| format!("{time:?}")).collect();
-    // Only what moves has a row per frame; single arrays in an .npz or a folder of .npy files.
+    // Only moving attributes have one row per frame. The arrays are in an .npz or in a folder of .npy files.
     let varying = scene.info().varying;
     let make = format!(
         "import numpy as np, os\n\
@@ -111,7 +111,7 @@ fn arrays_exported_as_a_stream_arrive_bit_for_bit() {
 
 #[test]
 #[ignore = "needs numpy"]
-fn an_exporter_that_fails_writes_no_end_mark() {
+fn failing_exporter_writes_no_end_mark() {
     let python = python("numpy");
     let workplace = Workplace::new();
     let code = "import sys; sys.path.insert(0, sys.argv[1])\n\
@@ -133,7 +133,7 @@ fn an_exporter_that_fails_writes_no_end_mark() {
 
 #[test]
 #[ignore = "needs numpy"]
-fn a_stream_of_no_gaussians_is_written_and_read() {
+fn stream_without_gaussians_is_written_and_read() {
     let python = python("numpy");
     let workplace = Workplace::new();
     let code = "import sys; sys.path.insert(0, sys.argv[1])\n\
@@ -151,7 +151,7 @@ fn a_stream_of_no_gaussians_is_written_and_read() {
 
 #[test]
 #[ignore = "needs numpy and zstandard"]
-fn the_container_reader_gives_every_bit_of_every_column() {
+fn python_container_reader_returns_every_bit() {
     let python = python("numpy, zstandard");
     let workplace = Workplace::new();
     workplace.done("convert {tiny} zstd.gseq");
@@ -186,8 +186,8 @@ fn the_container_reader_gives_every_bit_of_every_column() {
     }
 }
 
-/// Stand-ins for the classes of the 4DGaussians repository, with their names, signatures and chatter: the real ones
-/// need its CUDA extensions. The deformation moves positions by the time.
+/// Replacements for the classes of the 4DGaussians repository, with their names, signatures and printed output, because
+/// the real classes need its CUDA extensions. The deformation adds the time to positions.
 const REPOSITORY: [(&str, &str); 3] = [
     (
         "arguments.py",
@@ -229,7 +229,7 @@ const REPOSITORY: [(&str, &str); 3] = [
 
 #[test]
 #[ignore = "needs numpy and PyTorch"]
-fn the_4dgaussians_exporter_streams_what_the_repository_evaluates_whatever_it_prints() {
+fn exporter_of_4dgaussians_streams_the_evaluated_states() {
     let python = python("numpy, torch");
     let workplace = Workplace::new();
     for (name, text) in REPOSITORY {
@@ -259,7 +259,7 @@ fn the_4dgaussians_exporter_streams_what_the_repository_evaluates_whatever_it_pr
 
 #[test]
 #[ignore = "needs numpy"]
-fn a_generated_stream_moves_every_gaussian_in_every_frame_and_is_the_same_again() {
+fn generated_stream_always_moves_and_is_reproducible() {
     let python = python("numpy");
     let workplace = Workplace::new();
     let exporter = |arguments: &[&str]| {
@@ -272,14 +272,14 @@ fn a_generated_stream_moves_every_gaussian_in_every_frame_and_is_the_same_again(
     let info = found.info();
     assert_eq!((info.count, info.times.len(), info.sh_degree), (500, 70, 3));
     assert_eq!(info.varying, Columns::all().difference(Columns::SH));
-    // A period apart the curves are where they were, but for the noise.
+    // One period apart the curves have the same values, except for noise.
     for (frame, other) in [(0, 1), (33, 34), (5, 65)] {
         let (one, two) = (state(&found, frame), state(&found, other));
         assert!(one == state(&again, frame), "frame {frame}");
         for column in info.varying.iter() {
             let values = one.column(column).planes().iter().zip(two.column(column).planes());
             let (all, equal) = values.fold((0, 0), |(all, equal), (a, b)| (all + 1, equal + usize::from(a == b)));
-            // Noise of 2e-5 falls on the same float of size 4 once in a hundred.
+            // Noise of 2e-5 gives the same float of size 4 in 1% of cases.
             assert!(equal * 50 < all, "{}: {equal} of {all} values of frames {frame} and {other}", column.name());
         }
     }
@@ -289,7 +289,7 @@ fn a_generated_stream_moves_every_gaussian_in_every_frame_and_is_the_same_again(
 
 #[test]
 #[ignore = "needs numpy"]
-fn the_scale_script_compresses_every_size_and_says_what_it_took() {
+fn scale_script_reports_cost_of_every_size() {
     let python = python("numpy");
     let workplace = Workplace::new();
     let mut scale = Command::new(python);
@@ -302,7 +302,7 @@ fn the_scale_script_compresses_every_size_and_says_what_it_took() {
     assert_eq!(kept.len(), 2, "only cameras.json and scale.json stay, not {kept:?}");
 }
 
-/// A sweep's bar stands above those of its runs: none is longer than its terminal, or stays behind.
+/// The bar of a sweep is drawn above the bars of its runs. No bar is longer than the terminal or remains at the end.
 #[test]
 #[ignore = "needs Python"]
 fn bars_fit_terminals_of_60_to_120_columns_and_leave_nothing_behind() {
@@ -317,10 +317,10 @@ fn bars_fit_terminals_of_60_to_120_columns_and_leave_nothing_behind() {
     assert_eq!(String::from_utf8(said).unwrap().matches("all fit").count(), 3);
 }
 
-/// The script's own tests: compress, streams, containers and refusals, through the module that is installed.
+/// Tests of the Python package itself: compress, streams, containers and refusals, through the installed module.
 #[test]
 #[ignore = "needs maturin, numpy and zstandard"]
-fn what_the_python_package_promises_holds_of_the_installed_wheel() {
+fn installed_python_package_passes_its_tests() {
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("python/tests/installed.py");
     let output = Command::new(python("maturin, numpy, zstandard")).arg(script).output().unwrap();
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));

@@ -1,8 +1,9 @@
-//! `splatsieve selfcheck` as a person and as a script meet it; what makes a case fail is tested beside the cases.
+//! Tests of `splatsieve selfcheck` as users and scripts run it. The conditions under which a case fails are tested
+//! beside the cases.
 
 use crate::scene::Workplace;
 
-/// The cases, in the order of the pipeline.
+/// Names of the cases, in the order of the pipeline.
 const CASES: [&str; 28] = [
     "motion and life",
     "motion far away",
@@ -35,7 +36,7 @@ const CASES: [&str; 28] = [
 ];
 
 #[test]
-fn every_case_is_a_line_of_the_table_with_bound_error_and_pass() {
+fn table_has_bound_error_and_verdict_of_every_case() {
     let workplace = Workplace::new();
     assert!(workplace.done("--help").contains("selfcheck"));
     let table = workplace.done("selfcheck");

@@ -1,4 +1,4 @@
-//! `scripts/slurm` against a real Slurm: `tests/slurm/check.py` starts one of its own, with several nodes on this machine.
+//! Tests of `scripts/slurm` with a real Slurm: `tests/slurm/check.py` starts one with several nodes on this machine.
 #![cfg(target_os = "linux")]
 
 use std::path::{Path, PathBuf};
@@ -6,9 +6,9 @@ use std::process::Command;
 
 #[test]
 #[ignore = "needs Slurm"]
-fn slurm_runs_parts_and_scenes_to_the_same_bytes() {
+fn slurm_shards_and_scenes_give_the_same_bytes() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
-    // The optimized program where its path is given: the debug one takes several times as long.
+    // The optimized program, if its path is given; the debug program takes several times as long.
     let program = std::env::var_os("SPLATSIEVE_PROGRAM")
         .map_or_else(|| assert_cmd::cargo::cargo_bin("splatsieve"), PathBuf::from);
     let data = std::env::var_os("SPLATSIEVE_DATA").map_or_else(|| root.join("../shared/data"), PathBuf::from);

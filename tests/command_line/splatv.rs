@@ -1,4 +1,5 @@
-//! `.splatv` files of other programs: rows that no player draws, windows without an end, textures without padding.
+//! Tests of `.splatv` files of other programs: rows that no player draws, infinite temporal widths, textures without
+//! padding.
 
 use std::fs;
 use std::path::Path;
@@ -12,7 +13,7 @@ use splatsieve::scene::{InputOptions, open_scene};
 
 const ROWS: usize = 200;
 
-fn sound(i: usize) -> SplatvGaussian {
+fn valid_gaussian(i: usize) -> SplatvGaussian {
     let part = |k: usize| ((i * k) % 97) as f32 / 97.0;
     SplatvGaussian {
         position: [4.0 * part(13) - 2.0, 4.0 * part(29) - 2.0, 4.0 * part(41) - 2.0],
@@ -27,10 +28,10 @@ fn sound(i: usize) -> SplatvGaussian {
     }
 }
 
-/// Row 3 has no position, row 10 neither position nor rotation, rows 20 to 24 have no rotation, row 30 no width; rows 40 to
-/// 47 have windows without an end.
+/// Returns texture rows with defects: row 3 has no position, row 10 neither position nor rotation, rows 20 to 24 no
+/// rotation, row 30 no width; rows 40 to 47 have infinite temporal widths.
 fn rows() -> Vec<[u32; WORDS]> {
-    let mut rows: Vec<[u32; WORDS]> = (0..ROWS).map(|i| words(&sound(i))).collect();
+    let mut rows: Vec<[u32; WORDS]> = (0..ROWS).map(|i| words(&valid_gaussian(i))).collect();
     rows[3][1] = f32::NAN.to_bits();
     (rows[10][0], rows[10][3], rows[10][4]) = (f32::INFINITY.to_bits(), 0, 0);
     rows[20..25].iter_mut().for_each(|row| (row[3], row[4]) = (0, 0));
@@ -41,7 +42,7 @@ fn rows() -> Vec<[u32; WORDS]> {
 
 const DROPPED: [usize; 8] = [3, 10, 20, 21, 22, 23, 24, 30];
 
-/// A file whose texture ends behind the last row, as numpy's `tobytes` leaves it.
+/// Writes a file whose texture ends after the last row, as numpy's `tobytes` leaves it.
 fn write(path: &Path, rows: &[[u32; WORDS]]) {
     let text = r#"[{"type":"splat","size":65536,"texwidth":4096,"texheight":1,"cameras":[]}]"#;
     let mut bytes = [MAGIC.to_le_bytes(), (text.len() as u32).to_le_bytes()].concat();
@@ -59,7 +60,7 @@ fn json(workplace: &Workplace, arguments: &str) -> Value {
     serde_json::from_str(&workplace.done(arguments)).unwrap()
 }
 
-/// What `info` and the summary of a compression say of the rows.
+/// Returns the notes of `info` or of a compression summary about the rows.
 fn notes(found: &Value) -> Vec<String> {
     let notes = found["notes"].as_array().unwrap().iter().map(|note| note.as_str().unwrap().to_owned());
     notes.filter(|note| note.contains(" rows ")).collect()
@@ -88,7 +89,7 @@ fn defective_rows_are_counted_and_left_out_or_kept() {
     let summary = workplace.summary(&format!("odd.splatv -o small.splatv {options}"));
     assert_eq!((&summary["input"]["gaussians"], &summary["gaussians"]), (&192.into(), &150.into()));
     assert_said(&notes(&summary), &parts);
-    let places: Vec<[f32; 3]> = (0..ROWS).filter(|row| !DROPPED.contains(row)).map(|row| sound(row).position).collect();
+    let places: Vec<[f32; 3]> = (0..ROWS).filter(|row| !DROPPED.contains(row)).map(|row| valid_gaussian(row).position).collect();
     let small = rows_of(&workplace.path("small.splatv"));
     assert!(small.len() == 150 && small.iter().all(|row| places.contains(&row.position)));
     let map = index_map(&workplace.path("small.splatv.index_map.npy"));
@@ -98,14 +99,14 @@ fn defective_rows_are_counted_and_left_out_or_kept() {
 }
 
 #[test]
-fn infinite_windows_show_at_every_time_and_results_are_sound() {
+fn infinite_temporal_widths_are_visible_at_every_time() {
     let workplace = Workplace::new();
     write(&workplace.path("odd.splatv"), &rows());
     let options = InputOptions { path: workplace.path("odd.splatv"), frames: Some(5), ..InputOptions::default() };
     let scene = open_scene(&options).unwrap();
     for frame in 0..5 {
         let state = state(scene.source(), frame);
-        // Row 40 is Gaussian 32.
+        // Row 40 of the file is Gaussian 32.
         let visible = opacity(state.opacity_logit.row::<1>(32)[0]);
         assert!((visible - 204.0 / 255.0).abs() < 1e-6, "{visible} at frame {frame}");
         assert!(state.position.planes().iter().all(|x| x.is_finite()));
@@ -122,7 +123,7 @@ fn infinite_windows_show_at_every_time_and_results_are_sound() {
 }
 
 #[test]
-fn zero_quaternions_are_kept_where_asked() {
+fn zero_quaternions_are_kept_on_request() {
     let workplace = Workplace::new();
     write(&workplace.path("odd.splatv"), &rows());
     let said = workplace.done("info odd.splatv --zero-rotation identity");
@@ -142,7 +143,7 @@ fn zero_quaternions_are_kept_where_asked() {
 }
 
 #[test]
-fn a_texture_that_ends_within_a_row_is_refused() {
+fn texture_that_ends_within_a_row_is_refused() {
     let workplace = Workplace::new();
     let path = workplace.path("cut.splatv");
     write(&path, &rows());
@@ -153,7 +154,7 @@ fn a_texture_that_ends_within_a_row_is_refused() {
     workplace.refused(1, "info cut.splatv", &["cut.splatv", "65536", &whole, &found, "cut short"]);
 }
 
-/// What is said of a captured file by `info`, `compress` and `evaluate` of it as it is.
+/// Checks that `info`, `compress` and `evaluate` accept a captured file. Returns the notes of the compression.
 fn captured(name: &str) -> Vec<String> {
     let workplace = Workplace::new();
     let folder = shared("captured");
@@ -184,7 +185,7 @@ fn captured_kitchen_has_821_infinite_widths() {
 #[ignore = "needs the trained models"]
 fn captured_coffee_has_the_defects_that_were_counted() {
     let notes = captured("coffee10.splatv");
-    // All 24 rows without a position have a zero quaternion, too.
+    // The 24 rows without a position have a zero quaternion as well.
     let total = "11335 of 11926 rows have defects: 11331 (95.01%) left out, 4 repaired";
     let kinds = ["24 of 11926 rows (0.20%) left out", "11331 of 11926 rows (95.01%) left out: zero quaternion"];
     assert_said(&notes, &[total, kinds[0], kinds[1], "4 of 11926 rows (0.03%) repaired: infinite temporal width"]);

@@ -1,5 +1,5 @@
-//! A sequence on standard input: what comes of it is what comes of the same frames in a file, whatever breaks
-//! off leaves nothing, and other programs can write and read it.
+//! Tests of sequences on standard input: results equal those of the same frames in a file, a broken stream leaves no
+//! files, and other programs can write and read streams.
 
 use std::fs;
 use std::io::Write;
@@ -23,24 +23,24 @@ fn done(output: Output) -> Vec<u8> {
     output.stdout
 }
 
-/// The tiny model as a stream.
-fn streamed(workplace: &Workplace) -> Vec<u8> {
+/// Returns the tiny model as a stream.
+fn tiny_stream(workplace: &Workplace) -> Vec<u8> {
     done(workplace.piped("convert {tiny} -", b""))
 }
 
-/// Names of everything in a folder that is no result: hidden ones, and those of scratch files.
-fn left_over(folder: &Path) -> Vec<PathBuf> {
+/// Returns the names of files in a folder that are no results: hidden files and scratch files.
+fn leftover_files(folder: &Path) -> Vec<PathBuf> {
     files(folder).into_keys().filter(|name| name.to_str().unwrap().contains("splatsieve")).collect()
 }
 
 #[test]
 #[ignore = "needs time"]
-fn a_stream_gives_the_bytes_of_packing_first_whatever_the_threads() {
+fn stream_and_packed_file_give_the_same_bytes() {
     let workplace = Workplace::new();
-    let stream = streamed(&workplace);
+    let stream = tiny_stream(&workplace);
     done(workplace.piped("convert - packed.gseq", &stream));
-    // The frames are scanned once, as they arrive, and all pictures are looked at then; only the end tells which a
-    // hundred are spread evenly.
+    // Frames are scanned once, as they arrive. All views can be rendered then; a hundred evenly spread views are known
+    // only at the end.
     let (as_it_arrives, at_the_end): (&[&str], &[&str]) = (&["receive", "score"], &["receive", "visible", "score"]);
     for (name, rest, first) in [
         ("default", "--cameras {tiny}", at_the_end),
@@ -71,13 +71,13 @@ fn a_stream_gives_the_bytes_of_packing_first_whatever_the_threads() {
             assert!(stages.starts_with(first), "{name}: {stages:?}");
         }
     }
-    assert!(left_over(&workplace.path("")).is_empty());
+    assert!(leftover_files(&workplace.path("")).is_empty());
 }
 
 #[test]
-fn a_stream_is_packed_within_bounds_like_a_file_and_told_of_where_that_is_larger() {
+fn stream_packs_within_bounds_like_a_file() {
     let workplace = Workplace::new();
-    let stream = streamed(&workplace);
+    let stream = tiny_stream(&workplace);
     let bounds = "--max-error position=2e-3,sh=1e-2";
     done(workplace.piped(&format!("convert - stream.gseq {bounds}"), &stream));
     workplace.done(&format!("convert {{tiny}} file.gseq {bounds}"));
@@ -87,7 +87,7 @@ fn a_stream_is_packed_within_bounds_like_a_file_and_told_of_where_that_is_larger
         let at = TileId { column, gaussian_block: 0, frame_block: 0 };
         assert_eq!(stream_of.tile_info(at).unwrap().checksum, file.tile_info(at).unwrap().checksum, "{at:?}");
     }
-    // Raw tiles and what says where they lie.
+    // Raw tiles, and the table of their positions.
     let larger = String::from_utf8(done(workplace.piped("convert - raw.gseq --raw", &stream))).unwrap();
     assert!(larger.contains(&format!("bytes of {}: the input holds its values in fewer", stream.len())), "{larger}");
     let refused = workplace.piped("convert - x.gseq --max-error position=1%", &stream);
@@ -97,16 +97,16 @@ fn a_stream_is_packed_within_bounds_like_a_file_and_told_of_where_that_is_larger
 }
 
 #[test]
-fn rows_of_a_stream_are_those_of_the_packed_frames() {
+fn stream_scores_equal_those_of_packed_frames() {
     let workplace = Workplace::new();
-    let stream = streamed(&workplace);
+    let stream = tiny_stream(&workplace);
     done(workplace.piped("convert - packed.gseq", &stream));
     workplace.done("score packed.gseq --cameras {tiny} -o expected.npz");
     done(workplace.piped("score - --cameras {tiny} -o found.npz", &stream));
     assert!(fs::read(workplace.path("expected.npz")).unwrap() == fs::read(workplace.path("found.npz")).unwrap());
 }
 
-/// The stream with its time stamps changed.
+/// Returns the stream with its time stamps changed by `time`, a function of the frame number.
 fn retimed(stream: &[u8], time: impl Fn(usize) -> f64) -> Vec<u8> {
     let mut bytes = stream.to_owned();
     let (mut frame, mut at) = (0, 0);
@@ -124,9 +124,9 @@ fn retimed(stream: &[u8], time: impl Fn(usize) -> f64) -> Vec<u8> {
 
 #[test]
 #[ignore = "needs time"]
-fn uneven_frames_are_measured_from_the_packed_ones_with_the_same_result() {
+fn uneven_stream_times_give_the_result_of_the_file() {
     let workplace = Workplace::new();
-    let stream = retimed(&streamed(&workplace), |frame| (frame * frame) as f64);
+    let stream = retimed(&tiny_stream(&workplace), |frame| (frame * frame) as f64);
     done(workplace.piped("convert - packed.gseq", &stream));
     workplace.done("compress packed.gseq -o expected");
     let output = done(workplace.piped("compress - -o found", &stream));
@@ -135,7 +135,7 @@ fn uneven_frames_are_measured_from_the_packed_ones_with_the_same_result() {
 }
 
 #[test]
-fn what_is_unpacked_as_a_stream_packs_to_the_same_frames_and_chains() {
+fn unpacked_stream_packs_to_the_same_frames() {
     let workplace = Workplace::new();
     workplace.done("convert {tiny} a.gseq");
     let stream = done(workplace.piped("convert a.gseq -", b""));
@@ -163,9 +163,9 @@ fn what_is_unpacked_as_a_stream_packs_to_the_same_frames_and_chains() {
 }
 
 #[test]
-fn broken_streams_end_in_an_error_and_leave_nothing() {
+fn broken_streams_are_errors_and_leave_no_files() {
     let workplace = Workplace::new();
-    let stream = streamed(&workplace);
+    let stream = tiny_stream(&workplace);
     let refused = |arguments: &str, stdin: &[u8], code: i32, part: &str| {
         let before = files(&workplace.path(""));
         let output = workplace.piped(arguments, stdin);
@@ -189,7 +189,7 @@ fn broken_streams_end_in_an_error_and_leave_nothing() {
 }
 
 #[test]
-fn a_reader_that_has_seen_enough_of_a_stream_is_no_failure() {
+fn closed_pipe_while_streaming_is_no_failure() {
     let workplace = Workplace::new();
     let mut child = splatsieve(&workplace, "convert {tiny} - --quiet").spawn().unwrap();
     drop(child.stdout.take());
@@ -197,10 +197,10 @@ fn a_reader_that_has_seen_enough_of_a_stream_is_no_failure() {
     assert!(output.status.success() && output.stderr.is_empty(), "{}", String::from_utf8_lossy(&output.stderr));
 }
 
-/// Waits until `folder` holds what a run left, or gives up.
+/// Waits until `folder` holds a scratch file of the run. Panics if the run ends or after 60 s.
 fn wait_for_scratch(folder: &Path, child: &mut Child) {
     let start = Instant::now();
-    while left_over(folder).is_empty() {
+    while leftover_files(folder).is_empty() {
         assert!(start.elapsed() < Duration::from_secs(60), "no scratch file appeared");
         assert!(child.try_wait().unwrap().is_none(), "the run ended");
         std::thread::sleep(Duration::from_millis(10));
@@ -209,9 +209,9 @@ fn wait_for_scratch(folder: &Path, child: &mut Child) {
 
 #[cfg(target_os = "linux")]
 #[test]
-fn what_a_killed_run_leaves_is_gone_after_the_next_one() {
+fn next_run_removes_scratch_files_of_a_killed_run() {
     let workplace = Workplace::new();
-    let stream = streamed(&workplace);
+    let stream = tiny_stream(&workplace);
     for (scratch, next) in [("", "convert {tiny} other.gseq --overwrite"), ("scratch", "compress - -o out --overwrite")]
     {
         let flag = if scratch.is_empty() { String::new() } else { format!(" --scratch-dir {scratch}") };
@@ -225,8 +225,8 @@ fn what_a_killed_run_leaves_is_gone_after_the_next_one() {
         child.kill().unwrap();
         child.wait().unwrap();
         assert!(!workplace.path("out").exists());
-        assert!(!left_over(&folder).is_empty(), "a kill leaves the scratch file");
+        assert!(!leftover_files(&folder).is_empty(), "a kill leaves the scratch file");
         done(workplace.piped(&format!("{next}{flag}"), &stream));
-        assert!(left_over(&folder).is_empty());
+        assert!(leftover_files(&folder).is_empty());
     }
 }

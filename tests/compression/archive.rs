@@ -1,4 +1,4 @@
-//! Archives as a user meets them: written, unpacked, read as inputs, damaged.
+//! Tests of archives (`.gsz`): writing, unpacking, reading as input, damage.
 
 use std::fs;
 use std::path::Path;
@@ -8,10 +8,10 @@ use splatsieve::model::{Columns, Gaussians};
 use splatsieve::models::{InputModel, ModelFolder};
 use splatsieve::outputs::container::write_container;
 
-/// How to have the tiny model archived without refining anything.
+/// Arguments that archive the tiny model at 50 dB without refinement.
 const TINY: &str = "{tiny} --cameras {tiny} --ratio 0.5 --no-refine --prune-only --archive-psnr 50";
 
-/// A workplace with `small.gsz` of the tiny model, and its summary.
+/// Returns a workplace with `small.gsz`, the archive of the tiny model, and the summary of the run.
 fn with_archive() -> (Workplace, serde_json::Value) {
     let workplace = Workplace::new();
     let summary = workplace.summary(&format!("{TINY} -o small.gsz"));
@@ -22,13 +22,13 @@ fn model(folder: &Path) -> ModelFolder {
     ModelFolder::open(folder, None).unwrap().with_times(vec![0.0, 0.4, 1.0]).unwrap()
 }
 
-fn cloud(folder: &Path) -> PlyRows {
+fn point_cloud(folder: &Path) -> PlyRows {
     let found = files(folder).into_keys().find(|name| name.ends_with("point_cloud.ply")).unwrap();
     PlyRows::read(&folder.join(found))
 }
 
 #[test]
-fn an_archive_unpacks_to_a_model_folder_whose_pictures_are_as_close_as_was_asked_for() {
+fn archive_unpacks_to_a_model_folder_at_the_asked_psnr() {
     let (workplace, summary) = with_archive();
     let archive = &summary["archive"];
     assert!(archive["psnr"].as_f64().unwrap() >= 50.0, "{archive}");
@@ -42,16 +42,16 @@ fn an_archive_unpacks_to_a_model_folder_whose_pictures_are_as_close_as_was_asked
     let unpacked = workplace.path("small");
     let has = |name: &str| names(&unpacked).iter().any(|found| found.ends_with(name));
     assert!(has("point_cloud.ply") && has("deformation.pth"), "{:?}", names(&unpacked));
-    // Archives are made to be sent: of the folders that the training machine had they keep the last names alone.
+    // Archives are made to be shared: of the folders on the training machine they keep only the last path component.
     let trained = fs::read_to_string(tiny().join("cfg_args")).unwrap();
     let expected = trained.replace("model_path='output/tiny'", "model_path='tiny'");
     assert!(expected != trained);
     assert_eq!(fs::read_to_string(unpacked.join("cfg_args")).unwrap(), expected);
-    let (before, after) = (cloud(&tiny()), cloud(&unpacked));
+    let (before, after) = (point_cloud(&tiny()), point_cloud(&unpacked));
     assert_eq!(before.names, after.names);
     assert_eq!(summary["gaussians"], after.rows.len());
 
-    // Every Gaussian is where the map says, and other columns than attributes came along.
+    // Every Gaussian is at the place that the index map gives, and properties other than attributes are kept.
     let map = index_map(&workplace.path("small.gsz.index_map.npy"));
     let extent = (0..before.rows.len()).map(|i| before.value(i, "x").abs()).fold(0.0, f32::max);
     let mut places: Vec<i64> = map.iter().copied().filter(|&place| place >= 0).collect();
@@ -67,7 +67,7 @@ fn an_archive_unpacks_to_a_model_folder_whose_pictures_are_as_close_as_was_asked
 }
 
 #[test]
-fn an_archive_is_read_like_the_folder_that_it_unpacks_to() {
+fn archive_reads_like_the_folder_it_unpacks_to() {
     let (workplace, _) = with_archive();
     workplace.done("convert small.gsz small");
     let folder = model(&workplace.path("small"));
@@ -79,21 +79,21 @@ fn an_archive_is_read_like_the_folder_that_it_unpacks_to() {
         assert!((0..a.len()).all(|i| bits(&a, i) == bits(&b, i)), "frame {frame}");
     }
     drop(archive);
-    let evaluated = |of: &str| -> serde_json::Value {
-        serde_json::from_str(&workplace.done(&format!("evaluate {{tiny}} {of} --cameras {{tiny}} --json"))).unwrap()
+    let evaluated = |path: &str| -> serde_json::Value {
+        serde_json::from_str(&workplace.done(&format!("evaluate {{tiny}} {path} --cameras {{tiny}} --json"))).unwrap()
     };
     assert_eq!(evaluated("small.gsz")["psnr"], evaluated("small")["psnr"]);
     workplace.done("render small.gsz --cameras {tiny} --all -o pictures");
     workplace.done("info small.gsz");
     workplace.done("compress small.gsz --cameras {tiny} --ratio 0.5 --no-refine --prune-only -o smaller");
-    assert_eq!(cloud(&workplace.path("smaller")).rows.len(), cloud(&workplace.path("small")).rows.len().div_ceil(2));
-    // What it was decoded to is gone.
+    assert_eq!(point_cloud(&workplace.path("smaller")).rows.len(), point_cloud(&workplace.path("small")).rows.len().div_ceil(2));
+    // The decoded scratch folder is removed.
     let left = files(&workplace.path(""));
     assert!(left.keys().all(|name| !name.to_string_lossy().contains("scratch")), "{:?}", left.keys());
 }
 
 #[test]
-fn the_bytes_of_an_archive_do_not_depend_on_threads() {
+fn archive_bytes_ignore_thread_count() {
     let (one, two) = (Workplace::new(), Workplace::new());
     one.done(&format!("--threads 1 compress {TINY} -o small.gsz"));
     two.done(&format!("--threads 3 compress {TINY} -o small.gsz"));
@@ -102,7 +102,7 @@ fn the_bytes_of_an_archive_do_not_depend_on_threads() {
 
 #[test]
 #[ignore = "needs time"]
-fn frames_become_a_container_within_bounds_whose_pictures_are_as_close_as_was_asked_for() {
+fn archive_of_frames_keeps_bounds_and_the_asked_psnr() {
     let workplace = Workplace::new();
     let made = splatsieve::diagnostics::demo_scene::Scene::new(1500, 20);
     let raw = gseq::Compression::Raw;
@@ -115,12 +115,12 @@ fn frames_become_a_container_within_bounds_whose_pictures_are_as_close_as_was_as
     assert_eq!(fs::metadata(workplace.path("small.gsz")).unwrap().len(), bytes);
     let archive = &summary["archive"];
     assert!(archive["psnr"].as_f64().unwrap() >= 45.0 && archive.get("parts").is_none(), "{archive}");
-    // What was looked at before it was written is what is there.
+    // The PSNR measured before writing is that of the file.
     let run = workplace.done("evaluate exact.gseq small.gsz --json");
     let found: serde_json::Value = serde_json::from_str(&run).unwrap();
     let psnr = found["psnr"].as_f64().unwrap_or_else(|| panic!("{found}"));
     assert!((44.0..48.0).contains(&psnr), "{psnr} dB");
-    // Every value is within the bound that is named.
+    // Every value is within the bound that the summary names.
     let open = |name: &str| splatsieve::models::open(&workplace.path(name), &Default::default()).unwrap();
     let [before, after] = ["exact.gseq", "small.gsz"].map(open);
     assert_eq!(after.kind(), "gseq container");
@@ -133,19 +133,19 @@ fn frames_become_a_container_within_bounds_whose_pictures_are_as_close_as_was_as
             assert!(bound > 0.0 && off <= bound, "{} is {off} off, not {bound}", column.name());
         }
     }
-    // Threads change no byte, nor does the way that frames come.
+    // The bytes depend neither on the number of threads nor on whether frames come from a file or a stream.
     workplace.done(&format!("--threads 3 compress frames.gseq {how} -o three.gsz --archive-psnr 45"));
     let stream = workplace.piped("convert frames.gseq - --quiet", b"").stdout;
     let output = workplace.piped(&format!("compress - {how} -o piped.gsz --archive-psnr 45"), &stream);
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let read = |name: &str| fs::read(workplace.path(name)).unwrap();
     assert!(read("three.gsz") == read("small.gsz") && read("piped.gsz") == read("small.gsz"));
-    // A size, and one that is too small.
+    // A target size, and one that is too small.
     let most = bytes / 2;
     let sized = workplace.summary(&format!("frames.gseq --no-refine --prune-only -o sized.gsz --size {most}"));
     assert!((most / 2..=most).contains(&sized["output_bytes"].as_u64().unwrap()), "{sized}");
     workplace.refused(2, "compress frames.gseq -o none.gsz --size 100", &["--size", "expected at least"]);
-    // Of what shines without end no picture tells a bound.
+    // Renders of infinite colors give no error bound.
     let mut broken = state(before.source(), 0);
     broken.sh.planes_mut().fill(f32::INFINITY);
     workplace.ply("broken/0.ply", &broken);
@@ -158,7 +158,7 @@ fn frames_become_a_container_within_bounds_whose_pictures_are_as_close_as_was_as
 }
 
 #[test]
-fn a_single_ply_comes_back_with_its_header_and_close_to_its_values() {
+fn single_ply_returns_with_its_header_and_close_values() {
     let workplace = Workplace::new();
     let mut gaussians = Gaussians::zeros(400, 1);
     let mut seed = 1u64;
@@ -188,7 +188,7 @@ fn a_single_ply_comes_back_with_its_header_and_close_to_its_values() {
 }
 
 #[test]
-fn damaged_archives_and_what_no_archive_holds_are_refused_in_words() {
+fn damaged_and_impossible_archives_are_refused() {
     let (workplace, _) = with_archive();
     let bytes = fs::read(workplace.path("small.gsz")).unwrap();
     fs::write(workplace.path("cut.gsz"), &bytes[..bytes.len() - 100]).unwrap();
@@ -211,7 +211,7 @@ fn damaged_archives_and_what_no_archive_holds_are_refused_in_words() {
 }
 
 #[test]
-fn a_quality_that_is_asked_for_counts_what_the_archive_loses() {
+fn asked_quality_includes_the_loss_of_the_archive() {
     let workplace = Workplace::new();
     let least = 30.0;
     let summary = workplace.summary(&format!(
@@ -224,7 +224,7 @@ fn a_quality_that_is_asked_for_counts_what_the_archive_loses() {
 }
 
 #[test]
-fn bytes_asked_for_are_filled_by_count_and_bits_together() {
+fn target_size_is_filled_by_count_and_bits_together() {
     let workplace = Workplace::new();
     let how = "{tiny} --cameras {tiny} --no-refine --overwrite -o small.gsz --size";
     let mut before = (0, 0.0);

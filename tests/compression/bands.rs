@@ -1,5 +1,5 @@
-//! Bands of spherical harmonics that nobody sees: gone from a result, with the degree that its configuration names, as far
-//! as a bound on pictures says; and there where they matter, or where an SH head adds to them.
+//! Tests of SH degree reduction: coefficients with no visible effect are removed, and the configuration names the lower
+//! degree, as far as a bound on renders allows. Coefficients stay if they matter or if an SH head adds to them.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -7,25 +7,25 @@ use std::path::{Path, PathBuf};
 use crate::scene::{PlyRows, Workplace, check_model_folder, index_map, lasting_files, tiny, without_sh_head};
 use serde_json::Value;
 
-/// What a stage that runs writes down where nothing goes.
-const WHAT: &str = "lower SH degree";
+/// Entry of the summary if the stage runs and removes nothing.
+const LOWER_DEGREE: &str = "lower SH degree";
 
-fn cloud_of(model: &Path) -> PathBuf {
+fn point_cloud(model: &Path) -> PathBuf {
     let folders = fs::read_dir(model.join("point_cloud")).unwrap();
     folders.map(|entry| entry.unwrap().path().join("point_cloud.ply")).next().unwrap()
 }
 
-fn why_left(summary: &Value) -> Option<String> {
+fn reason_left_out(summary: &Value) -> Option<String> {
     let left = summary["left_out"].as_array().unwrap();
-    left.iter().find(|left| left["what"] == WHAT).map(|left| left["why"].as_str().unwrap().to_owned())
+    left.iter().find(|left| left["what"] == LOWER_DEGREE).map(|left| left["why"].as_str().unwrap().to_owned())
 }
 
-/// The tiny model without its SH head, and with harmonics above `degree` a millionth of what they were: `model` in the
+/// Writes the tiny model without its SH head, and with coefficients above `degree` scaled by 1e-6, to `model` in the
 /// workplace.
-fn faint_above(workplace: &Workplace, degree: usize) -> PathBuf {
+fn write_faint_above(workplace: &Workplace, degree: usize) -> PathBuf {
     let model = workplace.path("model");
     without_sh_head(&tiny(), &model);
-    let path = cloud_of(&model);
+    let path = point_cloud(&model);
     let PlyRows { names, rows } = PlyRows::read(&path);
     let faint = |name: &str| {
         let number = name.strip_prefix("f_rest_").and_then(|number| number.parse::<usize>().ok());
@@ -43,27 +43,27 @@ fn faint_above(workplace: &Workplace, degree: usize) -> PathBuf {
     model
 }
 
-const QUICKLY: &str = "model --cameras {tiny} --no-refine --prune-only --set field=exact --overwrite";
+const UNREFINED: &str = "model --cameras {tiny} --no-refine --prune-only --set field=exact --overwrite";
 
 #[test]
-fn bands_that_nobody_sees_go_with_the_degree_that_the_configuration_names() {
+fn invisible_sh_coefficients_and_their_degree_go() {
     for degree in [0, 1, 2] {
         let workplace = Workplace::new();
-        let model = faint_above(&workplace, degree);
-        let summary = workplace.summary(&format!("{QUICKLY} --ratio 0.5 --set bands_margin=90 -o small"));
+        let model = write_faint_above(&workplace, degree);
+        let summary = workplace.summary(&format!("{UNREFINED} --ratio 0.5 --set bands_margin=90 -o small"));
         let bands = &summary["bands"];
-        assert_eq!((&bands["sh_degree"], why_left(&summary)), (&Value::from(degree), None), "{bands}");
+        assert_eq!((&bands["sh_degree"], reason_left_out(&summary)), (&Value::from(degree), None), "{bands}");
         let of_degree = |tried: &Value| tried[0] == degree && tried[1].as_f64() >= bands["least"].as_f64();
         assert!(bands["tried"].as_array().unwrap().iter().any(of_degree), "{bands}");
 
         let small = workplace.path("small");
         let [before, after] = [&model, &small].map(|model| fs::read_to_string(model.join("cfg_args")).unwrap());
         assert_eq!(after, before.replace("sh_degree=3", &format!("sh_degree={degree}")));
-        let field = |model: &Path| fs::read(cloud_of(model).with_file_name("deformation.pth")).unwrap();
+        let field = |model: &Path| fs::read(point_cloud(model).with_file_name("deformation.pth")).unwrap();
         assert!(field(&small) == field(&model), "the field changed");
 
-        // What stays of a row is what it was, coefficient by coefficient of every channel.
-        let [before, after] = [&model, &small].map(|model| PlyRows::read(&cloud_of(model)));
+        // The remaining coefficients of a row are unchanged, coefficient by coefficient of every channel.
+        let [before, after] = [&model, &small].map(|model| PlyRows::read(&point_cloud(model)));
         let left = (degree + 1) * (degree + 1) - 1;
         assert_eq!(after.names.iter().filter(|name| name.starts_with("f_rest_")).count(), 3 * left);
         let map = index_map(&small.join("index_map.npy"));
@@ -82,65 +82,65 @@ fn bands_that_nobody_sees_go_with_the_degree_that_the_configuration_names() {
 }
 
 #[test]
-fn bands_that_matter_stay_and_are_said_to() {
+fn visible_sh_coefficients_stay_and_are_reported() {
     let workplace = Workplace::new();
-    let model = faint_above(&workplace, 3);
-    let summary = workplace.summary(&format!("{QUICKLY} --ratio 0.5 --set bands_margin=90 -o small"));
-    let why = why_left(&summary).unwrap();
+    let model = write_faint_above(&workplace, 3);
+    let summary = workplace.summary(&format!("{UNREFINED} --ratio 0.5 --set bands_margin=90 -o small"));
+    let why = reason_left_out(&summary).unwrap();
     assert!(why.contains("dB at degree 2") && why.contains("at least 60.0 dB against all degrees required"), "{why}");
     assert_eq!(summary["bands"]["sh_degree"], 3);
     let configs = [&model, &workplace.path("small")].map(|model| fs::read(model.join("cfg_args")).unwrap());
     assert!(configs[0] == configs[1]);
-    let [before, after] = [&model, &workplace.path("small")].map(|model| PlyRows::read(&cloud_of(model)).names);
+    let [before, after] = [&model, &workplace.path("small")].map(|model| PlyRows::read(&point_cloud(model)).names);
     assert_eq!(after, before);
 
-    // Without being asked to, nothing is looked for and nothing said.
-    let all = workplace.summary(&format!("{QUICKLY} --ratio 0.5 --set bands=all -o small"));
-    assert!(all["bands"].is_null() && why_left(&all).is_none());
+    // Without the request nothing is searched and nothing reported.
+    let all = workplace.summary(&format!("{UNREFINED} --ratio 0.5 --set bands=all -o small"));
+    assert!(all["bands"].is_null() && reason_left_out(&all).is_none());
 }
 
 #[test]
-fn bands_that_an_sh_head_adds_to_stay_and_so_does_color_without_any() {
+fn sh_coefficients_stay_with_an_sh_head_or_at_degree_0() {
     let workplace = Workplace::new();
-    let quickly = QUICKLY.replacen("model", "{tiny}", 1);
+    let quickly = UNREFINED.replacen("model", "{tiny}", 1);
     let summary = workplace.summary(&format!("{quickly} --ratio 0.5 --set bands_margin=0 -o small"));
-    assert!(why_left(&summary).unwrap().contains("SH head") && summary["bands"].is_null());
-    assert_eq!(PlyRows::read(&cloud_of(&workplace.path("small"))).names.len(), 62);
+    assert!(reason_left_out(&summary).unwrap().contains("SH head") && summary["bands"].is_null());
+    assert_eq!(PlyRows::read(&point_cloud(&workplace.path("small"))).names.len(), 62);
 
-    faint_above(&workplace, 0);
-    workplace.done(&format!("compress {QUICKLY} -o plain"));
-    let again = QUICKLY.replacen("model", "plain", 1);
+    write_faint_above(&workplace, 0);
+    workplace.done(&format!("compress {UNREFINED} -o plain"));
+    let again = UNREFINED.replacen("model", "plain", 1);
     let summary = workplace.summary(&format!("{again} --ratio 0.5 -o small"));
-    assert!(why_left(&summary).unwrap().contains("degree 0") && summary["bands"].is_null());
+    assert!(reason_left_out(&summary).unwrap().contains("degree 0") && summary["bands"].is_null());
 }
 
 #[test]
-fn any_threads_write_the_same_bytes_of_fewer_bands() {
+fn lower_sh_degree_bytes_ignore_thread_count() {
     let workplace = Workplace::new();
-    faint_above(&workplace, 1);
+    write_faint_above(&workplace, 1);
     let how = "--ratio 0.3 --set refine_steps=40 --set refine_cut_steps=10";
     for threads in [1, 3] {
         workplace.done(&format!("compress model --cameras {{tiny}} {how} --threads {threads} -o small{threads}"));
     }
     assert!(lasting_files(&workplace.path("small1")) == lasting_files(&workplace.path("small3")));
-    assert!(PlyRows::read(&cloud_of(&workplace.path("small1"))).names.len() < 62);
+    assert!(PlyRows::read(&point_cloud(&workplace.path("small1"))).names.len() < 62);
 }
 
 #[test]
-fn a_search_finds_its_size_with_the_bands_that_it_leaves() {
+fn quality_search_uses_the_lower_sh_degree() {
     let workplace = Workplace::new();
-    faint_above(&workplace, 0);
+    write_faint_above(&workplace, 0);
     let how = "--no-refine --min-psnr 25dB";
     let summary = workplace.summary(&format!("model --cameras {{tiny}} {how} -o small"));
     assert_eq!(summary["bands"]["sh_degree"], 0, "{}", summary["bands"]);
     assert!(summary["goal"]["searched"].as_f64().unwrap() >= 25.0, "{}", summary["goal"]);
-    assert_eq!(PlyRows::read(&cloud_of(&workplace.path("small"))).names.len(), 17);
+    assert_eq!(PlyRows::read(&point_cloud(&workplace.path("small"))).names.len(), 17);
 }
 
 #[test]
-fn frames_and_single_files_lose_bands_too() {
+fn frames_and_single_files_lower_the_sh_degree_too() {
     let workplace = Workplace::new();
-    faint_above(&workplace, 1);
+    write_faint_above(&workplace, 1);
     let cameras = "--cameras {tiny} --no-refine --prune-only --ratio 0.5";
     workplace.done(&format!("compress model {cameras} -o one.ply"));
     assert_eq!(PlyRows::read(&workplace.path("one.ply")).names.len(), 17 + 9);
@@ -154,11 +154,11 @@ fn frames_and_single_files_lose_bands_too() {
 
 #[test]
 #[ignore = "needs Python"]
-fn the_original_loader_can_open_fewer_bands_and_the_check_refuses_a_degree_that_is_not_the_clouds() {
+fn lower_degree_passes_the_loader_check_and_a_wrong_one_fails() {
     let workplace = Workplace::new();
-    let model = faint_above(&workplace, 1);
+    let model = write_faint_above(&workplace, 1);
     let small = workplace.path("small");
-    workplace.done(&format!("compress {QUICKLY} --ratio 0.4 -o small"));
+    workplace.done(&format!("compress {UNREFINED} --ratio 0.4 -o small"));
     let (accepted, text) = check_model_folder(&model, &small);
     assert!(accepted && text.contains("SH degree 1 of 3") && text.contains("can open it"), "{text}");
 
@@ -175,8 +175,8 @@ fn the_original_loader_can_open_fewer_bands_and_the_check_refuses_a_degree_that_
     }
     fs::write(small.join("cfg_args"), own).unwrap();
 
-    // Another channel's coefficient in the place of one.
-    let cloud = cloud_of(&small);
+    // Puts the coefficient of one channel in the place of another.
+    let cloud = point_cloud(&small);
     let PlyRows { names, rows } = PlyRows::read(&cloud);
     let [one, other] = ["f_rest_1", "f_rest_3"].map(|name| 4 * names.iter().position(|of| of == name).unwrap());
     let mut bytes = fs::read(&cloud).unwrap();
@@ -190,9 +190,9 @@ fn the_original_loader_can_open_fewer_bands_and_the_check_refuses_a_degree_that_
 }
 
 #[test]
-fn a_degree_that_is_asked_for_is_refined_to_its_best() {
+fn asked_degree_is_refined_to_its_best() {
     let workplace = Workplace::new();
-    let model = faint_above(&workplace, 3);
+    let model = write_faint_above(&workplace, 3);
     let how = "--ratio 0.3 --set refine_steps=100 --set refine_cut_steps=20 --set field=exact";
     let summary = workplace.summary(&format!("model --cameras {{tiny}} {how} --set bands=0 -o small"));
     assert!(
@@ -202,17 +202,17 @@ fn a_degree_that_is_asked_for_is_refined_to_its_best() {
             .iter()
             .any(|note| note == "SH coefficients above degree 0 of 3 are dropped, as requested")
     );
-    assert!(summary["bands"].is_null() && why_left(&summary).is_none());
+    assert!(summary["bands"].is_null() && reason_left_out(&summary).is_none());
     let configs = [&model, &workplace.path("small")].map(|model| fs::read_to_string(model.join("cfg_args")).unwrap());
     assert_eq!(configs[1], configs[0].replace("sh_degree=3", "sh_degree=0"));
-    assert_eq!(PlyRows::read(&cloud_of(&workplace.path("small"))).names.len(), 17);
+    assert_eq!(PlyRows::read(&point_cloud(&workplace.path("small"))).names.len(), 17);
 
-    // As many whose bands went after they were refined are further away.
+    // As many Gaussians whose degree was lowered after refinement have a lower PSNR.
     workplace.done(&format!("compress model --cameras {{tiny}} {how} --set bands=all -o whole"));
     workplace.done(
         "compress whole --cameras {tiny} --no-refine --prune-only --ratio 1 --set field=exact --set bands=0 -o late",
     );
-    assert_eq!(PlyRows::read(&cloud_of(&workplace.path("late"))).names.len(), 17);
+    assert_eq!(PlyRows::read(&point_cloud(&workplace.path("late"))).names.len(), 17);
     let psnr = |result: &str| {
         let looks = workplace.done(&format!("evaluate model {result} --cameras {{tiny}} --json"));
         serde_json::from_str::<Value>(&looks).unwrap()["psnr"].as_f64().unwrap()
@@ -222,9 +222,9 @@ fn a_degree_that_is_asked_for_is_refined_to_its_best() {
 }
 
 #[test]
-fn a_degree_that_is_asked_for_holds_in_every_output_and_search() {
+fn asked_degree_holds_in_every_output_and_search() {
     let workplace = Workplace::new();
-    faint_above(&workplace, 3);
+    write_faint_above(&workplace, 3);
     let cameras = "model --cameras {tiny} --no-refine --prune-only --set bands=0";
     for output in ["small.gsz", "small.gseq", "frames --as ply-sequence"] {
         workplace.done(&format!("compress {cameras} --ratio 0.5 -o {output}"));
@@ -236,22 +236,22 @@ fn a_degree_that_is_asked_for_holds_in_every_output_and_search() {
     assert!(found["goal"]["searched"].as_f64().unwrap() >= 20.0, "{}", found["goal"]);
     assert_eq!(PlyRows::read(&workplace.path("one.ply")).names.len(), 17);
 
-    // What goes makes room.
-    let of_size = |bands: &str| {
+    // Removed coefficients make space for more Gaussians.
+    let count_at = |bands: &str| {
         let how = format!("--no-refine --size 80kB --set field=exact --set bands={bands}");
         let summary = workplace.summary(&format!("model --cameras {{tiny}} {how} -o fits{bands}"));
         summary["gaussians"].as_u64().unwrap()
     };
-    let [all, none] = ["all", "0"].map(of_size);
+    let [all, none] = ["all", "0"].map(count_at);
     assert!(none > 2 * all, "{none} at degree 0, {all} at degree 3");
 }
 
 #[test]
-fn a_degree_that_cannot_be_had_is_named() {
+fn impossible_degree_is_refused_by_name() {
     let workplace = Workplace::new();
     let summary = workplace.summary("{tiny} --cameras {tiny} --no-refine --ratio 0.5 --set bands=1 -o small");
-    assert!(why_left(&summary).unwrap().contains("SH head"));
-    assert_eq!(PlyRows::read(&cloud_of(&workplace.path("small"))).names.len(), 62);
+    assert!(reason_left_out(&summary).unwrap().contains("SH head"));
+    assert_eq!(PlyRows::read(&point_cloud(&workplace.path("small"))).names.len(), 62);
     for wrong in ["4", "-1", "some"] {
         let arguments = format!("compress {{tiny}} --set bands={wrong} -o none");
         workplace.refused(2, &arguments, &["--bands", wrong, "expected all, needed, or a degree from 0 to 3"]);
@@ -259,13 +259,13 @@ fn a_degree_that_cannot_be_had_is_named() {
 }
 
 #[test]
-fn so_many_bytes_go_to_the_degree_at_which_they_show_most() {
+fn target_size_picks_the_best_sh_degree() {
     let workplace = Workplace::new();
-    faint_above(&workplace, 0);
+    write_faint_above(&workplace, 0);
     let how = "model --cameras {tiny} --size 85kB --set field=exact --set refine_steps=100 --set refine_cut_steps=20";
     let chosen = workplace.summary(&format!("{how} -o chosen"));
     let all = workplace.summary(&format!("{how} --set bands=all -o all"));
-    let names = |result: &str| PlyRows::read(&cloud_of(&workplace.path(result))).names.len();
+    let names = |result: &str| PlyRows::read(&point_cloud(&workplace.path(result))).names.len();
     assert_eq!([names("chosen"), names("all")], [17, 62]);
     let stage = |summary: &Value| summary["stages"].as_array().unwrap().iter().any(|stage| stage["name"] == "degree");
     assert_eq!([stage(&chosen), stage(&all)], [true, false]);

@@ -1,5 +1,5 @@
-//! Containers whose values are off by a declared bound: as small as that makes them, as close as they say, and read by
-//! whatever reads containers.
+//! Tests of containers whose values differ from the input by at most a declared bound: they are smaller, keep the
+//! bound, and every container reader reads them.
 
 use std::fs;
 
@@ -12,25 +12,26 @@ use splatsieve::source::FrameSource;
 
 const BOUNDS: &str = "position=2e-3,rotation=5e-3,log_scale=1e-2,opacity_logit=2e-2,sh=1e-2";
 
-/// Largest difference between the finite values of a column of two containers, and whether all others are the same.
-fn furthest(workplace: &Workplace, column: Columns) -> (f64, bool) {
+/// Returns the largest difference between the finite values of an attribute in the two containers, and whether all
+/// other values are equal.
+fn largest_difference(workplace: &Workplace, column: Columns) -> (f64, bool) {
     let [exact, within] = ["exact.gseq", "within.gseq"].map(|name| Container::open(&workplace.path(name)).unwrap());
-    let (mut furthest, mut kept) = (0.0f64, true);
+    let (mut largest_difference, mut kept) = (0.0f64, true);
     for frame in 0..exact.info().times.len() {
         let [exact, within] = [&exact, &within].map(|source| state(source, frame));
         for (a, b) in exact.column(column).planes().iter().zip(within.column(column).planes()) {
             match a.is_finite() {
-                true => furthest = furthest.max((f64::from(*a) - f64::from(*b)).abs()),
+                true => largest_difference = largest_difference.max((f64::from(*a) - f64::from(*b)).abs()),
                 false => kept &= a.to_bits() == b.to_bits(),
             }
         }
     }
-    (furthest, kept)
+    (largest_difference, kept)
 }
 
 #[test]
 #[ignore = "needs time"]
-fn every_column_keeps_its_bound_and_the_file_says_it() {
+fn every_attribute_keeps_its_bound_and_names_it() {
     let workplace = Workplace::new();
     workplace.done("demo --gaussians 3000 --frames 48 -o demo");
     workplace.done("convert demo/scene.gseq exact.gseq");
@@ -41,9 +42,9 @@ fn every_column_keeps_its_bound_and_the_file_says_it() {
         let (name, bound) = bound.split_once('=').unwrap();
         let bound: f64 = bound.parse().unwrap();
         let column = Columns::all().iter().find(|column| column.name() == name).unwrap();
-        let (furthest, kept) = furthest(&workplace, column);
-        assert!(furthest <= bound && kept, "{name}: {furthest} off, {bound} promised");
-        assert!(furthest > 0.3 * bound, "{name}: a bound of {bound} is not made use of, {furthest} off");
+        let (largest_difference, kept) = largest_difference(&workplace, column);
+        assert!(largest_difference <= bound && kept, "{name}: {largest_difference} off, {bound} promised");
+        assert!(largest_difference > 0.3 * bound, "{name}: a bound of {bound} is not made use of, {largest_difference} off");
         let column = info["columns"].as_array().unwrap().iter().find(|column| column["name"] == name).unwrap();
         assert_eq!(column["max_error"].as_f64(), Some(bound), "{info}");
     }
@@ -59,22 +60,22 @@ fn every_column_keeps_its_bound_and_the_file_says_it() {
 }
 
 #[test]
-fn columns_without_a_bound_keep_every_bit_and_a_percentage_is_of_the_extent() {
+fn unbounded_attributes_are_exact_percent_is_of_extent() {
     let workplace = Workplace::new();
     workplace.done("convert {tiny} exact.gseq");
     workplace.done("convert {tiny} within.gseq --max-error position=0.1%");
     for column in Columns::all().difference(Columns::POSITION).iter() {
-        assert_eq!(furthest(&workplace, column), (0.0, true), "{}", column.name());
+        assert_eq!(largest_difference(&workplace, column), (0.0, true), "{}", column.name());
     }
     let bound = Reader::open(workplace.path("within.gseq")).unwrap().layout().columns[0].max_error;
-    let (furthest, _) = furthest(&workplace, Columns::POSITION);
-    assert!(furthest <= bound && furthest > 0.3 * bound, "{furthest} off, {bound} promised");
-    // The tiny model's Gaussians lie in a box of some units.
+    let (largest_difference, _) = largest_difference(&workplace, Columns::POSITION);
+    assert!(largest_difference <= bound && largest_difference > 0.3 * bound, "{largest_difference} off, {bound} promised");
+    // The Gaussians of the tiny model lie in a box of a few units.
     assert!((1e-4..1e-1).contains(&bound), "{bound}");
 }
 
 #[test]
-fn threads_change_no_byte() {
+fn bounded_bytes_ignore_thread_count() {
     let workplace = Workplace::new();
     for (name, threads) in [("a", 1), ("b", 3)] {
         fs::create_dir(workplace.path(name)).unwrap();
@@ -84,7 +85,7 @@ fn threads_change_no_byte() {
 }
 
 #[test]
-fn bounds_that_make_no_sense_are_refused_by_name() {
+fn invalid_bounds_are_refused_by_name() {
     let workplace = Workplace::new();
     for (bound, expected) in [
         ("colour=1", "position, rotation, log_scale, opacity_logit, sh"),

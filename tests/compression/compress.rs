@@ -1,5 +1,5 @@
-//! `compress` as a user runs it: what every kind of output holds, and that nothing but the request and
-//! the input decides its bytes.
+//! Tests of `compress`: the contents of every kind of output, and that its bytes depend only on the request and the
+//! input.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -11,8 +11,8 @@ use splatsieve::files::ply_sequence::PlySequence;
 use splatsieve::models::ModelFolder;
 use splatsieve::source::FrameSource;
 
-const N: usize = 300;
-/// Rows of the input by place in the output, from the index map.
+const COUNT: usize = 300;
+/// Returns the rows of the input that make up each place of the output, from the index map.
 fn members(map: &[i64]) -> Vec<Vec<usize>> {
     let count = map.iter().max().map_or(0, |&last| last + 1) as usize;
     let mut members = vec![Vec::new(); count];
@@ -22,14 +22,14 @@ fn members(map: &[i64]) -> Vec<Vec<usize>> {
     members
 }
 
-fn cloud(model: &Path) -> std::path::PathBuf {
+fn point_cloud(model: &Path) -> std::path::PathBuf {
     let folders = fs::read_dir(model.join("point_cloud")).unwrap();
     folders.map(|entry| entry.unwrap().path().join("point_cloud.ply")).next().unwrap()
 }
 
-/// The output folder is the input with fewer rows: whoever was not merged has its bytes in the file and
-/// its bits at every one of `frames`.
-fn kept_gaussians_are_untouched(workplace: &Workplace, model: &Path, preset: &str, frames: &[usize]) {
+/// Checks that the output folder is the input with fewer rows: every Gaussian that was not merged keeps its bytes in
+/// the file and its bits at each of `frames`.
+fn assert_kept_are_untouched(workplace: &Workplace, model: &Path, preset: &str, frames: &[usize]) {
     let name = format!("out_{preset}");
     let (input, output) = (model.display().to_string(), workplace.path(&name));
     let summary = workplace.summary(&format!(
@@ -38,7 +38,7 @@ fn kept_gaussians_are_untouched(workplace: &Workplace, model: &Path, preset: &st
     ));
     let map = index_map(&output.join("index_map.npy"));
     let members = members(&map);
-    let (before, after) = (PlyRows::read(&cloud(model)), PlyRows::read(&cloud(&output)));
+    let (before, after) = (PlyRows::read(&point_cloud(model)), PlyRows::read(&point_cloud(&output)));
     assert_eq!(map.len(), before.rows.len());
     assert_eq!(members.len(), after.rows.len());
     assert_eq!(summary["gaussians"], after.rows.len());
@@ -69,7 +69,7 @@ fn kept_gaussians_are_untouched(workplace: &Workplace, model: &Path, preset: &st
 fn kept_gaussians_of_the_tiny_model_are_untouched_at_every_frame() {
     let workplace = Workplace::new();
     for preset in ["paper", "default"] {
-        kept_gaussians_are_untouched(&workplace, &tiny(), preset, &(0..10).collect::<Vec<_>>());
+        assert_kept_are_untouched(&workplace, &tiny(), preset, &(0..10).collect::<Vec<_>>());
     }
 }
 
@@ -79,7 +79,7 @@ fn kept_gaussians_of_deform2_are_untouched() {
     let model = shared("deform2");
     let workplace = Workplace::new();
     for preset in ["paper", "default"] {
-        kept_gaussians_are_untouched(&workplace, &model, preset, &[0, 31, 59]);
+        assert_kept_are_untouched(&workplace, &model, preset, &[0, 31, 59]);
     }
 }
 
@@ -126,7 +126,7 @@ fn targets_out_of_reach_are_refused() {
 }
 
 #[test]
-fn ablations_leave_out_a_stage() {
+fn only_options_leave_out_a_stage() {
     let workplace = Workplace::new();
     let pruned = workplace.summary("{tiny} -o pruned --preset paper --prune-only");
     assert_eq!(pruned["gaussians"], 240, "stage 1 keeps 80% of 300");
@@ -142,12 +142,12 @@ fn ablations_leave_out_a_stage() {
 }
 
 #[test]
-fn what_the_user_keeps_stays_alone_and_what_the_user_drops_goes() {
+fn kept_ids_stay_unmerged_and_dropped_ids_go() {
     let workplace = Workplace::new();
     fs::write(workplace.path("drop.txt"), "# seen in a viewer\n20-29\n250\n").unwrap();
     workplace.done("compress {tiny} -o out --preset paper --keep-ids 0-9,299 --drop-ids drop.txt --count 40");
     let map = index_map(&workplace.path("out/index_map.npy"));
-    let (before, after) = (PlyRows::read(&cloud(&tiny())), PlyRows::read(&cloud(&workplace.path("out"))));
+    let (before, after) = (PlyRows::read(&point_cloud(&tiny())), PlyRows::read(&point_cloud(&workplace.path("out"))));
     assert_eq!(after.rows.len(), 40);
     for id in (0..10).chain([299]) {
         assert!(map[id] >= 0 && after.rows[map[id] as usize] == before.rows[id], "Gaussian {id} is to be kept");
@@ -157,7 +157,7 @@ fn what_the_user_keeps_stays_alone_and_what_the_user_drops_goes() {
 }
 
 #[test]
-fn box_keeps_who_is_inside_at_the_reference_frame() {
+fn keep_box_keeps_gaussians_in_it_at_the_reference_frame() {
     let workplace = Workplace::new();
     let summary = workplace.summary(
         "{tiny} -o out --preset paper --keep-box -0.4,-0.4,-0.4,0.4,0.4,0.4 --set keep_fraction=0.1 --drop-ids 0",
@@ -167,7 +167,7 @@ fn box_keeps_who_is_inside_at_the_reference_frame() {
     let state = state(scene.source(), frame);
     let map = index_map(&workplace.path("out/index_map.npy"));
     let inside: Vec<usize> =
-        (1..N).filter(|&i| state.position.row::<3>(i).iter().all(|x| (-0.4..=0.4).contains(&f64::from(*x)))).collect();
+        (1..COUNT).filter(|&i| state.position.row::<3>(i).iter().all(|x| (-0.4..=0.4).contains(&f64::from(*x)))).collect();
     assert!(inside.len() > 30, "{} inside", inside.len());
     for id in inside {
         assert!(map[id] >= 0, "Gaussian {id} is in the box");
@@ -176,14 +176,14 @@ fn box_keeps_who_is_inside_at_the_reference_frame() {
 }
 
 #[test]
-fn dry_run_writes_nothing_and_tells_the_count() {
+fn dry_run_writes_nothing_and_predicts_the_count() {
     let workplace = Workplace::new();
     let planned = workplace.summary("{tiny} -o out --ratio 0.37 --dry-run");
     assert!(files(&workplace.path("")).is_empty());
     let done = workplace.summary("{tiny} -o out --ratio 0.37");
     assert_eq!(planned["gaussians"], done["gaussians"]);
     assert!(planned["output_bytes"].is_null());
-    // The model as a whole, without what lies beside it.
+    // Size of the model itself, without the files beside it.
     let beside = ["recipe.toml", "index_map.npy", "summary.json"];
     let files = files(&workplace.path("out"));
     let own = files.iter().filter(|(name, _)| !beside.contains(&name.to_str().unwrap()));
@@ -198,7 +198,7 @@ fn all_kinds_of_output_hold_the_same_gaussians() {
             workplace.done(&format!("compress {{tiny}} --preset {preset} --set field=exact --overwrite -o {output}"));
         }
         let folder = workplace.path("folder");
-        assert_eq!(fs::read(workplace.path("one.ply")).unwrap(), fs::read(cloud(&folder)).unwrap());
+        assert_eq!(fs::read(workplace.path("one.ply")).unwrap(), fs::read(point_cloud(&folder)).unwrap());
         let map = fs::read(folder.join("index_map.npy")).unwrap();
         for other in ["one.gseq.index_map.npy", "one.ply.index_map.npy", "frames/index_map.npy"] {
             assert!(fs::read(workplace.path(other)).unwrap() == map, "{other}");
@@ -222,7 +222,7 @@ fn all_kinds_of_output_hold_the_same_gaussians() {
 }
 
 #[test]
-fn explicit_trajectories_keep_the_bits_of_whoever_stays() {
+fn explicit_trajectories_keep_the_bits_of_survivors() {
     let workplace = Workplace::new();
     workplace.done("convert {tiny} scene.gseq");
     workplace.done("convert scene.gseq frames --as ply-sequence");
@@ -249,9 +249,9 @@ fn explicit_trajectories_keep_the_bits_of_whoever_stays() {
 
 #[test]
 #[ignore = "needs time"]
-fn threads_change_no_byte() {
+fn compressed_bytes_ignore_thread_count() {
     let workplace = Workplace::new();
-    // More Gaussians than one block of work holds.
+    // More Gaussians than one block.
     workplace.done("demo --gaussians 3000 --frames 6 -o demo");
     let mut seen = BTreeSet::new();
     for request in [
@@ -280,7 +280,7 @@ fn threads_change_no_byte() {
 
 #[test]
 #[ignore = "needs the trained models"]
-fn threads_change_no_byte_of_deform2() {
+fn bytes_of_deform2_ignore_thread_count() {
     let model = shared("deform2");
     let workplace = Workplace::new();
     let input = model.display();
@@ -307,16 +307,16 @@ fn recipe_beside_a_result_repeats_it() {
 }
 
 #[test]
-fn results_of_results_are_results() {
+fn results_can_be_compressed_again() {
     let workplace = Workplace::new();
     let cameras = tiny().display().to_string();
     workplace.done(&format!("compress {{tiny}} --cameras {cameras} -o first --count 120"));
     workplace.done(&format!("compress first --cameras {cameras} -o second --count 60"));
-    assert_eq!(PlyRows::read(&cloud(&workplace.path("second"))).rows.len(), 60);
+    assert_eq!(PlyRows::read(&point_cloud(&workplace.path("second"))).rows.len(), 60);
 }
 
 #[test]
-fn overwrite_replaces_an_earlier_result_whole() {
+fn overwrite_replaces_an_earlier_result_completely() {
     let workplace = Workplace::new();
     workplace.done("compress {tiny} -o out --preset paper");
     workplace.done("compress {tiny} -o fresh --preset default");

@@ -1,4 +1,4 @@
-//! Asking for quality or for bytes instead of a count, as a user does.
+//! Tests of requests for a quality or a size in bytes in place of a count.
 
 use std::fs;
 use std::path::Path;
@@ -6,38 +6,39 @@ use std::path::Path;
 use crate::scene::{Workplace, files};
 use serde_json::Value;
 
-/// A made-up scene, `demo/scene.gseq`, with its cameras.
+/// Returns a workplace with a generated scene, `demo/scene.gseq`, and its cameras.
 fn with_demo() -> Workplace {
     let workplace = Workplace::new();
     workplace.done("demo --gaussians 800 --frames 4 -o demo");
     workplace
 }
 
-/// How to have it refined quickly.
-const QUICKLY: &str = "demo/scene.gseq --cameras demo/cameras.json --set refine_steps=120 --set refine_cut_steps=20";
+/// Arguments for a short refinement.
+const SHORT_REFINEMENT: &str = "demo/scene.gseq --cameras demo/cameras.json --set refine_steps=120 --set refine_cut_steps=20";
 
-/// Bytes of everything below `folder`, or of `folder` and what lies beside it under its name.
+/// Returns the bytes of all files below the output folder, or of the output file and the files beside it that begin
+/// with its name.
 fn bytes_written(workplace: &Workplace, output: &str) -> u64 {
-    let of = |name: &Path| name.starts_with(output) || name.to_string_lossy().starts_with(&format!("{output}."));
-    files(&workplace.path("")).into_iter().filter(|(name, _)| of(name)).map(|(_, bytes)| bytes.len() as u64).sum()
+    let belongs = |name: &Path| name.starts_with(output) || name.to_string_lossy().starts_with(&format!("{output}."));
+    files(&workplace.path("")).into_iter().filter(|(name, _)| belongs(name)).map(|(_, bytes)| bytes.len() as u64).sum()
 }
 
 #[test]
-fn the_fewest_that_keep_a_psnr_are_found_and_reported_by_pictures_that_nothing_was_searched_on() {
+fn psnr_search_is_reported_on_separate_views() {
     let workplace = with_demo();
     let found = [32.0, 38.0].map(|least| {
-        let summary = workplace.summary(&format!("{QUICKLY} --min-psnr {least}dB --overwrite -o small.gseq"));
+        let summary = workplace.summary(&format!("{SHORT_REFINEMENT} --min-psnr {least}dB --overwrite -o small.gseq"));
         let goal = &summary["goal"];
         let number = |name: &str| goal[name].as_f64().unwrap();
         assert_eq!((goal["name"].as_str(), number("asked")), (Some("min_psnr"), least));
         assert!(number("searched") >= least, "{goal}");
         assert!((number("held") - number("searched")).abs() < 3.0, "{goal}");
         assert!(goal["held_pictures"].as_array().unwrap().len() >= 100, "{goal}");
-        // Every size that was tried and does is at least as large.
+        // Every tried count that reaches the PSNR is at least as large as the chosen one.
         let count = summary["gaussians"].as_u64().unwrap();
-        let does = |tried: &&Value| tried[1].as_f64().unwrap() >= least;
+        let reaches = |tried: &&Value| tried[1].as_f64().unwrap() >= least;
         let tried = goal["tried"].as_array().unwrap();
-        assert_eq!(tried.iter().filter(does).map(|tried| tried[0].as_u64().unwrap()).min(), Some(count));
+        assert_eq!(tried.iter().filter(reaches).map(|tried| tried[0].as_u64().unwrap()).min(), Some(count));
         let recipe = fs::read_to_string(workplace.path("small.gseq.recipe.toml")).unwrap();
         assert!(recipe.contains(&format!("min_psnr = {least:.1}")), "{recipe}");
         count
@@ -46,25 +47,25 @@ fn the_fewest_that_keep_a_psnr_are_found_and_reported_by_pictures_that_nothing_w
 }
 
 #[test]
-fn what_cannot_be_had_with_less_is_everything_and_nothing_is_refined_where_nothing_may_move() {
+fn unreachable_psnr_keeps_all_and_no_refine_holds() {
     let workplace = with_demo();
-    let summary = workplace.summary(&format!("{QUICKLY} --no-refine --min-psnr 99 --overwrite -o small.gseq"));
+    let summary = workplace.summary(&format!("{SHORT_REFINEMENT} --no-refine --min-psnr 99 --overwrite -o small.gseq"));
     assert!(summary["goal"]["searched"].as_f64().unwrap() >= 99.0, "{summary}");
     let stages: Vec<&str> =
         summary["stages"].as_array().unwrap().iter().map(|stage| stage["name"].as_str().unwrap()).collect();
     assert!(stages.contains(&"search") && !stages.contains(&"refine"), "{stages:?}");
-    let other = workplace.summary(&format!("{QUICKLY} --no-refine --min-psnr 30 --overwrite -o small.gseq"));
+    let other = workplace.summary(&format!("{SHORT_REFINEMENT} --no-refine --min-psnr 30 --overwrite -o small.gseq"));
     assert!(other["gaussians"].as_u64() < summary["gaussians"].as_u64());
 }
 
 #[test]
 #[ignore = "needs time"]
-fn a_loss_is_that_of_what_photographs_show() {
+fn max_loss_compares_with_photographs() {
     let workplace = with_demo();
     workplace.done("render demo/scene.gseq --cameras demo/cameras.json --all --split all -o photographs");
-    let summary = workplace.summary(&format!("{QUICKLY} --max-loss 60dB --ground-truth photographs -o small.gseq"));
+    let summary = workplace.summary(&format!("{SHORT_REFINEMENT} --max-loss 60dB --ground-truth photographs -o small.gseq"));
     let goal = &summary["goal"];
-    // Photographs that are renders of the original keep 59 dB for their 8 bits.
+    // Photographs that are renders of the original reach 59 dB with their 8 bits.
     assert_eq!(goal["name"], "max_loss");
     let (searched, held) = (goal["searched"].as_f64().unwrap(), goal["held"].as_f64().unwrap());
     assert!(searched <= 60.0 && (searched - held).abs() < 3.0, "{goal}");
@@ -73,7 +74,7 @@ fn a_loss_is_that_of_what_photographs_show() {
         "{goal}"
     );
     let tighter = workplace.summary(&format!(
-        "{QUICKLY} --no-refine --max-loss 22dB --ground-truth photographs --overwrite -o small.gseq"
+        "{SHORT_REFINEMENT} --no-refine --max-loss 22dB --ground-truth photographs --overwrite -o small.gseq"
     ));
     assert!(tighter["gaussians"].as_u64() > summary["gaussians"].as_u64(), "{}", tighter["goal"]);
     assert!(tighter["goal"]["searched"].as_f64().unwrap() <= 22.0, "{}", tighter["goal"]);
@@ -81,11 +82,11 @@ fn a_loss_is_that_of_what_photographs_show() {
 
 #[test]
 #[ignore = "needs time"]
-fn everything_that_is_written_has_at_most_the_bytes_asked_for_and_hardly_less() {
+fn output_size_is_just_below_the_target() {
     let workplace = with_demo();
     let model = "{tiny} --cameras {tiny} --set refine_steps=40 --set refine_cut_steps=10";
     for (how, output, most) in
-        [(QUICKLY, "small.gseq", 90_000u64), (QUICKLY, "frames", 400_000), (model, "model", 110_000)]
+        [(SHORT_REFINEMENT, "small.gseq", 90_000u64), (SHORT_REFINEMENT, "frames", 400_000), (model, "model", 110_000)]
     {
         let kind = if output == "frames" { "--as ply-sequence" } else { "" };
         let summary = workplace.summary(&format!("{how} --size {most}B {kind} -o {output}"));
@@ -93,11 +94,11 @@ fn everything_that_is_written_has_at_most_the_bytes_asked_for_and_hardly_less() 
         assert!(written <= most && written > most * 9 / 10 - 24_576, "{output}: {written} of {most}, {summary}");
         assert!(summary["gaussians"].as_u64().unwrap() > 30, "{summary}");
     }
-    workplace.refused(2, &format!("compress {QUICKLY} --size 20KB -o none.gseq"), &["one Gaussian", "20000"]);
+    workplace.refused(2, &format!("compress {SHORT_REFINEMENT} --size 20KB -o none.gseq"), &["one Gaussian", "20000"]);
 }
 
 #[test]
-fn goals_that_contradict_each_other_are_refused() {
+fn contradictory_targets_are_refused() {
     let workplace = Workplace::new();
     for (arguments, part) in [
         ("--max-loss 0.5", "--ground-truth"),
@@ -116,8 +117,8 @@ fn goals_that_contradict_each_other_are_refused() {
 
 #[test]
 #[ignore = "needs time"]
-fn more_bytes_than_everything_takes_leave_out_what_is_to_be_dropped_alone() {
+fn target_size_above_the_input_only_drops_named_ids() {
     let workplace = with_demo();
-    let summary = workplace.summary(&format!("{QUICKLY} --no-refine --size 10MB --drop-ids 5-14 -o small.gseq"));
+    let summary = workplace.summary(&format!("{SHORT_REFINEMENT} --no-refine --size 10MB --drop-ids 5-14 -o small.gseq"));
     assert_eq!(summary["gaussians"], 790);
 }

@@ -1,4 +1,4 @@
-//! Frames that do not know one another: what a folder of PLY files whose Gaussians differ in number and order becomes.
+//! Tests of frames without shared Gaussian ids: folders of PLY files whose Gaussians differ in number and order.
 
 use std::collections::BTreeMap;
 use std::f64::consts::PI;
@@ -15,13 +15,13 @@ use splatsieve::scene::{InputOptions, Scene, open_scene};
 
 const FRAMES: usize = 37;
 
-/// Even numbers in [0, 1) that follow from what they are for.
-fn uniform(of: u64) -> f32 {
-    (hash_id(of) >> 40) as f32 / (1u64 << 24) as f32
+/// Returns a number evenly distributed in [0, 1) that depends only on `seed`.
+fn uniform(seed: u64) -> f32 {
+    (hash_id(seed) >> 40) as f32 / (1u64 << 24) as f32
 }
 
-/// Gaussian `i` of a cloud at a frame: on a circle of its own.
-fn row(i: usize, frame: usize, out: &mut Gaussians, at: usize) {
+/// Writes Gaussian `i` at a frame to row `at` of `out`; each Gaussian moves on its own circle.
+fn write_row(i: usize, frame: usize, out: &mut Gaussians, at: usize) {
     let value = |k: u64| uniform(64 * i as u64 + k);
     let angle = 0.05 * frame as f32 + 6.0 * value(0);
     let size = -4.5 + value(1);
@@ -32,17 +32,18 @@ fn row(i: usize, frame: usize, out: &mut Gaussians, at: usize) {
     out.sh.set_row(at, [13, 14, 15].map(|k| 3.0 * value(k) - 1.5));
 }
 
-/// Frame `frame` of `count` Gaussians of which those that `lives` names are there, in an order of its own.
-fn frame(count: usize, frame: usize, lives: impl Fn(usize) -> bool) -> (Gaussians, Vec<usize>) {
-    let mut order: Vec<usize> = (0..count).filter(|&i| lives(i)).collect();
+/// Returns frame `frame` with the Gaussians of `0..count` that are alive by `is_alive`, in an order that differs by frame,
+/// and their ids.
+fn frame(count: usize, frame: usize, is_alive: impl Fn(usize) -> bool) -> (Gaussians, Vec<usize>) {
+    let mut order: Vec<usize> = (0..count).filter(|&i| is_alive(i)).collect();
     order.sort_by_key(|&i| hash_id((i as u64) << 20 | frame as u64));
     let mut out = Gaussians::zeros(order.len(), 1);
-    order.iter().enumerate().for_each(|(at, &i)| row(i, frame, &mut out, at));
+    order.iter().enumerate().for_each(|(at, &i)| write_row(i, frame, &mut out, at));
     (out, order)
 }
 
-/// Whether a Gaussian lives: all begin and end at frames of their own, and are away for two frames in between.
-fn lives(i: usize, frame: usize) -> bool {
+/// Returns whether a Gaussian is alive: each begins and ends at its own frames and is absent for two frames in between.
+fn is_alive(i: usize, frame: usize) -> bool {
     let begins = (hash_id(i as u64) % 60) as usize;
     let age = (frame + 30).wrapping_sub(begins);
     age < 25 && !(8..10).contains(&age)
@@ -50,7 +51,7 @@ fn lives(i: usize, frame: usize) -> bool {
 
 fn write_frames(workplace: &Workplace, folder: &str, count: usize) -> Vec<Vec<usize>> {
     let write = |t: usize| {
-        let (gaussians, order) = frame(count, t, |i| lives(i, t));
+        let (gaussians, order) = frame(count, t, |i| is_alive(i, t));
         workplace.ply(&format!("{folder}/f_{t}.ply"), &gaussians);
         order
     };
@@ -63,17 +64,17 @@ fn open(workplace: &Workplace, folder: &str, link: Link) -> Scene {
 }
 
 #[test]
-fn frames_of_other_numbers_become_tracks_that_hold_every_row_to_the_bit() {
+fn tracks_hold_every_row_of_unlinked_frames_to_the_bit() {
     let workplace = Workplace::new();
-    // Several blocks of Gaussians, so that some are not there yet for a while, and others no longer.
+    // Several blocks of Gaussians, some of which begin late or end early.
     let orders = write_frames(&workplace, "frames", 4000);
     let scene = open(&workplace, "frames", Link::Apart);
     let count = scene.source().info().count;
-    let lived = (0..4000).filter(|&i| (0..FRAMES).any(|t| lives(i, t))).count();
+    let lived = (0..4000).filter(|&i| (0..FRAMES).any(|t| is_alive(i, t))).count();
     assert_eq!(count, lived, "one track per Gaussian, across gaps of two frames");
     let mut whose: BTreeMap<usize, usize> = BTreeMap::new();
     for (t, order) in orders.iter().enumerate() {
-        let (given, found) = (frame(4000, t, |i| lives(i, t)).0, state(scene.source(), t));
+        let (given, found) = (frame(4000, t, |i| is_alive(i, t)).0, state(scene.source(), t));
         let rows: BTreeMap<Vec<u32>, usize> = (0..count).map(|track| (bits(&found, track), track)).collect();
         for (at, &i) in order.iter().enumerate() {
             let track = rows.get(&bits(&given, at)).unwrap_or_else(|| panic!("Gaussian {i} is not in frame {t}"));
@@ -82,9 +83,9 @@ fn frames_of_other_numbers_become_tracks_that_hold_every_row_to_the_bit() {
         let there = found.opacity_logit.plane(0).iter().filter(|&&logit| logit > -40.0).count();
         assert_eq!(there, order.len(), "those of frame {t} alone are seen");
     }
-    // Held where they are not, so that nothing moves.
+    // Before and after its life a track keeps its state, so that it does not move.
     for (&i, &track) in &whose {
-        let alive: Vec<usize> = (0..FRAMES).filter(|&t| lives(i, t)).collect();
+        let alive: Vec<usize> = (0..FRAMES).filter(|&t| is_alive(i, t)).collect();
         for t in [0, FRAMES - 1] {
             let nearest = if t == 0 { alive[0] } else { *alive.last().unwrap() };
             let (there, held) = (state(scene.source(), nearest), state(scene.source(), t));
@@ -99,7 +100,7 @@ fn frames_of_other_numbers_become_tracks_that_hold_every_row_to_the_bit() {
 }
 
 #[test]
-fn frames_are_linked_where_their_order_does_not_tell_or_where_asked() {
+fn frames_are_linked_if_rows_differ_or_on_request() {
     let workplace = Workplace::new();
     for t in 0..9 {
         let (mixed, order) = frame(500, t, |_| true);
@@ -113,7 +114,7 @@ fn frames_are_linked_where_their_order_does_not_tell_or_where_asked() {
     assert_eq!(kind("mixed", Link::Auto), "linked PLY frames");
     assert_eq!(kind("mixed", Link::Never), "PLY frames");
     assert_eq!(kind("kept", Link::Always), "linked PLY frames");
-    // By their first order, the same tracks are the same Gaussians.
+    // Both have the same tracks in the order of the first frame.
     let (kept, linked) = (open(&workplace, "kept", Link::Never), open(&workplace, "kept", Link::Always));
     assert_eq!(state(kept.source(), 8), state(linked.source(), 8));
     let said = workplace.done("compress mixed -o out --ratio 0.5 --no-refine --verbose --link always");
@@ -124,7 +125,7 @@ fn frames_are_linked_where_their_order_does_not_tell_or_where_asked() {
         said.contains("frames have a common order: Gaussians of the same index are nearer than unrelated ones"),
         "{said}"
     );
-    // What a work folder keeps of one opening is not taken for the other's.
+    // Cache entries of one way to open the frames are not used for the other.
     let small = "compress mixed --ratio 0.5 --no-refine --cache work --link";
     workplace.done(&format!("{small} never -o never"));
     workplace.done(&format!("{small} always -o again"));
@@ -133,7 +134,7 @@ fn frames_are_linked_where_their_order_does_not_tell_or_where_asked() {
 }
 
 #[test]
-fn what_is_kept_is_written_as_frames_of_what_lives_in_them() {
+fn frames_are_written_with_the_gaussians_alive_in_them() {
     let workplace = Workplace::new();
     write_frames(&workplace, "frames", 900);
     workplace.done("compress frames -o all --ratio 1 --no-refine --prune-only --set bands=all --link apart");
@@ -144,7 +145,7 @@ fn what_is_kept_is_written_as_frames_of_what_lives_in_them() {
         left.sort();
         assert!(given == left, "frame {t}: all rows, in another order");
     }
-    // Half of the tracks, merged too: every frame has fewer rows, none that nobody sees.
+    // Half of the tracks, with merging: every frame has fewer rows, and none is invisible.
     workplace.done("compress frames -o half --ratio 0.5");
     for t in 0..FRAMES {
         let (given, left) = (rows("frames", t).len(), rows("half", t).len());
@@ -155,9 +156,9 @@ fn what_is_kept_is_written_as_frames_of_what_lives_in_them() {
     workplace.done("info half");
 }
 
-/// Frame `t` of Gaussians whose lives begin anew every seven frames, for two of which the old fades out while the new fades
-/// in: both together as opaque as `row` says.
-fn fading(count: usize, t: usize) -> Gaussians {
+/// Returns frame `t` of Gaussians that are replaced every seven frames. The old one fades out over two frames while the
+/// new one fades in, and both together are as opaque as `write_row` makes one.
+fn fading_frame(count: usize, t: usize) -> Gaussians {
     let parts = |i: usize| match (t + (hash_id(i as u64) % 7) as usize) % 7 {
         phase @ (0 | 1) if t > phase => vec![(phase + 1) as f64 / 3.0, (2 - phase) as f64 / 3.0],
         _ => vec![1.0],
@@ -167,7 +168,7 @@ fn fading(count: usize, t: usize) -> Gaussians {
     rows.sort_by_key(|&(i, k, _)| hash_id((i as u64) << 20 | (k as u64) << 40 | t as u64));
     let mut out = Gaussians::zeros(rows.len(), 1);
     for (at, (i, _, part)) in rows.into_iter().enumerate() {
-        row(i, t, &mut out, at);
+        write_row(i, t, &mut out, at);
         let alpha = 1.0 - (1.0 + f64::from(out.opacity_logit.plane(0)[at]).exp()).powf(-part);
         out.opacity_logit.set_row(at, [(alpha / (1.0 - alpha)).ln() as f32]);
     }
@@ -175,11 +176,11 @@ fn fading(count: usize, t: usize) -> Gaussians {
 }
 
 #[test]
-fn lives_that_fade_into_one_another_are_one_track_and_one_row() {
+fn lives_that_fade_into_one_another_become_one_track() {
     let workplace = Workplace::new();
     let (count, frames) = (600, 21);
     for t in 0..frames {
-        workplace.ply(&format!("frames/{t}.ply"), &fading(count, t));
+        workplace.ply(&format!("frames/{t}.ply"), &fading_frame(count, t));
     }
     let (apart, joined) = (open(&workplace, "frames", Link::Apart), open(&workplace, "frames", Link::Auto));
     let [apart_count, joined_count] = [&apart, &joined].map(|scene| scene.source().info().count);
@@ -191,12 +192,12 @@ fn lives_that_fade_into_one_another_are_one_track_and_one_row() {
         "{notes}"
     );
     assert!(!apart.input.notes().join("\n").contains("were joined"));
-    // As opaque as both were, in one row.
+    // One row has the opacity of both.
     workplace.done("compress frames -o all --ratio 1 --no-refine --prune-only --set bands=all");
     let mut one_row = 0;
     for t in 0..frames {
         let (mut whole, ply) = (Gaussians::zeros(count, 1), PlyRows::read(&workplace.path(&format!("all/{t}.ply"))));
-        (0..count).for_each(|i| row(i, t, &mut whole, i));
+        (0..count).for_each(|i| write_row(i, t, &mut whole, i));
         let there = joined.source();
         let found = state(there, t);
         let living: Vec<usize> = (0..found.len()).filter(|&i| found.opacity_logit.plane(0)[i] > -30.0).collect();
@@ -211,21 +212,21 @@ fn lives_that_fade_into_one_another_are_one_track_and_one_row() {
         }
     }
     assert!(one_row * 100 >= 97 * count * frames, "{one_row} of {} are in one row", count * frames);
-    // Held apart where that is asked for, and so recorded.
+    // They stay separate on request, and the recipe records it.
     workplace.done("compress frames -o apart --ratio 1 --no-refine --prune-only --set bands=all --link apart");
     let rows = |folder: &str| PlyRows::read(&workplace.path(&format!("{folder}/8.ply"))).rows.len();
     assert!(rows("apart") == rows("frames") && rows("all") < rows("apart"), "{} {}", rows("all"), rows("apart"));
     assert!(fs::read_to_string(workplace.path("apart/recipe.toml")).unwrap().contains("link = \"apart\""));
 }
 
-/// Frame `t` of Gaussians that change along time by parts of their own, so that of every column some are steady and some are
-/// not.
-fn trembling(count: usize, t: usize) -> Gaussians {
+/// Returns frame `t` of Gaussians whose attributes vary by amounts of their own, so that each attribute is steady in
+/// some Gaussians and not in others.
+fn varying_frame(count: usize, t: usize) -> Gaussians {
     let mut out = Gaussians::zeros(count, 1);
     for i in 0..count {
-        row(i, t, &mut out, i);
+        write_row(i, t, &mut out, i);
         let tremble = |k: u64, most: f32| {
-            let part = |of: u64| uniform(hash_id((i as u64) << 20 | k << 12 | of));
+            let part = |seed: u64| uniform(hash_id((i as u64) << 20 | k << 12 | seed));
             2.0 * most * part(4000) * (part(t as u64) - 0.5) * 3f32.sqrt()
         };
         for (c, value) in (0..).zip(out.sh.row::<12>(i)) {
@@ -234,7 +235,7 @@ fn trembling(count: usize, t: usize) -> Gaussians {
         let [scales, turn] = [(20, 0.03), (30, 0.01)].map(|(k, most)| [0, 1, 2].map(|c| tremble(k + c, most)));
         (0..3).for_each(|c| out.log_scale.plane_mut(c)[i] += scales[c]);
         let [w, x, y, z] = out.rotation.row(i);
-        // Half of them with the other sign.
+        // Half of the quaternions have the opposite sign.
         let sign = if uniform((i as u64) << 20 | t as u64) < 0.5 { -1.0 } else { 1.0 };
         out.rotation.set_row(i, [w + turn[0], x + turn[1], y + turn[2], z].map(|q| sign * q));
         out.opacity_logit.set_row(i, [out.opacity_logit.plane(0)[i] + tremble(40, 0.25)]);
@@ -244,9 +245,9 @@ fn trembling(count: usize, t: usize) -> Gaussians {
     out.pick(&order)
 }
 
-/// What the documentation of `steady` says of one track, in f64: the means of rotation, scales, opacity logit and colors, and
-/// by how much each changes, over its bound.
-fn steadiness(frames: &[Gaussians], track: usize) -> [(Vec<f64>, f64); 4] {
+/// Computes in f64 the definition in the documentation of `steady` for one track: the mean of rotation, scales, opacity
+/// logit and colors, each with its variation divided by its bound.
+fn mean_and_variation(frames: &[Gaussians], track: usize) -> [(Vec<f64>, f64); 4] {
     let values = |column: &dyn Fn(&Gaussians) -> Vec<f32>| -> Vec<Vec<f64>> {
         frames.iter().map(|frame| column(frame).into_iter().map(f64::from).collect()).collect()
     };
@@ -256,10 +257,10 @@ fn steadiness(frames: &[Gaussians], track: usize) -> [(Vec<f64>, f64); 4] {
     let mean = |rows: &[Vec<f64>]| -> Vec<f64> {
         (0..rows[0].len()).map(|c| rows.iter().zip(&alphas).map(|(row, a)| a * row[c]).sum::<f64>() / weight).collect()
     };
-    let rms = |rows: &[Vec<f64>], of: &dyn Fn(Vec<f64>) -> f64| {
+    let rms = |rows: &[Vec<f64>], length: &dyn Fn(Vec<f64>) -> f64| {
         let mean = mean(rows);
         let differ = |row: &Vec<f64>| row.iter().zip(&mean).map(|(a, b)| a - b).collect();
-        (rows.iter().zip(&alphas).map(|(row, a)| a * of(differ(row))).sum::<f64>() / weight).sqrt()
+        (rows.iter().zip(&alphas).map(|(row, a)| a * length(differ(row))).sum::<f64>() / weight).sqrt()
     };
     let mut turns = values(&|frame| frame.rotation.row::<4>(track).to_vec());
     let first = turns[0].clone();
@@ -289,11 +290,11 @@ fn steadiness(frames: &[Gaussians], track: usize) -> [(Vec<f64>, f64); 4] {
 }
 
 #[test]
-fn what_hardly_changes_along_a_track_is_held_at_its_mean() {
+fn steady_attributes_of_a_track_become_their_mean() {
     let workplace = Workplace::new();
     let (count, frames) = (400, 12);
     for t in 0..frames {
-        workplace.ply(&format!("frames/{t}.ply"), &trembling(count, t));
+        workplace.ply(&format!("frames/{t}.ply"), &varying_frame(count, t));
     }
     let (apart, held) = (open(&workplace, "frames", Link::Apart), open(&workplace, "frames", Link::Always));
     let [given, found] = [&apart, &held].map(|scene| {
@@ -301,7 +302,7 @@ fn what_hardly_changes_along_a_track_is_held_at_its_mean() {
         states
     });
     let mut parts = [[0, 0]; 4];
-    // Tracks that are there in all frames, and are so of one life.
+    // Tracks of a single life that are alive in all frames.
     let whole = |states: &[Gaussians], track: usize| {
         let is_there = states.iter().all(|frame| frame.opacity_logit.plane(0)[track] > -39.0);
         is_there.then(|| {
@@ -312,7 +313,7 @@ fn what_hardly_changes_along_a_track_is_held_at_its_mean() {
         (0..found[0].len()).filter_map(|track| Some((whole(&found, track)?, track))).collect();
     for given_as in 0..given[0].len() {
         let Some(&found_as) = whole(&given, given_as).and_then(|place| places.get(&place)) else { continue };
-        for (kind, (mean, change)) in steadiness(&given, given_as).into_iter().enumerate() {
+        for (kind, (mean, change)) in mean_and_variation(&given, given_as).into_iter().enumerate() {
             let columns = |frame: &Gaussians, track: usize| match kind {
                 0 => frame.rotation.row::<4>(track).to_vec(),
                 1 => frame.log_scale.row::<3>(track).to_vec(),
@@ -335,7 +336,7 @@ fn what_hardly_changes_along_a_track_is_held_at_its_mean() {
     assert!(parts.iter().flatten().all(|&part| part > 20), "{parts:?}");
     let notes = held.input.notes().join("\n");
     assert!(notes.contains("% of the colors (within 0.04)") && notes.contains("renders stay within"), "{notes}");
-    // Files say the same, to the bit.
+    // The written files have the same values, to the bit.
     workplace.done("compress frames -o all --ratio 1 --no-refine --prune-only --set bands=all");
     for (t, found) in found.iter().enumerate() {
         let ply = PlyRows::read(&workplace.path(&format!("all/{t}.ply")));
@@ -354,10 +355,10 @@ fn what_hardly_changes_along_a_track_is_held_at_its_mean() {
 
 #[test]
 #[ignore = "needs time"]
-fn threads_and_memory_change_nothing() {
+fn linking_ignores_thread_count_and_memory() {
     let workplace = Workplace::new();
     for t in 0..20 {
-        workplace.ply(&format!("frames/{t}.ply"), &fading(1500, t));
+        workplace.ply(&format!("frames/{t}.ply"), &fading_frame(1500, t));
     }
     let run = |name: &str, more: &str| {
         workplace.done(&format!("compress frames -o {name} --ratio 0.4 --set refine_steps=20 {more}"));
@@ -370,10 +371,10 @@ fn threads_and_memory_change_nothing() {
 
 #[test]
 #[ignore = "needs time"]
-fn a_run_killed_at_any_moment_leaves_nothing_under_the_final_name() {
+fn killed_run_leaves_nothing_under_the_final_name() {
     let workplace = Workplace::new();
     for t in 0..12 {
-        workplace.ply(&format!("frames/{t}.ply"), &fading(800, t));
+        workplace.ply(&format!("frames/{t}.ply"), &fading_frame(800, t));
     }
     let arguments = "compress frames -o small --ratio 0.4 --set refine_steps=20";
     let start = Instant::now();
@@ -406,7 +407,7 @@ fn a_run_killed_at_any_moment_leaves_nothing_under_the_final_name() {
 }
 
 #[test]
-fn a_cut_begins_new_tracks_and_is_told() {
+fn cut_begins_new_tracks_and_is_noted() {
     let workplace = Workplace::new();
     for t in 0..8 {
         let (mut gaussians, _) = frame(300, t, |i| i % 7 != t % 7);
@@ -422,7 +423,7 @@ fn a_cut_begins_new_tracks_and_is_told() {
 }
 
 #[test]
-fn frames_that_cannot_be_linked_are_refused_by_name_and_leave_nothing() {
+fn unlinkable_frames_are_refused_by_name() {
     let workplace = Workplace::new();
     let put = |name: &str, gaussians: &Gaussians| workplace.ply(&format!("frames/{name}"), gaussians);
     for t in 0..4 {
@@ -435,7 +436,7 @@ fn frames_that_cannot_be_linked_are_refused_by_name_and_leave_nothing() {
     refused(&[]);
     spoil(&good[..good.len() - 5]);
     refused(&["cut short"]);
-    // Another degree; other columns.
+    // Another SH degree, and other properties.
     put("2.ply", &Gaussians::zeros(60, 0));
     refused(&["as in"]);
     let text = String::from_utf8_lossy(&good[..600]).into_owned();
@@ -446,20 +447,21 @@ fn frames_that_cannot_be_linked_are_refused_by_name_and_leave_nothing() {
     refused(&["--allow-gaps"]);
     let gaps = workplace.done("info frames --allow-gaps");
     assert!(gaps.contains("3 frames") || gaps.contains('3'), "{gaps}");
-    // A frame of no Gaussians is one.
+    // A frame without Gaussians is valid.
     put("2.ply", &Gaussians::zeros(0, 1));
     workplace.done("compress frames -o out --ratio 1 --no-refine");
     assert_eq!(PlyRows::read(&workplace.path("out/2.ply")).rows.len(), 0);
-    // What has as many Gaussians in every frame, and is not to be linked, is as before.
+    // Frames with equal numbers of Gaussians that are not to be linked are read by row as before.
     workplace.refused(1, "compress frames -o other --link never", &["element vertex", "--link"]);
-    // A single frame has nothing to be linked to.
+    // A single frame has nothing to link.
     fs::create_dir(workplace.path("alone")).unwrap();
     fs::write(workplace.path("alone/0.ply"), &good).unwrap();
     workplace.done("info alone --link always");
 }
 
-/// Frames of a model, permuted, with positions off by `noise` of the size: links found, wrong and given up, as parts of all.
-fn links(model: PathBuf, noise: f32) -> [f64; 3] {
+/// Links the frames of a model after shuffling their rows and adding noise to positions, `noise` times the size of a
+/// Gaussian. Returns the fractions of links that are right, wrong and given up.
+fn link_fractions(model: PathBuf, noise: f32) -> [f64; 3] {
     let options = InputOptions { path: model.clone(), cameras: Some(model.clone()), ..InputOptions::default() };
     let scene = open_scene(&options).unwrap();
     let (count, frames) = (scene.source().info().count, scene.source().info().times.len());
@@ -473,10 +475,10 @@ fn links(model: PathBuf, noise: f32) -> [f64; 3] {
         for (at, &i) in order.iter().enumerate() {
             let squares = mixed.log_scale.row::<3>(at).map(|log| (2.0 * log).exp());
             let size = (squares.iter().sum::<f32>() / 3.0).sqrt();
-            // Sums of three even ones, of variance 1.
+            // Sum of three uniform numbers, of variance 1.
             let normal = |c: u64| {
-                let of = |k: u64| uniform((u64::from(i) << 20 | t as u64) << 8 | c << 4 | k) - 0.5;
-                2.0 * (of(0) + of(1) + of(2))
+                let uniform_part = |k: u64| uniform((u64::from(i) << 20 | t as u64) << 8 | c << 4 | k) - 0.5;
+                2.0 * (uniform_part(0) + uniform_part(1) + uniform_part(2))
             };
             let moved: [f32; 3] =
                 std::array::from_fn(|c| mixed.position.plane(c)[at] + noise * size * normal(c as u64));
@@ -504,14 +506,14 @@ fn links(model: PathBuf, noise: f32) -> [f64; 3] {
 
 #[test]
 #[ignore = "needs the trained models"]
-fn shuffled_frames_of_trained_models_are_linked_again() {
+fn shuffled_frames_of_trained_models_are_relinked() {
     for name in ["deform2", "room2_dynerf"] {
-        let [right, wrong, _] = links(shared(name), 0.02);
+        let [right, wrong, _] = link_fractions(shared(name), 0.02);
         assert!(right >= 0.98 && wrong <= 0.005, "{name}: {right} found, {wrong} wrong");
     }
 }
 
-/// A stream of version 2 (format/STREAM.md) with frames at even times.
+/// Returns a stream of version 2 (format/STREAM.md) with frames at even times.
 fn stream(frames: &[Gaussians]) -> Vec<u8> {
     let mut bytes = b"\x89GSTR\r\n\x1a".to_vec();
     for field in [2, 1, 0, 0, 31, 0] {
@@ -534,9 +536,9 @@ fn stream(frames: &[Gaussians]) -> Vec<u8> {
 }
 
 #[test]
-fn a_stream_of_any_number_of_gaussians_gives_the_bytes_of_files() {
+fn stream_of_unlinked_frames_gives_the_bytes_of_files() {
     let workplace = Workplace::new();
-    let frames: Vec<Gaussians> = (0..FRAMES).map(|t| frame(900, t, |i| lives(i, t)).0).collect();
+    let frames: Vec<Gaussians> = (0..FRAMES).map(|t| frame(900, t, |i| is_alive(i, t)).0).collect();
     for (t, frame) in frames.iter().enumerate() {
         workplace.ply(&format!("frames/frame_{t:05}.ply"), frame);
     }
@@ -554,21 +556,21 @@ fn a_stream_of_any_number_of_gaussians_gives_the_bytes_of_files() {
     let said = run("compress - -o small_stream.gseq --ratio 0.4 --no-refine --verbose");
     assert!(said.contains("linked frame stream") && said.contains("does not say which"), "{said}");
     assert!(same("small_files.gseq", "small_stream.gseq"));
-    // And as frames of what lives in them.
+    // The same as frames of the Gaussians that are alive in them.
     run("compress - -o half --as ply-sequence --ratio 0.5 --no-refine");
     let rows = |t: usize| PlyRows::read(&workplace.path(&format!("half/frame_{t:05}.ply"))).rows.len();
     assert!((0..FRAMES).all(|t| (1..frames[t].len()).contains(&rows(t))));
 }
 
 #[test]
-fn lives_of_a_container_and_of_its_stream_are_joined_where_asked() {
+fn lives_in_containers_and_streams_join_on_request() {
     let workplace = Workplace::new();
     let (count, frames) = (300, 40);
     for t in 0..frames {
-        workplace.ply(&format!("frames/{t}.ply"), &fading(count, t));
+        workplace.ply(&format!("frames/{t}.ply"), &fading_frame(count, t));
     }
     workplace.done("convert frames lives.gseq --link apart");
-    // It says itself who is who, and is believed; that lives are short is told.
+    // The container has ids of its own, which are used; a note says that lives are short.
     let [auto, apart, joined] =
         [Link::Auto, Link::Apart, Link::Always].map(|link| open(&workplace, "lives.gseq", link));
     let [auto_count, apart_count, joined_count] = [&auto, &apart, &joined].map(|scene| scene.source().info().count);
@@ -584,10 +586,10 @@ fn lives_of_a_container_and_of_its_stream_are_joined_where_asked() {
     assert!(said.contains(" of 40 frames (median): --link always joins Gaussians that continue one another"), "{said}");
     let said = compress("joined.gseq", "always");
     assert!(said.contains("were joined to ") && !said.contains("--link always joins"), "{said}");
-    // In each frame what was there is there once.
+    // Every Gaussian that is alive in a frame is in exactly one row of it.
     for t in (0..frames).step_by(13) {
         let mut whole = Gaussians::zeros(count, 1);
-        (0..count).for_each(|i| row(i, t, &mut whole, i));
+        (0..count).for_each(|i| write_row(i, t, &mut whole, i));
         let found = state(joined.source(), t);
         let is_one_row = |&i: &usize| {
             let is_it = |&track: &usize| {
@@ -599,7 +601,7 @@ fn lives_of_a_container_and_of_its_stream_are_joined_where_asked() {
         let one_row = (0..count).filter(is_one_row).count();
         assert!(one_row * 100 >= 97 * count, "frame {t}: {one_row}");
     }
-    // The stream of it is linked like it.
+    // The stream of the container is linked like the container.
     let stream = workplace.piped("convert lives.gseq - --quiet", b"").stdout;
     assert!(workplace.piped("convert - of_stream.gseq --link always", &stream).status.success());
     workplace.done("convert lives.gseq of_container.gseq --link always");
@@ -611,7 +613,7 @@ fn lives_of_a_container_and_of_its_stream_are_joined_where_asked() {
 }
 
 #[test]
-fn a_stream_that_breaks_off_or_has_no_frame_leaves_nothing() {
+fn cut_or_empty_stream_leaves_no_files() {
     let workplace = Workplace::new();
     let frames: Vec<Gaussians> = (0..3).map(|t| frame(50, t, |_| true).0).collect();
     let whole = stream(&frames);
@@ -633,10 +635,11 @@ fn a_stream_that_breaks_off_or_has_no_frame_leaves_nothing() {
 }
 
 #[test]
-fn links_that_nobody_can_tell_begin_new_tracks_and_are_told() {
-    // Its 300 Gaussians jump about from frame to frame; a quarter of the links were wrong before they were weighed.
+fn doubtful_links_begin_new_tracks_and_are_noted() {
+    // The 300 Gaussians of this model jump from frame to frame; a quarter of the links were wrong before links were
+    // weighed.
     let tiny = PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/tests/data/tiny_model"));
-    let [right, wrong, doubtful] = links(tiny.clone(), 0.0);
+    let [right, wrong, doubtful] = link_fractions(tiny.clone(), 0.0);
     assert!(wrong <= 0.005 && doubtful >= 0.2, "{right} found, {wrong} wrong, {doubtful} given up");
     let workplace = Workplace::new();
     let scene = open_scene(&InputOptions { path: tiny, ..InputOptions::default() }).unwrap();

@@ -1,4 +1,4 @@
-//! Compressed models: what the stages keep, merge, refine and write.
+//! Tests of compressed models: what the stages keep, merge, refine and write.
 
 mod archive;
 mod bands;

@@ -1,5 +1,5 @@
-//! Clusters and proxies of whole models against method.md, section 5 written down plainly: neighbors by looking
-//! at all pairs, gates by their formulas, leaders one after the other.
+//! Clusters and proxies of complete models against a plain implementation of method.md, section 5: neighbors by
+//! comparing all pairs, tests by their formulas, leaders one after the other.
 
 use std::path::{Path, PathBuf};
 
@@ -13,19 +13,19 @@ use splatsieve::pruning::score::{Scored, UserOverrides};
 use splatsieve::recipe::{MergeParams, MergePass, MotionParams, Placement, ProxyOpacity, Recipe, ShHigh, Trajectory};
 use splatsieve::scene::{InputOptions, Scene, open_scene};
 
-/// Tightens a gate.
-type Edit = fn(&mut MergeParams);
+/// Change to the merging parameters that tightens one test.
+type Tighten = fn(&mut MergeParams);
 
-/// A model in memory, every frame of it.
-struct Whole {
+/// All frames of a model in memory.
+struct AllFrames {
     frames: Vec<Gaussians>,
     alive: Vec<Vec<bool>>,
     reference: usize,
     extent: f64,
 }
 
-impl Whole {
-    fn read(scene: &Scene) -> Whole {
+impl AllFrames {
+    fn read(scene: &Scene) -> AllFrames {
         let source = scene.source();
         let frames: Vec<Gaussians> = (0..source.info().times.len()).map(|frame| state(source, frame)).collect();
         let alive: Vec<Vec<bool>> = frames
@@ -43,7 +43,7 @@ impl Whole {
                 rank(99) - rank(1)
             })
             .fold(0.0, f64::max);
-        Whole { frames, alive, reference, extent }
+        AllFrames { frames, alive, reference, extent }
     }
 
     fn at(&self, frame: usize, i: usize) -> DVec3 {
@@ -62,8 +62,8 @@ fn covariance(state: &Gaussians, i: usize) -> DMat3 {
     axes * DMat3::from_diagonal(scale * scale) * axes.transpose()
 }
 
-/// Tests 1 and 2 for two nodes with these states.
-fn alike(state: &Gaussians, i: usize, j: usize, merge: &MergeParams, pass: &MergePass) -> bool {
+/// Returns whether two nodes with these states pass tests 1 and 2.
+fn passes_tests_1_and_2(state: &Gaussians, i: usize, j: usize, merge: &MergeParams, pass: &MergePass) -> bool {
     let sigma = (covariance(state, i) + covariance(state, j)) * 0.5;
     let trace = sigma.x_axis.x + sigma.y_axis.y + sigma.z_axis.z;
     let regular = sigma + DMat3::from_diagonal(DVec3::splat(1e-6 * trace));
@@ -74,7 +74,7 @@ fn alike(state: &Gaussians, i: usize, j: usize, merge: &MergeParams, pass: &Merg
     let sorted = |i: usize| {
         let mut log = state.log_scale.row::<3>(i).map(f64::from);
         log.sort_by(|a, b| b.partial_cmp(a).unwrap());
-        // Thinner than a tenth of its middle scale is flat, however flat.
+        // A smallest scale below a tenth of the middle scale counts as a tenth of it.
         log[2] = log[2].max(log[1] + 0.1f64.ln());
         log
     };
@@ -89,20 +89,20 @@ fn alike(state: &Gaussians, i: usize, j: usize, merge: &MergeParams, pass: &Merg
         && (color(i) - color(j)).length() <= merge.max_color_difference
 }
 
-/// Test 3 for two Gaussians.
-fn move_alike(whole: &Whole, i: usize, j: usize, recipe: &Recipe, pass: &MergePass) -> bool {
+/// Returns whether two Gaussians pass test 3.
+fn passes_test_3(all_frames: &AllFrames, i: usize, j: usize, recipe: &Recipe, pass: &MergePass) -> bool {
     let merge = &recipe.merge;
-    let unit = merge.length_unit.in_scene_units(whole.extent);
-    let both = |t: usize| whole.alive[t][i] && whole.alive[t][j];
-    let common: Vec<usize> = (0..whole.frames.len()).filter(|&t| both(t)).collect();
-    let either = (0..whole.frames.len()).filter(|&t| whole.alive[t][i] || whole.alive[t][j]).count();
+    let unit = merge.length_unit.in_scene_units(all_frames.extent);
+    let both = |t: usize| all_frames.alive[t][i] && all_frames.alive[t][j];
+    let common: Vec<usize> = (0..all_frames.frames.len()).filter(|&t| both(t)).collect();
+    let either = (0..all_frames.frames.len()).filter(|&t| all_frames.alive[t][i] || all_frames.alive[t][j]).count();
     if common.is_empty() {
         return false;
     }
     let steps: Vec<(DVec3, DVec3)> = common
         .iter()
         .filter(|&&t| t > 0 && (recipe.scan.motion == MotionParams::Literal || both(t - 1)))
-        .map(|&t| (whole.at(t, i) - whole.at(t - 1, i), whole.at(t, j) - whole.at(t - 1, j)))
+        .map(|&t| (all_frames.at(t, i) - all_frames.at(t - 1, i), all_frames.at(t, j) - all_frames.at(t - 1, j)))
         .collect();
     let similarity = match merge.trajectory {
         Trajectory::Cosine => {
@@ -117,23 +117,23 @@ fn move_alike(whole: &Whole, i: usize, j: usize, recipe: &Recipe, pass: &MergePa
             if squares + noise == 0.0 { 1.0 } else { (2.0 * dot + noise) / (squares + noise) }
         }
     };
-    let offset = |t: usize| whole.at(t, i) - whole.at(t, j);
-    let drift = common.iter().map(|&t| (offset(t) - offset(whole.reference)).length()).fold(0.0, f64::max);
+    let offset = |t: usize| all_frames.at(t, i) - all_frames.at(t, j);
+    let drift = common.iter().map(|&t| (offset(t) - offset(all_frames.reference)).length()).fold(0.0, f64::max);
     let dead = (either - common.len()) as f64 / either as f64;
     similarity > pass.tau_m && drift <= merge.max_drift * unit && dead <= merge.max_dead_time
 }
 
-/// Members of every cluster by leader, the leader first, as ids; leaders ascending.
-fn clusters(whole: &Whole, scored: &Scored, kept: &[usize], recipe: &Recipe) -> Vec<Vec<usize>> {
+/// Returns the members of every cluster as ids, the leader first; clusters ascend by leader.
+fn clusters(all_frames: &AllFrames, scored: &Scored, kept: &[usize], recipe: &Recipe) -> Vec<Vec<usize>> {
     let merge = &recipe.merge;
-    let unit = merge.length_unit.in_scene_units(whole.extent);
+    let unit = merge.length_unit.in_scene_units(all_frames.extent);
     let mut groups: Vec<Vec<usize>> = kept.iter().map(|&id| vec![id]).collect();
     for pass in &merge.passes {
-        // The state of a node: its Gaussian's own, or its proxy's so far.
-        let mut nodes = whole.frames[whole.reference].pick(&groups.iter().map(|g| g[0] as u32).collect::<Vec<_>>());
+        // State of a node: that of its Gaussian, or of its proxy so far.
+        let mut nodes = all_frames.frames[all_frames.reference].pick(&groups.iter().map(|g| g[0] as u32).collect::<Vec<_>>());
         for (node, group) in groups.iter().enumerate().filter(|(_, group)| group.len() > 1) {
             let members = weighted(scored, group);
-            merge_state(&members, &whole.frames[whole.reference], group[0] as u32, merge, Columns::all()).write(
+            merge_state(&members, &all_frames.frames[all_frames.reference], group[0] as u32, merge, Columns::all()).write(
                 Columns::all(),
                 node,
                 &mut nodes,
@@ -159,8 +159,8 @@ fn clusters(whole: &Whole, scored: &Scored, kept: &[usize], recipe: &Recipe) -> 
             near.sort_by(|a, b| a.partial_cmp(b).unwrap());
             for (_, other) in near.into_iter().take(merge.max_neighbors) {
                 if leader[other].is_none()
-                    && alike(&nodes, node, other, merge, pass)
-                    && move_alike(whole, groups[node][0], groups[other][0], recipe, pass)
+                    && passes_tests_1_and_2(&nodes, node, other, merge, pass)
+                    && passes_test_3(all_frames, groups[node][0], groups[other][0], recipe, pass)
                 {
                     leader[other] = Some(node);
                 }
@@ -176,7 +176,7 @@ fn clusters(whole: &Whole, scored: &Scored, kept: &[usize], recipe: &Recipe) -> 
     groups
 }
 
-/// Ids, ascending, with weights ∝ C·Vis.
+/// Returns the ids in ascending order with weights ∝ C·Vis.
 fn weighted(scored: &Scored, group: &[usize]) -> Vec<(u32, f64)> {
     let mut ids = group.to_vec();
     ids.sort_unstable();
@@ -192,31 +192,32 @@ fn options(output: &Path, recipe: &Recipe, only: Only) -> Request {
     Request { only, ..Request::new(input, output.to_owned(), recipe.clone()) }
 }
 
-/// Compresses the tiny model and compares clusters and proxies; gives how many Gaussians joined others.
-fn merges_as_method_says(recipe: &Recipe, only: Only) -> usize {
+/// Compresses the tiny model and checks its clusters and proxies. Returns how many Gaussians joined others.
+fn assert_merges_as_specified(recipe: &Recipe, only: Only) -> usize {
     let folder = tempfile::tempdir().unwrap();
     let output = folder.path().join("out");
     let scene = crate::scene::scene(&tiny());
     let (summary, map) = compress_scene(&scene, &options(&output, recipe, only)).unwrap();
     let scored = score_scene(&scene, recipe, &UserOverrides::default()).unwrap();
-    let whole = Whole::read(&scene);
-    assert_eq!(summary.merge.unwrap().reference_frame, whole.reference);
+    let all_frames = AllFrames::read(&scene);
+    assert_eq!(summary.merge.unwrap().reference_frame, all_frames.reference);
     let kept: Vec<usize> = (0..map.len()).filter(|&id| only == Only::Merge || scored.selection.keep[id]).collect();
 
-    let expected = clusters(&whole, &scored, &kept, recipe);
+    let expected = clusters(&all_frames, &scored, &kept, recipe);
     let mut expected_map = vec![None; map.len()];
     for (place, group) in expected.iter().enumerate() {
         group.iter().for_each(|&id| expected_map[id] = Some(place as u32));
     }
     assert_eq!(map, expected_map, "clusters differ from the sequential rule");
 
-    proxies_are_solved_at_their_leaders(&output, &scene, &whole, &scored, &expected, &recipe.merge);
+    assert_solved_at_leaders(&output, &scene, &all_frames, &scored, &expected, &recipe.merge);
     kept.len() - expected.len()
 }
 
-/// Holds a merged state against the definitions over its members, weights w: μ = Σ w x, or the leader's place; covariance
-/// Σ w (Σᵢ + (xᵢ − μ)(xᵢ − μ)ᵀ); colors Σ w c; opacity by its rule, an area being a quarter of an ellipsoid's surface.
-fn is_the_mixture(merged: &ProxyState, members: &[(u32, f64)], states: &Gaussians, leader: usize, merge: &MergeParams) {
+/// Checks a merged state against its definition over the members with weights w: position μ = Σ w x, or that of the
+/// leader; covariance Σ w (Σᵢ + (xᵢ − μ)(xᵢ − μ)ᵀ); colors Σ w c; opacity by its rule, in which the area is a quarter
+/// of the surface of the ellipsoid.
+fn assert_is_mixture(merged: &ProxyState, members: &[(u32, f64)], states: &Gaussians, leader: usize, merge: &MergeParams) {
     let position = |i: usize| DVec3::from(states.position.row::<3>(i).map(f64::from));
     let mean = match merge.placement {
         Placement::Leader => position(leader),
@@ -238,29 +239,29 @@ fn is_the_mixture(merged: &ProxyState, members: &[(u32, f64)], states: &Gaussian
     let off = (found - expected).to_cols_array().iter().fold(0.0, |most: f64, x| most.max(x.abs()));
     assert!(off <= 1e-10 * trace, "covariance {found}, expected {expected}");
 
-    // Knud Thomsen's formula, p = 1.6075.
+    // Formula by Knud Thomsen, p = 1.6075.
     let surface = |s: DVec3| {
         let sections = [s.x * s.y, s.y * s.z, s.z * s.x].map(|area| area.powf(1.6075));
         4.0 * std::f64::consts::PI * (sections.iter().sum::<f64>() / 3.0).powf(1.0 / 1.6075)
     };
-    let of = |i: u32| {
+    let opacity_and_area = |i: u32| {
         let scale = DVec3::from(states.log_scale.row::<3>(i as usize).map(|x| f64::from(x).exp()));
         (1.0 / (1.0 + (-f64::from(states.opacity_logit.plane(0)[i as usize])).exp()), surface(scale))
     };
     let opacity = match merge.opacity {
-        ProxyOpacity::Sum => members.iter().map(|&(i, _)| of(i).0).sum::<f64>(),
-        ProxyOpacity::Union => 1.0 - members.iter().map(|&(i, _)| 1.0 - of(i).0).product::<f64>(),
-        ProxyOpacity::Area => members.iter().map(|&(i, _)| of(i).0 * of(i).1).sum::<f64>() / surface(scales),
+        ProxyOpacity::Sum => members.iter().map(|&(i, _)| opacity_and_area(i).0).sum::<f64>(),
+        ProxyOpacity::Union => 1.0 - members.iter().map(|&(i, _)| 1.0 - opacity_and_area(i).0).product::<f64>(),
+        ProxyOpacity::Area => members.iter().map(|&(i, _)| opacity_and_area(i).0 * opacity_and_area(i).1).sum::<f64>() / surface(scales),
     };
     let found = 1.0 / (1.0 + (-merged.opacity_logit).exp());
     assert!((found - opacity.min(1.0)).abs() <= 1e-5, "opacity {found}, expected {opacity}");
 
     let heaviest = members.iter().rev().max_by(|a, b| a.1.total_cmp(&b.1)).unwrap().0;
     for (k, &found) in merged.sh.iter().enumerate() {
-        let of = |i: u32| f64::from(states.sh.plane(k)[i as usize]);
+        let coefficient = |i: u32| f64::from(states.sh.plane(k)[i as usize]);
         let expected = match merge.sh_high {
-            ShHigh::Heaviest if k >= 3 => of(heaviest),
-            _ => members.iter().map(|&(i, weight)| weight * of(i)).sum::<f64>(),
+            ShHigh::Heaviest if k >= 3 => coefficient(heaviest),
+            _ => members.iter().map(|&(i, weight)| weight * coefficient(i)).sum::<f64>(),
         };
         assert!(
             (found - expected).abs() <= 1e-12 * (1.0 + expected.abs()),
@@ -269,13 +270,14 @@ fn is_the_mixture(merged: &ProxyState, members: &[(u32, f64)], states: &Gaussian
     }
 }
 
-/// The raw parameters of a proxy are its merged state at the reference frame minus what the field adds to
-/// its leader there; its quaternion is as long as the leader's in that frame. Then, if it was placed at its
-/// leader, its state at the reference frame is the merged one, and its path the leader's to the bit.
-fn proxies_are_solved_at_their_leaders(
+/// Checks that the raw parameters of a proxy are its merged state at the reference frame minus what the field adds to
+/// its leader there, and that its quaternion has the length of the leader's quaternion in that frame. If the proxy is
+/// placed at its leader, its state at the reference frame must be the merged one, and its path that of the leader, to
+/// the bit.
+fn assert_solved_at_leaders(
     output: &Path,
     scene: &Scene,
-    whole: &Whole,
+    all_frames: &AllFrames,
     scored: &Scored,
     clusters: &[Vec<usize>],
     merge: &MergeParams,
@@ -284,42 +286,43 @@ fn proxies_are_solved_at_their_leaders(
     let (before, after) = (PlyRows::read(&tiny().join(cloud)), PlyRows::read(&output.join(cloud)));
     let result = splatsieve::models::ModelFolder::open(output, None).unwrap();
     let result = result.with_times(scene.source().info().times.clone()).unwrap();
-    let frames: Vec<Gaussians> = (0..whole.frames.len()).map(|frame| state(&result, frame)).collect();
-    let at_reference = &whole.frames[whole.reference];
+    let frames: Vec<Gaussians> = (0..all_frames.frames.len()).map(|frame| state(&result, frame)).collect();
+    let at_reference = &all_frames.frames[all_frames.reference];
     for (place, group) in clusters.iter().enumerate().filter(|(_, group)| group.len() > 1) {
         let leader = group[0];
         let members = weighted(scored, group);
         let merged = merge_state(&members, at_reference, leader as u32, merge, Columns::all());
-        is_the_mixture(&merged, &members, at_reference, leader, merge);
+        assert_is_mixture(&merged, &members, at_reference, leader, merge);
         let length = at_reference.rotation.row::<4>(leader).iter().map(|x| f64::from(x * x)).sum::<f64>().sqrt();
-        // (property, merged state, state of the leader), then the state found in the result.
+        // (property, merged state, state of the leader, raw value of the leader); then the state of the result is
+        // compared.
         let mut columns: Vec<(String, f64, f32, f32)> = Vec::new();
-        let found = &frames[whole.reference];
+        let found = &frames[all_frames.reference];
         for c in 0..3 {
-            let of = |state: &Gaussians, i: usize| state.position.plane(c)[i];
-            columns.push((["x", "y", "z"][c].into(), merged.position[c], of(at_reference, leader), of(found, place)));
-            let of = |state: &Gaussians, i: usize| state.log_scale.plane(c)[i];
-            columns.push((format!("scale_{c}"), merged.log_scale[c], of(at_reference, leader), of(found, place)));
+            let value = |state: &Gaussians, i: usize| state.position.plane(c)[i];
+            columns.push((["x", "y", "z"][c].into(), merged.position[c], value(at_reference, leader), value(found, place)));
+            let value = |state: &Gaussians, i: usize| state.log_scale.plane(c)[i];
+            columns.push((format!("scale_{c}"), merged.log_scale[c], value(at_reference, leader), value(found, place)));
         }
         for c in 0..4 {
-            let of = |state: &Gaussians, i: usize| state.rotation.plane(c)[i];
+            let value = |state: &Gaussians, i: usize| state.rotation.plane(c)[i];
             let rotation = merged.rotation[c] * length;
-            columns.push((format!("rot_{c}"), rotation, of(at_reference, leader), of(found, place)));
+            columns.push((format!("rot_{c}"), rotation, value(at_reference, leader), value(found, place)));
         }
-        let of = |state: &Gaussians, i: usize| state.opacity_logit.plane(0)[i];
-        columns.push(("opacity".into(), merged.opacity_logit, of(at_reference, leader), of(found, place)));
+        let value = |state: &Gaussians, i: usize| state.opacity_logit.plane(0)[i];
+        columns.push(("opacity".into(), merged.opacity_logit, value(at_reference, leader), value(found, place)));
         for k in 0..16 {
             for channel in 0..3 {
                 let name = if k == 0 { format!("f_dc_{channel}") } else { format!("f_rest_{}", 15 * channel + k - 1) };
-                let of = |state: &Gaussians, i: usize| state.sh.plane(3 * k + channel)[i];
-                columns.push((name, merged.sh[3 * k + channel], of(at_reference, leader), of(found, place)));
+                let value = |state: &Gaussians, i: usize| state.sh.plane(3 * k + channel)[i];
+                columns.push((name, merged.sh[3 * k + channel], value(at_reference, leader), value(found, place)));
             }
         }
         assert_eq!(columns.len(), 59);
         for (name, merged, of_leader, found) in columns {
             let (raw, raw_leader) = (after.value(place, &name), before.value(leader, &name));
             let expected = merged - (f64::from(of_leader) - f64::from(raw_leader));
-            // Four f32 numbers of this size were rounded on the way.
+            // Four f32 numbers of this size are rounded during the computation.
             let size = merged.abs().max(of_leader.abs().into()).max(raw_leader.abs().into()).max(1e-3);
             let tolerance = 4.0 * f64::from(f32::EPSILON) * size;
             let at = format!("{name} of the proxy at {place}, led by {leader}");
@@ -329,7 +332,7 @@ fn proxies_are_solved_at_their_leaders(
             }
         }
         if merge.placement == Placement::Leader {
-            for (now, then) in frames.iter().zip(&whole.frames) {
+            for (now, then) in frames.iter().zip(&all_frames.frames) {
                 assert_eq!(now.position.row::<3>(place), then.position.row::<3>(leader), "path of {place}");
             }
         }
@@ -337,40 +340,40 @@ fn proxies_are_solved_at_their_leaders(
 }
 
 #[test]
-fn presets_merge_as_the_sequential_rule() {
-    // `strong` prunes most of the tiny model first, so that little is left to join.
+fn presets_merge_as_specified() {
+    // The preset `strong` prunes most of the tiny model first, so few Gaussians are left to merge.
     for (preset, least) in [("paper", 100), ("default", 30), ("strong", 20)] {
-        let joined = merges_as_method_says(&by_formula(preset), Only::Both);
+        let joined = assert_merges_as_specified(&by_formula(preset), Only::Both);
         assert!(joined >= least, "{preset}: only {joined} joined");
     }
 }
 
 #[test]
-fn merging_alone_merges_as_the_sequential_rule() {
+fn merging_without_pruning_merges_as_specified() {
     for preset in ["paper", "default"] {
-        assert!(merges_as_method_says(&by_formula(preset), Only::Merge) > 30);
+        assert!(assert_merges_as_specified(&by_formula(preset), Only::Merge) > 30);
     }
 }
 
 #[test]
-fn later_passes_merge_groups_as_the_sequential_rule() {
+fn later_passes_merge_groups_as_specified() {
     let mut recipe = by_formula("paper");
-    let one = merges_as_method_says(&recipe, Only::Both);
+    let one = assert_merges_as_specified(&recipe, Only::Both);
     recipe.merge.passes.push(MergePass { epsilon: 0.3, d0: 4.0, rho: 0.5, tau_m: 0.3 });
-    let two = merges_as_method_says(&recipe, Only::Both);
+    let two = assert_merges_as_specified(&recipe, Only::Both);
     assert!(two > one, "{two} joined in two passes, {one} in one");
 }
 
 #[test]
-fn every_gate_binds_as_the_sequential_rule() {
+fn every_merging_test_binds_as_specified() {
     let base = || {
         let mut recipe = by_formula("default");
         recipe.merge.passes = vec![MergePass { epsilon: 0.2, d0: 3.0, rho: 0.3, tau_m: 0.2 }];
         (recipe.merge.max_drift, recipe.merge.max_dead_time) = (0.05, 0.5);
         recipe
     };
-    let all = merges_as_method_says(&base(), Only::Merge);
-    let edits: [(&str, Edit); 9] = [
+    let all = assert_merges_as_specified(&base(), Only::Merge);
+    let edits: [(&str, Tighten); 9] = [
         ("epsilon", |m| m.passes[0].epsilon = 0.004),
         ("d0", |m| m.passes[0].d0 = 0.2),
         ("rho", |m| m.passes[0].rho = 0.9999),
@@ -384,13 +387,13 @@ fn every_gate_binds_as_the_sequential_rule() {
     for (gate, edit) in edits {
         let mut recipe = base();
         edit(&mut recipe.merge);
-        let joined = merges_as_method_says(&recipe, Only::Merge);
+        let joined = assert_merges_as_specified(&recipe, Only::Merge);
         assert!(joined < all, "{gate} binds nothing: {joined} joined, {all} without");
     }
 }
 
-/// A folder of eight frames of twelve pairs, each a tenth from the next; `offset`, from there, by frame and whether it
-/// is the second of a pair.
+/// Writes a folder of eight frames with twelve pairs, 0.1 apart. `offset` gives the displacement by frame and by
+/// whether the Gaussian is the second of its pair.
 fn pairs(workplace: &Workplace, offset: impl Fn(usize, bool) -> [f32; 3]) -> PathBuf {
     for frame in 0..8 {
         let mut cloud = Gaussians::zeros(24, 0);
@@ -406,7 +409,7 @@ fn pairs(workplace: &Workplace, offset: impl Fn(usize, bool) -> [f32; 3]) -> Pat
     workplace.path("frames")
 }
 
-/// Merges explicit trajectories, without pruning; gives who joined whom and the number of proxies.
+/// Merges explicit trajectories without pruning. Returns the index map and the number of proxies.
 fn merged(workplace: &Workplace, scene: &Scene, recipe: &Recipe) -> (Vec<Option<u32>>, usize) {
     let (input, output) =
         (InputOptions { path: workplace.path("frames"), ..InputOptions::default() }, workplace.path("out"));
@@ -420,9 +423,9 @@ fn open(path: PathBuf) -> Scene {
 }
 
 #[test]
-fn a_proxy_of_trajectories_goes_the_way_of_the_weighted_mean_of_its_members() {
+fn proxy_trajectory_is_the_weighted_mean_of_its_members() {
     let workplace = Workplace::new();
-    // The second of a pair circles the first, which flies.
+    // The first of a pair flies along a line; the second circles around it.
     let flying = |frame: usize, second: bool| {
         let (radius, (sin, cos)) = (if second { 0.003 } else { 0.0 }, (0.5 * frame as f32).sin_cos());
         [0.025 * frame as f32 + radius * cos, 0.0, radius * sin]
@@ -433,12 +436,12 @@ fn a_proxy_of_trajectories_goes_the_way_of_the_weighted_mean_of_its_members() {
     let (map, proxies) = merged(&workplace, &scene, &recipe);
     assert_eq!(proxies, 12);
     let scored = score_scene(&scene, &recipe, &UserOverrides::default()).unwrap();
-    let whole = Whole::read(&scene);
+    let all_frames = AllFrames::read(&scene);
     for frame in 0..8 {
         let rows = PlyRows::read(&workplace.path(&format!("out/frame_{frame}.ply")));
         for pair in 0..12 {
             let members = weighted(&scored, &[2 * pair, 2 * pair + 1]);
-            let mean: DVec3 = members.iter().map(|&(id, weight)| weight * whole.at(frame, id as usize)).sum();
+            let mean: DVec3 = members.iter().map(|&(id, weight)| weight * all_frames.at(frame, id as usize)).sum();
             let place = map[2 * pair].unwrap() as usize;
             let found = DVec3::from(["x", "y", "z"].map(|axis| f64::from(rows.value(place, axis))));
             // Coordinates up to 1.3, rounded to f32.
@@ -448,10 +451,11 @@ fn a_proxy_of_trajectories_goes_the_way_of_the_weighted_mean_of_its_members() {
 }
 
 #[test]
-fn jitter_below_the_noise_floor_is_no_motion() {
+fn jitter_below_the_noise_floor_is_not_motion() {
     let mut recipe = by_formula("default");
-    // (where, by how much the second of a pair jitters, the floor in extents, proxies): a third of the floor; the same
-    // without one; and what is rounding at this distance, for which there always is a floor.
+    // (position, jitter of the second of a pair, noise floor in extents, proxies): a jitter of a third of the floor;
+    // the same without a floor; and a jitter of the size of rounding at this position, for which there always is a
+    // floor.
     for (at, jitter, floor, expected) in [(0.0, 3e-5, 1e-4, 12), (0.0, 3e-5, 0.0, 0), (1024.0, 1.0 / 8192.0, 0.0, 12)] {
         let workplace = Workplace::new();
         let jittering = |frame: usize, second: bool| {
@@ -465,7 +469,7 @@ fn jitter_below_the_noise_floor_is_no_motion() {
 }
 
 #[test]
-fn proxies_that_stray_from_their_members_go_back_to_their_leaders() {
+fn proxies_that_drift_from_members_return_to_leaders() {
     let mut recipe = by_formula("default");
     recipe.merge.placement = Placement::Mean;
     recipe.merge.passes = vec![MergePass { epsilon: 0.2, d0: 3.0, rho: 0.3, tau_m: 0.2 }];
@@ -474,13 +478,13 @@ fn proxies_that_stray_from_their_members_go_back_to_their_leaders() {
     let output = folder.path().join("out");
     let scene = crate::scene::scene(&tiny());
     let (_, map) = compress_scene(&scene, &options(&output, &recipe, Only::Merge)).unwrap();
-    let (scored, whole) = (score_scene(&scene, &recipe, &UserOverrides::default()).unwrap(), Whole::read(&scene));
+    let (scored, all_frames) = (score_scene(&scene, &recipe, &UserOverrides::default()).unwrap(), AllFrames::read(&scene));
     let cloud = "point_cloud/iteration_7/point_cloud.ply";
     let (before, after) = (PlyRows::read(&tiny().join(cloud)), PlyRows::read(&output.join(cloud)));
     let result = splatsieve::models::ModelFolder::open(&output, None).unwrap();
     let result = result.with_times(scene.source().info().times.clone()).unwrap();
-    let frames: Vec<Gaussians> = (0..whole.frames.len()).map(|frame| state(&result, frame)).collect();
-    let limit = recipe.merge.max_drift * whole.extent;
+    let frames: Vec<Gaussians> = (0..all_frames.frames.len()).map(|frame| state(&result, frame)).collect();
+    let limit = recipe.merge.max_drift * all_frames.extent;
     let (mut at_leaders, mut at_means) = (0, 0);
     for place in 0..after.rows.len() {
         let group: Vec<usize> = (0..map.len()).filter(|&id| map[id] == Some(place as u32)).collect();
@@ -492,7 +496,7 @@ fn proxies_that_stray_from_their_members_go_back_to_their_leaders() {
         }
         at_means += 1;
         for (t, frame) in frames.iter().enumerate() {
-            let mean: DVec3 = members.iter().map(|&(id, weight)| weight * whole.at(t, id as usize)).sum();
+            let mean: DVec3 = members.iter().map(|&(id, weight)| weight * all_frames.at(t, id as usize)).sum();
             let off = (DVec3::from(frame.position.row::<3>(place).map(f64::from)) - mean).length();
             assert!(off <= limit * 1.001, "proxy {place} is {off} off at frame {t}, at most {limit} expected");
         }
@@ -501,9 +505,9 @@ fn proxies_that_stray_from_their_members_go_back_to_their_leaders() {
 }
 
 #[test]
-fn partitions_of_the_pairs_change_no_byte() {
-    // Two passes, so that the second asks for pairs of which some are known; and a target, so that many sets of
-    // survivors are tried.
+fn number_of_pair_partitions_changes_no_byte() {
+    // Two passes, so that the second asks for pairs of which some are measured already; and a target, so that many sets
+    // of survivors are tried.
     let mut recipe = by_formula("default");
     recipe.merge.passes.push(MergePass { epsilon: 0.2, d0: 4.0, rho: 0.5, tau_m: 0.3 });
     for target in [None, Some(Target::Count(180))] {
@@ -518,11 +522,11 @@ fn partitions_of_the_pairs_change_no_byte() {
             assert_eq!(std::fs::read_dir(scratch.path()).unwrap().count(), 0, "scratch files are left");
             (lasting_files(&output), map, summary.merge.unwrap().passes)
         };
-        let whole = merge(usize::MAX);
-        let pairs = whole.2[0].candidates;
-        assert!(pairs > 64 && whole.2.iter().all(|pass| pass.joins > 0), "{:?}", whole.2);
+        let unpartitioned = merge(usize::MAX);
+        let pairs = unpartitioned.2[0].candidates;
+        assert!(pairs > 64 && unpartitioned.2.iter().all(|pass| pass.joins > 0), "{:?}", unpartitioned.2);
         for partitions in [1, 7, 64] {
-            assert!(merge(pairs.div_ceil(partitions)) == whole, "{partitions} partitions, target {target:?}");
+            assert!(merge(pairs.div_ceil(partitions)) == unpartitioned, "{partitions} partitions, target {target:?}");
         }
     }
 }

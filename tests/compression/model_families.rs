@@ -1,4 +1,4 @@
-//! Models of other families: their states against those that the families' own code gives, and what is left of them, read
+//! Tests of the other model formats: their frame states against those of the code of their trainers, and results read
 //! back.
 
 use std::fs;
@@ -8,7 +8,7 @@ use crate::scene::{Workplace, arrays, shared, state};
 use splatsieve::model::{Gaussians, SH_C0, Split};
 use splatsieve::scene::{InputOptions, Scene, open_scene};
 
-fn family(name: &str) -> PathBuf {
+fn model_path(name: &str) -> PathBuf {
     shared("families").join(name)
 }
 
@@ -17,39 +17,39 @@ fn open(model: &Path, cameras: &Path) -> Scene {
     open_scene(&options).unwrap()
 }
 
-/// A scale that is the sum of two of some hundredths, and of which little is left, is known to no more than this: the
-/// originals, in f32, are off by up to 8e-9.
+/// Absolute tolerance of a scale, for scales that are the small sum of two numbers of a few hundredths: the trainers'
+/// f32 code is off by up to 8e-9 there.
 const CANCELLED: f64 = 1e-9;
 
-/// Largest differences of what a renderer reads, of all Gaussians at all recorded frames.
+/// Largest differences of the values that a renderer reads, over all Gaussians and all recorded frames.
 #[derive(Debug, Default)]
-struct Off {
+struct StateErrors {
     position: f64,
     rotation: f64,
-    /// Relative, beyond [`CANCELLED`].
+    /// Relative difference beyond [`CANCELLED`].
     scale: f64,
     opacity: f64,
     color: f64,
 }
 
-impl Off {
-    fn of(scene: &Scene, model: &Path) -> Off {
+impl StateErrors {
+    fn measure(scene: &Scene, model: &Path) -> StateErrors {
         let expected = arrays(&model.join("states.npz"));
         let source = scene.source();
-        let mut off = Off::default();
+        let mut errors = StateErrors::default();
         for (row, &frame) in expected["frames"].iter().enumerate() {
             let state = state(source, frame as usize);
-            off.add(&state, |name, width| {
+            errors.add(&state, |name, width| {
                 let name = if expected.contains_key(name) { name } else { "features" };
-                // No colors where they are harmonics that nothing changes.
+                // Colors are not recorded if they are SH that do not change.
                 let Some(all) = expected.get(name) else { return &[] };
                 let rows = state.len() * width;
-                // What does not change with time is there once.
+                // An array that does not change with time is recorded once.
                 let at = if all.len() == rows { 0 } else { row * rows };
                 &all[at..at + rows]
             });
         }
-        off
+        errors
     }
 
     fn add<'a>(&mut self, state: &Gaussians, expected: impl Fn(&'static str, usize) -> &'a [f64]) {
@@ -75,8 +75,8 @@ impl Off {
         }
     }
 
-    /// Tolerances that are fair in f32.
-    fn is_small(&self) -> bool {
+    /// Returns whether all differences are within tolerances that are reasonable in f32.
+    fn is_within_f32_tolerance(&self) -> bool {
         self.position <= 2e-6
             && self.rotation <= 5e-7
             && self.scale <= 1e-6
@@ -87,14 +87,14 @@ impl Off {
 
 #[test]
 #[ignore = "needs the trained models"]
-fn states_of_dynamic_3d_gaussians_are_those_of_its_own_code() {
-    let model = family("d3dg");
+fn dynamic_3d_gaussians_states_match_their_trainer() {
+    let model = model_path("d3dg");
     let [own, other] = ["train_meta.json", "transforms_train.json"].map(|name| open(&model, &model.join(name)));
     for scene in [&own, &other] {
-        let off = Off::of(scene, &model);
-        assert!(off.is_small(), "{off:?}");
+        let errors = StateErrors::measure(scene, &model);
+        assert!(errors.is_within_f32_tolerance(), "{errors:?}");
     }
-    // The cameras of its own files are those of the others.
+    // The cameras of this trainer's own files equal those of the transforms files.
     let train = |scene: &Scene| -> Vec<_> {
         scene.rig.shots.iter().filter(|shot| shot.split == Split::Train).cloned().collect()
     };
@@ -107,11 +107,11 @@ fn states_of_dynamic_3d_gaussians_are_those_of_its_own_code() {
     }
 }
 
-/// Of models whose states are a covariance: largest differences of position and opacity, and of a covariance over its
-/// largest entry.
-fn off_in_covariance(scene: &Scene, model: &Path) -> [f64; 3] {
+/// Returns the largest differences of position and opacity, and of the covariance relative to its largest entry, for
+/// models that record covariances.
+fn covariance_errors(scene: &Scene, model: &Path) -> [f64; 3] {
     let expected = arrays(&model.join("states.npz"));
-    let (source, mut off) = (scene.source(), [0.0f64; 3]);
+    let (source, mut errors) = (scene.source(), [0.0f64; 3]);
     for (row, (&frame, &time)) in expected["frames"].iter().zip(&expected["times"]).enumerate() {
         assert!((source.info().times[frame as usize] - time).abs() < 1e-9);
         let state = state(source, frame as usize);
@@ -125,94 +125,94 @@ fn off_in_covariance(scene: &Scene, model: &Path) -> [f64; 3] {
             let found = (axes * axes.transpose()).to_cols_array();
             let cov = &expected["cov"][6 * at..][..6];
             let most = cov.iter().fold(0.0f64, |most, x| most.max(x.abs()));
-            for (k, place) in [0, 1, 2, 4, 5, 8].into_iter().enumerate() {
-                off[2] = off[2].max((found[place] - cov[k]).abs() / most);
+            for (k, workplace) in [0, 1, 2, 4, 5, 8].into_iter().enumerate() {
+                errors[2] = errors[2].max((found[workplace] - cov[k]).abs() / most);
             }
             for c in 0..3 {
-                off[0] = off[0].max((f64::from(state.position.plane(c)[i]) - expected["xyz"][3 * at + c]).abs());
+                errors[0] = errors[0].max((f64::from(state.position.plane(c)[i]) - expected["xyz"][3 * at + c]).abs());
             }
             let opacity = 1.0 / (1.0 + (-f64::from(state.opacity_logit.plane(0)[i])).exp());
-            off[1] = off[1].max((opacity - expected["opacity"][i]).abs());
+            errors[1] = errors[1].max((opacity - expected["opacity"][i]).abs());
         }
     }
-    off
+    errors
 }
 
 #[test]
 #[ignore = "needs the trained models"]
-fn states_of_deformable_3d_gaussians_are_those_of_its_own_code() {
+fn deformable_3d_gaussians_states_match_their_trainer() {
     for (name, cameras) in [("deformable3d", "deform2"), ("deformable3d_6dof", "room2_dynerf")] {
-        let model = family(name);
-        let off = off_in_covariance(&open(&model, &shared(cameras)), &model);
-        println!("{name}: position {:e}, opacity {:e}, covariance {:e}", off[0], off[1], off[2]);
-        assert!(off[0] <= 2e-6 && off[1] <= 5e-7 && off[2] <= 1e-5, "{name}: {off:?}");
+        let model = model_path(name);
+        let errors = covariance_errors(&open(&model, &shared(cameras)), &model);
+        println!("{name}: position {:e}, opacity {:e}, covariance {:e}", errors[0], errors[1], errors[2]);
+        assert!(errors[0] <= 2e-6 && errors[1] <= 5e-7 && errors[2] <= 1e-5, "{name}: {errors:?}");
     }
 }
 
 #[test]
 #[ignore = "needs the trained models"]
-fn states_of_sc_gs_are_those_of_its_own_code() {
-    let model = family("scgs");
-    let off = Off::of(&open(&model, &shared("deform2")), &model);
-    println!("{off:?}");
-    assert!(off.is_small(), "{off:?}");
+fn sc_gs_states_match_their_trainer() {
+    let model = model_path("scgs");
+    let errors = StateErrors::measure(&open(&model, &shared("deform2")), &model);
+    println!("{errors:?}");
+    assert!(errors.is_within_f32_tolerance(), "{errors:?}");
 }
 
-/// PSNR of `compressed` against `original`, dB.
-fn psnr(place: &Workplace, original: &str, compressed: &str) -> f64 {
-    let found = place.done(&format!("evaluate {original} {compressed} --cameras {original} --json"));
+/// Returns the PSNR of `compressed` against `original`, in dB.
+fn psnr(workplace: &Workplace, original: &str, compressed: &str) -> f64 {
+    let found = workplace.done(&format!("evaluate {original} {compressed} --cameras {original} --json"));
     let found: serde_json::Value = serde_json::from_str(&found).unwrap();
     found["psnr"].as_f64().unwrap()
 }
 
 #[test]
 #[ignore = "needs the trained models"]
-fn dynamic_3d_gaussians_go_through_every_verb() {
-    let place = Workplace::new();
-    let model = family("d3dg").display().to_string();
-    let whole = place.done(&format!("info {model}"));
+fn every_command_accepts_dynamic_3d_gaussians() {
+    let workplace = Workplace::new();
+    let model = model_path("d3dg").display().to_string();
+    let whole = workplace.done(&format!("info {model}"));
     assert!(whole.contains("Dynamic3DGaussians") && whole.contains("2000"), "{whole}");
     for ratio in [0.4, 0.2] {
         let [pruned, default, refined] =
             [("pruned", "--prune-only --no-refine"), ("merged", "--no-refine"), ("refined", "")].map(
                 |(name, options)| {
                     let options = format!("-o {name} --ratio {ratio} {options} --overwrite");
-                    let summary = place.summary(&format!("{model} --cameras {model} {options}"));
+                    let summary = workplace.summary(&format!("{model} --cameras {model} {options}"));
                     assert_eq!(summary["gaussians"], 2000.0 * ratio, "{summary}");
-                    psnr(&place, &model, name)
+                    psnr(&workplace, &model, name)
                 },
             );
         println!("{ratio}: {pruned} dB pruned, {default} with merging, {refined} refined");
         assert!(default >= pruned && refined > pruned + 1.0, "{pruned} {default} {refined}");
     }
-    place.done(&format!("compress {model} --cameras {model} -o merged.gseq --merge-only --preset strong --no-refine"));
-    place.done(&format!("convert {model} packed.gseq"));
-    place.done(&format!("score {model} --cameras {model} -o rows.csv"));
-    place.done(&format!("render {model} --cameras {model} --frame 3 --view 1 -o picture.png"));
+    workplace.done(&format!("compress {model} --cameras {model} -o merged.gseq --merge-only --preset strong --no-refine"));
+    workplace.done(&format!("convert {model} packed.gseq"));
+    workplace.done(&format!("score {model} --cameras {model} -o rows.csv"));
+    workplace.done(&format!("render {model} --cameras {model} --frame 3 --view 1 -o picture.png"));
 }
 
 #[test]
 #[ignore = "needs the trained models"]
-fn states_and_features_of_spacetime_gaussians_are_those_of_its_own_code() {
-    let [lite, full] = ["stg_lite", "stg_full"].map(family);
+fn spacetime_gaussians_states_match_their_trainer() {
+    let [lite, full] = ["stg_lite", "stg_full"].map(model_path);
     for path in [lite.clone(), lite.join("point_cloud/iteration_10000/point_cloud.ply")] {
-        let off = Off::of(&open(&path, &lite), &lite);
-        assert!(off.is_small(), "{off:?}");
+        let errors = StateErrors::measure(&open(&path, &lite), &lite);
+        assert!(errors.is_within_f32_tolerance(), "{errors:?}");
     }
     let scene = open(&full, &full);
     let expected = arrays(&full.join("states.npz"));
     let decoder = scene.source().decoder().expect("a network");
-    let mut off = Off::default();
+    let mut errors = StateErrors::default();
     let mut furthest = 0.0f64;
     for (row, &frame) in expected["frames"].iter().enumerate() {
         assert!((scene.source().info().times[frame as usize] - expected["times"][row]).abs() < 1e-9);
         let state = state(scene.source(), frame as usize);
         let count = state.len();
         let features = &expected["features"][9 * count * row..][..9 * count];
-        // The color that the first features have by themselves.
+        // Color that the first three features have without the decoder.
         let colors: Vec<f64> =
             features.chunks(9).flat_map(|f| [f[0], f[1], f[2]].map(|x| 1.0 / (1.0 + (-x).exp()))).collect();
-        off.add(&state, |name, width| match name {
+        errors.add(&state, |name, width| match name {
             "colour" => &colors,
             "scales" => &expected[name],
             _ => &expected[name][row * width * count..][..width * count],
@@ -224,17 +224,17 @@ fn states_and_features_of_spacetime_gaussians_are_those_of_its_own_code() {
             furthest = row.iter().zip(features).fold(furthest, |most, (&a, b)| most.max((f64::from(a) - b).abs()));
         }
     }
-    assert!(off.is_small() && furthest < 5e-7, "{off:?} {furthest}");
+    assert!(errors.is_within_f32_tolerance() && furthest < 5e-7, "{errors:?} {furthest}");
 }
 
 #[test]
 #[ignore = "needs the trained models"]
-fn decoders_of_spacetime_gaussians_give_the_colors_of_its_own_code() {
-    let place = Workplace::new();
-    let full = family("stg_full");
+fn spacetime_gaussians_decoders_match_their_trainer() {
+    let workplace = Workplace::new();
+    let full = model_path("stg_full");
     let expected = arrays(&full.join("decoder.npz"));
     for act in ["sandwich", "sandwichnoact", "sandwichnoactss"] {
-        let copy = place.path(act);
+        let copy = workplace.path(act);
         let iteration = "point_cloud/iteration_25000";
         fs::create_dir_all(copy.join(iteration)).unwrap();
         for name in ["point_cloud.ply", "point_cloud.pt"] {
@@ -258,75 +258,77 @@ fn decoders_of_spacetime_gaussians_give_the_colors_of_its_own_code() {
 
 #[test]
 #[ignore = "needs the trained models"]
-fn a_splatv_of_the_lite_model_has_the_texture_that_its_viewers_converter_makes_rounded() {
-    let place = Workplace::new();
-    let lite = family("stg_lite");
+fn splatv_of_the_lite_model_equals_its_converter_rounded() {
+    let workplace = Workplace::new();
+    let lite = model_path("stg_lite");
     let [model, cameras] = [lite.clone(), lite.clone()].map(|path| path.display().to_string());
-    place.done(&format!("compress {model} --cameras {cameras} -o all.splatv --ratio 1 --prune-only --no-refine"));
+    workplace
+        .done(&format!("compress {model} --cameras {cameras} -o all.splatv --ratio 1 --prune-only --no-refine"));
     let texture = |path: &Path| {
         let bytes = fs::read(path).unwrap();
         let words: Vec<u32> = bytes[..8].chunks(4).map(|word| u32::from_le_bytes(word.try_into().unwrap())).collect();
         assert_eq!(words[0], 0x674b);
         bytes[8 + words[1] as usize..].to_vec()
     };
-    let [found, expected] = [place.path("all.splatv"), lite.join("model.splatv")].map(|path| texture(&path));
+    let [found, expected] = [workplace.path("all.splatv"), lite.join("model.splatv")].map(|path| texture(&path));
     assert_eq!(found.len(), expected.len());
-    // Theirs takes exponentials in f32: where that is next to the middle of two halves it may take the other one.
+    // The converter of the viewer computes exponentials in f32: near the middle between two half-precision numbers it
+    // may round to the other one.
     let parts =
         |texture: &[u8]| texture.as_chunks().0.iter().map(|&part| u16::from_le_bytes(part)).collect::<Vec<u16>>();
     let (found, expected) = (parts(&found), parts(&expected));
     let differing: Vec<usize> = (0..found.len()).filter(|&k| found[k] != expected[k]).collect();
-    // Words 5, 6 and 15 of each Gaussian's 16.
+    // Words 5, 6 and 15 of the 16 words of each Gaussian.
     let are_exponentials = differing.iter().all(|k| [10, 11, 12, 31].contains(&(k % 32)));
     let is_next = differing.iter().all(|&k| found[k].abs_diff(expected[k]) == 1);
     assert!(differing.len() <= 2 && are_exponentials && is_next, "{differing:?}");
-    // Read, it moves as the model does, to the precision of halves.
-    let [read, own] = ["all.splatv", &model].map(|path| open(&place.path(path), &lite));
+    // The file read again moves like the model, to half precision.
+    let [read, own] = ["all.splatv", &model].map(|path| open(&workplace.path(path), &lite));
     assert_eq!(read.source().info().times, own.source().info().times);
     let [read, own] = [&read, &own].map(|scene| state(scene.source(), 20));
-    let off =
+    let errors =
         read.position.planes().iter().zip(own.position.planes()).fold(0.0f32, |most, (a, b)| most.max((a - b).abs()));
-    assert!(off < 4e-3, "{off}");
-    assert!(place.done(&format!("evaluate {model} all.splatv --cameras {model} --json")).contains("psnr"));
+    assert!(errors < 4e-3, "{errors}");
+    assert!(workplace.done(&format!("evaluate {model} all.splatv --cameras {model} --json")).contains("psnr"));
 }
 
 #[test]
 #[ignore = "needs the trained models"]
-fn spacetime_gaussians_go_through_every_verb() {
-    let place = Workplace::new();
-    // What a made-up network makes of features is far from smooth.
+fn every_command_accepts_spacetime_gaussians() {
+    let workplace = Workplace::new();
+    // The untrained decoder of `stg_full` gives colors that are far from smooth.
     for (name, least) in [("stg_lite", 32.0), ("stg_full", 23.0)] {
-        let model = family(name).display().to_string();
+        let model = model_path(name).display().to_string();
         for ratio in [0.4, 0.2] {
             let [pruned, default] = [("pruned", "--prune-only"), ("merged", "")].map(|(name, options)| {
                 let options = format!("-o {name} --ratio {ratio} {options} --overwrite");
-                place.summary(&format!("{model} --cameras {model} {options}"));
-                psnr(&place, &model, name)
+                workplace.summary(&format!("{model} --cameras {model} {options}"));
+                psnr(&workplace, &model, name)
             });
             println!("{name} {ratio}: {pruned} dB pruned, {default} default");
             assert!(default >= pruned && default > least, "{name} {ratio}: {pruned} {default}");
         }
-        place.done(&format!(
+        workplace.done(&format!(
             "compress {model} --cameras {model} -o merged --merge-only --preset strong --no-refine --overwrite"
         ));
-        assert!(psnr(&place, &model, "merged") > least);
-        place.done(&format!("convert {model} packed.gseq --cameras {model} --overwrite"));
-        place.done(&format!("score {model} --cameras {model} -o rows.csv --overwrite"));
-        place.done(&format!("render {model} --cameras {model} --frame 3 --view 1 -o picture.png --overwrite"));
-        place.done(&format!("report {model} merged --cameras {model} -o report --overwrite"));
+        assert!(psnr(&workplace, &model, "merged") > least);
+        workplace.done(&format!("convert {model} packed.gseq --cameras {model} --overwrite"));
+        workplace.done(&format!("score {model} --cameras {model} -o rows.csv --overwrite"));
+        workplace.done(&format!("render {model} --cameras {model} --frame 3 --view 1 -o picture.png --overwrite"));
+        workplace.done(&format!("report {model} merged --cameras {model} -o report --overwrite"));
     }
 }
 
 #[test]
 #[ignore = "needs the trained models"]
-fn states_of_native_4d_gaussians_are_those_of_its_own_code() {
-    let model = family("yang4d");
-    // The length of its time is that of the configuration beside it.
+fn native_4d_gaussians_states_match_their_trainer() {
+    let model = model_path("yang4d");
+    // The duration is in the configuration file beside the model.
     let scene = open(&model, &model);
     let expected = arrays(&model.join("states.npz"));
     let count = scene.source().info().count;
-    let mut off = [0.0f64; 4];
-    let mut raise = |k: usize, found: f64, wanted: f64| off[k] = off[k].max((found - wanted).abs());
+    let mut errors = [0.0f64; 4];
+    let mut raise = |k: usize, found: f64, wanted: f64| errors[k] = errors[k].max((found - wanted).abs());
     for (row, &frame) in expected["frames"].iter().enumerate() {
         assert!((scene.source().info().times[frame as usize] - expected["times"][row]).abs() < 1e-9);
         let state = state(scene.source(), frame as usize);
@@ -345,11 +347,11 @@ fn states_of_native_4d_gaussians_are_those_of_its_own_code() {
             }
         }
     }
-    println!("position {:e}, opacity {:e}, covariance {:e}, harmonics {:e}", off[0], off[1], off[2], off[3]);
-    assert!(off[0] <= 2e-6 && off[1] <= 5e-7 && off[2] <= 5e-6 && off[3] <= 1e-6, "{off:?}");
+    println!("position {:e}, opacity {:e}, covariance {:e}, harmonics {:e}", errors[0], errors[1], errors[2], errors[3]);
+    assert!(errors[0] <= 2e-6 && errors[1] <= 5e-7 && errors[2] <= 5e-6 && errors[3] <= 1e-6, "{errors:?}");
 }
 
-/// R diag(s)² Rᵀ of a Gaussian: xx xy xz yy yz zz.
+/// Returns R diag(s)² Rᵀ of a Gaussian as xx, xy, xz, yy, yz, zz.
 fn covariance(state: &Gaussians, i: usize) -> [f64; 6] {
     let q = state.rotation.row::<4>(i).map(f64::from);
     let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
@@ -366,44 +368,44 @@ fn covariance(state: &Gaussians, i: usize) -> [f64; 6] {
 
 #[test]
 #[ignore = "needs the trained models"]
-fn states_of_free_time_gs_are_those_of_its_own_code() {
-    let model = family("ftgs");
+fn free_time_gs_states_match_their_trainer() {
+    let model = model_path("ftgs");
     let scene = open(&model, &shared("deform2"));
     let expected = arrays(&model.join("states.npz"));
-    let mut off = Off::default();
+    let mut errors = StateErrors::default();
     for (row, &frame) in expected["frames"].iter().enumerate() {
         let state = state(scene.source(), frame as usize);
-        // Colors do not change, and are not recorded.
+        // Colors do not change and are not recorded.
         let color = |i: usize, c: usize| 0.5 + SH_C0 * f64::from(state.sh.plane(c)[i]);
         let colors: Vec<f64> = (0..state.len()).flat_map(|i| [0, 1, 2].map(|c| color(i, c))).collect();
-        off.add(&state, |name, width| match name {
+        errors.add(&state, |name, width| match name {
             "colour" => &colors,
             "xyz" | "opacity" => &expected[name][row * width * state.len()..][..width * state.len()],
             _ => &expected[name],
         });
     }
-    assert!(off.is_small(), "{off:?}");
+    assert!(errors.is_within_f32_tolerance(), "{errors:?}");
 }
 
 #[test]
 #[ignore = "needs the trained models"]
-fn checkpoints_go_through_every_verb() {
-    let place = Workplace::new();
-    let ftgs = [family("ftgs"), shared("deform2")].map(|path| path.display().to_string());
-    let yang4d = [family("yang4d"), family("yang4d")].map(|path| path.display().to_string());
+fn every_command_accepts_checkpoints() {
+    let workplace = Workplace::new();
+    let ftgs = [model_path("ftgs"), shared("deform2")].map(|path| path.display().to_string());
+    let yang4d = [model_path("yang4d"), model_path("yang4d")].map(|path| path.display().to_string());
     for ([model, cameras], said) in [(yang4d, " --time-duration 0,2"), (ftgs, "")] {
         for ratio in [0.4, 0.2] {
             let [pruned, default] = [("pruned", "--prune-only"), ("merged", "")].map(|(name, options)| {
                 let options = format!("-o {name} --ratio {ratio} {options} --overwrite{said}");
-                place.summary(&format!("{model} --cameras {cameras} {options}"));
-                let found = place.done(&format!("evaluate {model} {name} --cameras {cameras} --json{said}"));
+                workplace.summary(&format!("{model} --cameras {cameras} {options}"));
+                let found = workplace.done(&format!("evaluate {model} {name} --cameras {cameras} --json{said}"));
                 let found: serde_json::Value = serde_json::from_str(&found).unwrap();
                 found["psnr"].as_f64().unwrap()
             });
             println!("{model} {ratio}: {pruned} dB pruned, {default} default");
             assert!(default >= pruned, "{model} {ratio}: {pruned} {default}");
         }
-        let done = |line: &str| place.done(&format!("{line} --cameras {cameras} --overwrite{said}"));
+        let done = |line: &str| workplace.done(&format!("{line} --cameras {cameras} --overwrite{said}"));
         done(&format!("compress {model} -o merged --merge-only --preset strong --no-refine"));
         done(&format!("convert {model} packed.gseq"));
         done(&format!("score {model} -o rows.csv"));
@@ -414,36 +416,37 @@ fn checkpoints_go_through_every_verb() {
 
 #[test]
 #[ignore = "needs the trained models"]
-fn models_of_nodes_go_through_every_verb() {
-    through_every_verb(&[("scgs", "deform2", "SC-GS", 1500.0)]);
+fn every_command_accepts_models_of_control_nodes() {
+    check_every_command(&[("scgs", "deform2", "SC-GS", 1500.0)]);
 }
 
-/// A network for every Gaussian takes half an hour unless it is optimized: run by name, with `SPLATSIEVE_PROGRAM`.
+/// A network evaluated for every Gaussian takes half an hour without optimization; run this test by name, with
+/// `SPLATSIEVE_PROGRAM`.
 #[test]
 #[ignore = "slow: half an hour unless optimised"]
-fn slow_networks_go_through_every_verb() {
-    through_every_verb(&[
+fn slow_every_command_accepts_deep_networks() {
+    check_every_command(&[
         ("deformable3d", "deform2", "Deformable-3D-Gaussians", 4000.0),
         ("deformable3d_6dof", "room2_dynerf", "Deformable-3D-Gaussians", 3000.0),
     ]);
 }
 
-/// Models by name, scene, kind and number of Gaussians.
-fn through_every_verb(models: &[(&str, &str, &str, f64)]) {
-    let place = Workplace::new();
-    for &(name, of, kind, count) in models {
-        let [model, cameras] = [family(name), shared(of)].map(|path| path.display().to_string());
-        let whole = place.done(&format!("info {model}"));
+/// Runs every command on models given by name, scene, kind and number of Gaussians.
+fn check_every_command(models: &[(&str, &str, &str, f64)]) {
+    let workplace = Workplace::new();
+    for &(name, scene_name, kind, count) in models {
+        let [model, cameras] = [model_path(name), shared(scene_name)].map(|path| path.display().to_string());
+        let whole = workplace.done(&format!("info {model}"));
         assert!(whole.contains(kind) && whole.contains(&count.to_string()), "{whole}");
         let psnr = |compressed: &str| {
-            let found = place.done(&format!("evaluate {model} {compressed} --cameras {cameras} --json"));
+            let found = workplace.done(&format!("evaluate {model} {compressed} --cameras {cameras} --json"));
             serde_json::from_str::<serde_json::Value>(&found).unwrap()["psnr"].as_f64().unwrap()
         };
         for ratio in [0.4, 0.2] {
             let [pruned, default] =
                 [("pruned", "--prune-only --no-refine"), ("merged", "--no-refine")].map(|(result, options)| {
                     let options = format!("-o {result} --ratio {ratio} {options} --overwrite");
-                    let summary = place.summary(&format!("{model} --cameras {cameras} {options}"));
+                    let summary = workplace.summary(&format!("{model} --cameras {cameras} {options}"));
                     assert_eq!(summary["gaussians"], count * ratio, "{summary}");
                     psnr(result)
                 });
@@ -451,15 +454,15 @@ fn through_every_verb(models: &[(&str, &str, &str, f64)]) {
             assert!(default >= pruned, "{name}: {pruned} {default}");
         }
         if name == "scgs" {
-            place.done(&format!("compress {model} --cameras {cameras} -o refined --ratio 0.2"));
+            workplace.done(&format!("compress {model} --cameras {cameras} -o refined --ratio 0.2"));
             let [pruned, refined] = ["pruned", "refined"].map(psnr);
             assert!(refined > pruned + 1.0, "{pruned} {refined}");
         }
-        place.done(&format!(
+        workplace.done(&format!(
             "compress {model} --cameras {cameras} -o m.gseq --merge-only --preset strong --no-refine --overwrite"
         ));
-        place.done(&format!("convert {model} p.gseq --cameras {cameras} --overwrite"));
-        place.done(&format!("score {model} --cameras {cameras} -o rows.csv --overwrite"));
-        place.done(&format!("render {model} --cameras {cameras} --frame 3 --view 1 -o picture.png --overwrite"));
+        workplace.done(&format!("convert {model} p.gseq --cameras {cameras} --overwrite"));
+        workplace.done(&format!("score {model} --cameras {cameras} -o rows.csv --overwrite"));
+        workplace.done(&format!("render {model} --cameras {cameras} --frame 3 --view 1 -o picture.png --overwrite"));
     }
 }

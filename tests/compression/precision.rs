@@ -1,5 +1,5 @@
-//! `precision` as a user runs it: what is exact has no error, what converges does so at the rate that theory predicts, and
-//! nothing but the diagrams stays.
+//! Tests of `precision`: exact settings have no error, converging ones converge at the rate that theory predicts, and
+//! only the diagrams remain.
 
 use std::fs;
 
@@ -10,7 +10,7 @@ fn read(text: &str) -> Value {
     serde_json::from_str(text).unwrap_or_else(|error| panic!("{error}: {text}"))
 }
 
-/// Cameras as 3DGS writes them, the last of them held out.
+/// Returns cameras in the file format of 3DGS as transforms with the last camera as test view.
 fn held_out(cameras: &Value) -> Value {
     let cameras = cameras.as_array().unwrap();
     let frame = |(view, camera): (usize, &Value)| {
@@ -27,24 +27,24 @@ fn held_out(cameras: &Value) -> Value {
     json!({"frames": cameras.iter().enumerate().map(frame).collect::<Vec<_>>()})
 }
 
-/// The curves of a knob.
+/// Returns the curves of a setting.
 fn curves<'a>(found: &'a Value, knob: &str) -> &'a Vec<Value> {
     let knobs = found["knobs"].as_array().unwrap();
-    knobs.iter().find(|of| of["name"] == knob).unwrap_or_else(|| panic!("no {knob}"))["curves"].as_array().unwrap()
+    knobs.iter().find(|entry| entry["name"] == knob).unwrap_or_else(|| panic!("no {knob}"))["curves"].as_array().unwrap()
 }
 
-/// An error of every mark of a curve.
-fn errors(curve: &Value, of: &str) -> Vec<f64> {
-    curve["marks"].as_array().unwrap().iter().map(|mark| mark["errors"][of].as_f64().unwrap()).collect()
+/// Returns the errors of one kind at all marks of a curve.
+fn errors(curve: &Value, kind: &str) -> Vec<f64> {
+    curve["marks"].as_array().unwrap().iter().map(|mark| mark["errors"][kind].as_f64().unwrap()).collect()
 }
 
-fn observed(curve: &Value, of: &str) -> f64 {
+fn observed(curve: &Value, kind: &str) -> f64 {
     let orders = curve["orders"].as_array().unwrap();
-    orders.iter().find(|order| order["of"] == of).unwrap()["observed"].as_f64().unwrap()
+    orders.iter().find(|order| order["of"] == kind).unwrap()["observed"].as_f64().unwrap()
 }
 
 #[test]
-fn what_is_exact_has_no_error_and_what_converges_does_so_as_it_should() {
+fn exact_settings_have_no_error_and_others_converge() {
     let place = Workplace::new();
     let demo = "demo -o d --gaussians 1000 --frames 5";
     place.done(demo);
@@ -57,12 +57,12 @@ fn what_is_exact_has_no_error_and_what_converges_does_so_as_it_should() {
     let found = read(&run.stdout);
     assert_eq!(found, read(&fs::read_to_string(place.path("diagrams/precision.json")).unwrap()));
     assert_eq!(found["kept"], 300);
-    // 5 frames of 6 cameras, of which one is held out.
+    // 5 frames of 6 cameras, of which one is a test camera.
     assert_eq!((&found["pictures"], &found["judged"]), (&25.into(), &5.into()));
 
     for curve in curves(&found, "look") {
-        for of in ["C", "W", "kept", "staying", "added"] {
-            assert_eq!(errors(curve, of).last(), Some(&0.0), "{of} of {}", curve["name"]);
+        for kind in ["C", "W", "kept", "staying", "added"] {
+            assert_eq!(errors(curve, kind).last(), Some(&0.0), "{kind} of {}", curve["name"]);
         }
         let of_c = errors(curve, "C");
         assert!(of_c[0] > 0.0, "{}: nothing is sampled", curve["name"]);
@@ -70,35 +70,35 @@ fn what_is_exact_has_no_error_and_what_converges_does_so_as_it_should() {
         assert!(curve["name"] != "look_pictures" || errors(curve, "staying")[0] > 0.0, "as many stay");
         let costs = curve["marks"].as_array().unwrap().iter().map(|mark| &mark["cost"]);
         for cost in costs {
-            let seconds = ["least", "median", "most"].map(|of| cost["seconds"][of].as_f64().unwrap());
+            let seconds = ["least", "median", "most"].map(|name| cost["seconds"][name].as_f64().unwrap());
             assert!(seconds.is_sorted() && seconds[0] > 0.0 && cost["runs"] == 1, "{cost}");
         }
     }
     let rounds = curves(&found, "rounds");
     for curve in rounds {
-        let of = errors(curve, "kept");
-        assert!(of[0] > 0.0 && of[0] > of[of.len() - 2] && of.last() == Some(&0.0), "{}: {of:?}", curve["name"]);
+        let values = errors(curve, "kept");
+        assert!(values[0] > 0.0 && values[0] > values[values.len() - 2] && values.last() == Some(&0.0), "{}: {values:?}", curve["name"]);
     }
 
     let percentiles = &curves(&found, "percentiles")[0];
-    // So few pictures are all looked at: exact percentiles keep what the finest look does.
+    // All views are used if there are so few: exact percentiles give what the finest view sampling gives.
     let [exact, finest] = [percentiles, &curves(&found, "look")[0]]
         .map(|curve| &curve["marks"].as_array().unwrap().last().unwrap()["psnr"]);
     assert!(exact.is_number() && exact == finest, "{exact} {finest}");
-    let of = errors(percentiles, "percentiles");
-    // Half a bucket of 2⁻ᵇⁱᵗˢ at most; the exact ones have no error.
-    for (mark, error) in percentiles["marks"].as_array().unwrap().iter().zip(&of) {
+    let values = errors(percentiles, "percentiles");
+    // At most half a bucket of 2⁻ᵇⁱᵗˢ; exact percentiles have no error.
+    for (mark, error) in percentiles["marks"].as_array().unwrap().iter().zip(&values) {
         assert!(*error <= 0.51 * mark["step"].as_f64().unwrap(), "{mark}");
     }
     let order = observed(percentiles, "percentiles");
     assert!((0.6..1.4).contains(&order), "percentiles converge at order {order}, not 1");
 
     let [plain, compensated, scan] = &curves(&found, "sums")[..] else { panic!("three ways to sum") };
-    for of in ["D", "kappa"] {
-        let last = |curve| *errors(curve, of).last().unwrap();
-        assert!(last(plain) > 1e-6, "{of}: f32 loses nothing: {}", last(plain));
-        assert!(last(compensated) < 1e-7 && last(scan) < 1e-11, "{of}: {} {}", last(compensated), last(scan));
-        assert!(errors(plain, of).is_sorted(), "{of}: errors of f32 do not grow with frames");
+    for kind in ["D", "kappa"] {
+        let last = |curve| *errors(curve, kind).last().unwrap();
+        assert!(last(plain) > 1e-6, "{kind}: f32 loses nothing: {}", last(plain));
+        assert!(last(compensated) < 1e-7 && last(scan) < 1e-11, "{kind}: {} {}", last(compensated), last(scan));
+        assert!(errors(plain, kind).is_sorted(), "{kind}: errors of f32 do not grow with frames");
     }
 
     let page = fs::read_to_string(place.path("diagrams/precision.html")).unwrap();
@@ -120,15 +120,15 @@ fn what_is_exact_has_no_error_and_what_converges_does_so_as_it_should() {
 
 #[test]
 #[ignore = "needs time"]
-fn threads_and_memory_change_no_byte_and_runs_are_those_of_compress() {
+fn precision_runs_equal_compress_at_any_thread_count() {
     let place = Workplace::new();
     place.done("demo -o d --gaussians 1500 --frames 4");
     let found = read(&place.done(
         "precision d/scene.gseq --cameras d/cameras.json -o diagrams --knobs machine,merging --ratio 0.4 --repeat 1 --json",
     ));
     for curve in curves(&found, "machine") {
-        let of = errors(curve, "bytes");
-        assert!(!of.is_empty() && of.iter().all(|&error| error == 0.0), "{curve}");
+        let values = errors(curve, "bytes");
+        assert!(!values.is_empty() && values.iter().all(|&error| error == 0.0), "{curve}");
     }
     let marks = curves(&found, "merging")[0]["marks"].as_array().unwrap();
     let ran = |options: &str| {
@@ -139,7 +139,7 @@ fn threads_and_memory_change_no_byte_and_runs_are_those_of_compress() {
             read(&place.done("evaluate d/scene.gseq small.gseq --cameras d/cameras.json --max-frames 12 --json"));
         evaluated["psnr"].as_f64().unwrap()
     };
-    // Radius 0: pruning alone. The largest: four times the recipe's own, whatever pictures say of it.
+    // Merge radius 0: pruning only. The largest radius is four times that of the recipe, without choosing by renders.
     let [alone, widest] = [&marks[0], &marks[4]];
     assert_eq!((&alone["value"], &widest["value"]), (&0.0.into(), &0.02.into()));
     for (mark, options) in
@@ -152,7 +152,7 @@ fn threads_and_memory_change_no_byte_and_runs_are_those_of_compress() {
 }
 
 #[test]
-fn what_cannot_be_turned_is_refused_before_anything_is_written() {
+fn impossible_settings_are_refused_before_writing() {
     let place = Workplace::new();
     place.done("demo -o d --gaussians 300 --frames 3");
     let before = files(&place.path(""));
@@ -169,7 +169,7 @@ fn what_cannot_be_turned_is_refused_before_anything_is_written() {
 }
 
 #[test]
-fn a_recipe_that_looks_at_nothing_and_refines_nothing_has_less_to_turn_and_says_so() {
+fn unused_settings_of_a_recipe_are_left_out_by_name() {
     let place = Workplace::new();
     place.done("demo -o d --gaussians 300 --frames 3");
     let found = read(&place.done(

@@ -1,18 +1,18 @@
-//! Refining as a user sees it: every kind of input comes closer to the original, and what is to stay stays.
+//! Tests of refinement: every kind of input comes closer to the original, and protected Gaussians do not change.
 
 use std::path::Path;
 
 use crate::scene::{PlyRows, Workplace, files, index_map, tiny};
 
-/// Mean PSNR of `result` against `original` as `cameras` hold out.
+/// Returns the mean PSNR of `result` against `original` over the test views of `cameras`.
 fn quality(workplace: &Workplace, original: &str, result: &str, cameras: &str) -> f64 {
-    let told = workplace.done(&format!("evaluate {original} {result} --cameras {cameras} --json"));
-    serde_json::from_str::<serde_json::Value>(&told).unwrap()["psnr"].as_f64().unwrap()
+    let json = workplace.done(&format!("evaluate {original} {result} --cameras {cameras} --json"));
+    serde_json::from_str::<serde_json::Value>(&json).unwrap()["psnr"].as_f64().unwrap()
 }
 
 #[test]
 #[ignore = "needs time"]
-fn every_kind_of_input_comes_closer_to_the_original_at_the_same_count() {
+fn refinement_raises_psnr_of_every_input_kind() {
     let workplace = Workplace::new();
     workplace.done("demo --gaussians 1500 --frames 6 -o demo");
     workplace.done("convert demo/scene.gseq frames --as ply-sequence");
@@ -37,7 +37,7 @@ fn every_kind_of_input_comes_closer_to_the_original_at_the_same_count() {
 }
 
 #[test]
-fn a_static_model_without_cameras_is_refined_by_virtual_ones() {
+fn still_without_cameras_is_refined_by_virtual_ones() {
     let workplace = Workplace::new();
     workplace.done("demo --gaussians 1200 --frames 2 -o demo");
     workplace.done("convert demo/scene.gseq frames --as ply-sequence");
@@ -54,7 +54,7 @@ fn a_static_model_without_cameras_is_refined_by_virtual_ones() {
 
 #[test]
 #[ignore = "needs time"]
-fn who_asks_for_similarity_gets_it_for_decibels() {
+fn ssim_weight_raises_ssim_and_lowers_psnr() {
     let workplace = Workplace::new();
     workplace.done("demo --gaussians 1500 --frames 6 -o demo");
     let found = ["0", "0.5"].map(|part| {
@@ -62,16 +62,16 @@ fn who_asks_for_similarity_gets_it_for_decibels() {
             "compress demo/scene.gseq --cameras demo/cameras.json --ratio 0.1 --set refine_steps=600 \
              --set refine_ssim={part} --overwrite -o small.gseq"
         ));
-        let told = workplace.done("evaluate demo/scene.gseq small.gseq --cameras demo/cameras.json --json");
-        let told: serde_json::Value = serde_json::from_str(&told).unwrap();
-        ["psnr", "ssim"].map(|name| told[name].as_f64().unwrap())
+        let json = workplace.done("evaluate demo/scene.gseq small.gseq --cameras demo/cameras.json --json");
+        let json: serde_json::Value = serde_json::from_str(&json).unwrap();
+        ["psnr", "ssim"].map(|name| json[name].as_f64().unwrap())
     });
     let [[decibels, similarity], [fewer, more]] = found;
     assert!(more > similarity + 0.005 && fewer > decibels - 1.0, "without and with: {found:?}");
 }
 
 #[test]
-fn only_what_is_named_moves_and_nothing_of_what_is_protected() {
+fn refinement_changes_only_named_unprotected_values() {
     let workplace = Workplace::new();
     let cloud = |root: &Path| {
         let name = files(root).into_keys().find(|name| name.ends_with("point_cloud.ply")).unwrap();

@@ -1,5 +1,5 @@
-//! Norm, scores, thresholds and the kept set against method.md, sections 2 to 4 written down plainly: sorted
-//! values for percentiles, loops for sums, a sort for each stage.
+//! Normalization, scores, thresholds and survivors against a plain implementation of method.md, sections 2 to 4: sorted
+//! values for percentiles, loops for sums, one sort per stage.
 
 use crate::scene::{by_formula, scene, tiny};
 use splatsieve::model::Rows;
@@ -7,14 +7,14 @@ use splatsieve::pipeline::score_scene;
 use splatsieve::pruning::score::{Scored, UserOverrides};
 use splatsieve::recipe::{Anisotropy, LowPriority, Recipe};
 
-const N: usize = 300;
+const COUNT: usize = 300;
 const FRAMES: f64 = 10.0;
 
 fn scored(recipe: &Recipe) -> Scored {
     score_scene(&scene(&tiny()), recipe, &UserOverrides::default()).unwrap()
 }
 
-/// Nearest rank: the smallest value that at least `percent` of all do not exceed.
+/// Returns the nearest-rank percentile: the smallest value that at least `percent` of all values do not exceed.
 fn percentile(values: &[f64], percent: usize) -> f64 {
     let mut sorted = values.to_vec();
     sorted.sort_by(|a, b| a.partial_cmp(b).unwrap());
@@ -33,7 +33,7 @@ fn norm(values: &[f64], epsilon: f64, clip: bool) -> Vec<f64> {
     values.iter().map(|&x| scaled(x)).collect()
 }
 
-/// The published SplitMix64 step from state `id` (Steele, Lea and Flood 2014).
+/// Returns the first output of SplitMix64 with state `id`, as published (Steele, Lea and Flood 2014).
 fn hash(id: usize) -> u64 {
     let mut z = (id as u64).wrapping_mul(0x9e3779b97f4a7c15).wrapping_add(0x9e3779b97f4a7c15);
     z = (z ^ z >> 30).wrapping_mul(0xbf58476d1ce4e5b9);
@@ -41,14 +41,14 @@ fn hash(id: usize) -> u64 {
     z ^ z >> 31
 }
 
-struct Direct {
+struct PlainScores {
     static_score: Vec<f64>,
     dynamic_score: Vec<f64>,
     score: Vec<f64>,
     keep: Vec<bool>,
 }
 
-fn directly(rows: &Rows, recipe: &Recipe) -> Direct {
+fn plain_scores(rows: &Rows, recipe: &Recipe) -> PlainScores {
     let (score, select) = (&recipe.score, &recipe.select);
     let norm = |values: &[f64]| norm(values, score.norm_epsilon, score.clip_norm);
     let life: Vec<f64> = rows.life.iter().map(|&frames| f64::from(frames) / FRAMES).collect();
@@ -57,7 +57,7 @@ fn directly(rows: &Rows, recipe: &Recipe) -> Direct {
     };
     let weigh = |terms: &[(f64, Vec<f64>)]| -> Vec<f64> {
         let norms: Vec<(f64, Vec<f64>)> = terms.iter().map(|(weight, values)| (*weight, norm(values))).collect();
-        (0..N).map(|i| norms.iter().map(|(weight, norm)| weight * norm[i]).sum()).collect()
+        (0..COUNT).map(|i| norms.iter().map(|(weight, norm)| weight * norm[i]).sum()).collect()
     };
     let static_score = weigh(&[(1.0, rows.c.clone()), (score.lambda, rows.e.clone())]);
     let dynamic_score = weigh(&[
@@ -66,33 +66,33 @@ fn directly(rows: &Rows, recipe: &Recipe) -> Direct {
         (score.eta, rows.v.clone()),
         (score.xi, life.clone()),
     ]);
-    let sum: Vec<f64> = (0..N).map(|i| score.w_static * static_score[i] + score.w_dynamic * dynamic_score[i]).collect();
+    let sum: Vec<f64> = (0..COUNT).map(|i| score.w_static * static_score[i] + score.w_dynamic * dynamic_score[i]).collect();
 
-    let mut best: Vec<usize> = (0..N).collect();
+    let mut best: Vec<usize> = (0..COUNT).collect();
     best.sort_by(|&a, &b| sum[b].partial_cmp(&sum[a]).unwrap().then(hash(a).cmp(&hash(b))));
-    let candidates = &best[..(select.keep_fraction * N as f64).round() as usize];
+    let candidates = &best[..(select.keep_fraction * COUNT as f64).round() as usize];
     let (of_static, of_dynamic) = (norm(&static_score), norm(&dynamic_score));
-    let keep = (0..N)
+    let keep = (0..COUNT)
         .map(|i| {
             let passes = of_static[i] >= select.tau_static || of_dynamic[i] >= select.tau_dynamic;
             passes && (select.low_priority == LowPriority::Rescue || candidates.contains(&i))
         })
         .collect();
-    Direct { static_score, dynamic_score, score: sum, keep }
+    PlainScores { static_score, dynamic_score, score: sum, keep }
 }
 
-/// Compares a run with the formulas; gives how many were kept.
-fn agrees(recipe: Recipe) -> usize {
+/// Compares a run with the formulas. Returns how many Gaussians were kept.
+fn assert_agrees(recipe: Recipe) -> usize {
     let scored = scored(&recipe);
-    let expected = directly(&scored.rows().unwrap(), &recipe);
+    let expected = plain_scores(&scored.rows().unwrap(), &recipe);
     let scores = scored.scores(&recipe.score).unwrap();
     for (what, got, expected) in [
         ("S_static", &scores.static_score, &expected.static_score),
         ("S_dynamic", &scores.dynamic_score, &expected.dynamic_score),
         ("S", &scores.score, &expected.score),
     ] {
-        for i in 0..N {
-            // A few sums of f64, in another order.
+        for i in 0..COUNT {
+            // A few sums of f64 in another order.
             let tolerance = 1e-13 * (1.0 + expected[i].abs());
             assert!(
                 (got[i] - expected[i]).abs() <= tolerance,
@@ -109,16 +109,16 @@ fn agrees(recipe: Recipe) -> usize {
 }
 
 #[test]
-fn presets_score_and_keep_as_method_says() {
-    assert_eq!(agrees(by_formula("paper")), 240);
+fn presets_score_and_keep_as_specified() {
+    assert_eq!(assert_agrees(by_formula("paper")), 240);
     for preset in ["default", "gentle", "strong"] {
-        let kept = agrees(by_formula(preset));
-        assert!((100..N).contains(&kept), "{preset}: {kept} kept");
+        let kept = assert_agrees(by_formula(preset));
+        assert!((100..COUNT).contains(&kept), "{preset}: {kept} kept");
     }
 }
 
 #[test]
-fn every_parameter_of_the_scores_and_stages_acts_as_method_says() {
+fn every_score_parameter_acts_as_specified() {
     let edits: [fn(&mut Recipe); 9] = [
         |r| (r.score.w_static, r.score.w_dynamic) = (2.0, 0.3),
         |r| (r.score.lambda, r.score.anisotropy) = (1.5, Anisotropy::Log),
@@ -136,7 +136,7 @@ fn every_parameter_of_the_scores_and_stages_acts_as_method_says() {
             .map(|edit| {
                 let mut recipe = by_formula(preset);
                 edit(&mut recipe);
-                agrees(recipe)
+                assert_agrees(recipe)
             })
             .collect();
         let (fraction, thresholds, both) = (counts[6], counts[7], counts[8]);
@@ -146,13 +146,13 @@ fn every_parameter_of_the_scores_and_stages_acts_as_method_says() {
 }
 
 #[test]
-fn smaller_targets_keep_a_part_of_what_larger_ones_keep() {
+fn smaller_targets_keep_a_subset_of_larger_ones() {
     for preset in ["paper", "default"] {
         let selection = scored(&by_formula(preset)).selection;
-        let own: Vec<u32> = (0..N as u32).filter(|&i| selection.keep[i as usize]).collect();
+        let own: Vec<u32> = (0..COUNT as u32).filter(|&i| selection.keep[i as usize]).collect();
         assert_eq!(selection.ranking.take(own.len()), own, "the recipe's own count gives the recipe's own set");
-        let mut larger = selection.ranking.take(N);
-        for m in (0..N).rev() {
+        let mut larger = selection.ranking.take(COUNT);
+        for m in (0..COUNT).rev() {
             let smaller = selection.ranking.take(m);
             assert_eq!(smaller.len(), m);
             assert!(smaller.iter().all(|id| larger.binary_search(id).is_ok()), "{preset}: {m}");

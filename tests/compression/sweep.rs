@@ -1,5 +1,4 @@
-//! `sweep` as a user runs it: every point is what `compress` and `evaluate` give, and nothing but the curves
-//! stays.
+//! Tests of `sweep`: every point is what `compress` and `evaluate` give, and only the curves remain.
 
 use std::fs;
 
@@ -24,12 +23,12 @@ fn json(text: &str) -> Value {
 }
 
 #[test]
-fn every_method_has_its_points_at_the_counts_asked_for() {
-    let place = Workplace::new();
-    let run = place.run("sweep {tiny} --cameras {tiny} -o curves --fractions 0.25,0.5,0.5 --max-frames 2 --json");
+fn every_method_has_points_at_the_asked_counts() {
+    let workplace = Workplace::new();
+    let run = workplace.run("sweep {tiny} --cameras {tiny} -o curves --fractions 0.25,0.5,0.5 --max-frames 2 --json");
     assert_eq!(run.code, 0, "{}", run.stderr);
     let found = json(&run.stdout);
-    assert_eq!(found, json(&fs::read_to_string(place.path("curves/sweep.json")).unwrap()));
+    assert_eq!(found, json(&fs::read_to_string(workplace.path("curves/sweep.json")).unwrap()));
     let total = found["gaussians"].as_u64().unwrap();
     let points = found["points"].as_array().unwrap();
     let merged_alone = points.iter().find(|p| p["method"] == "paper-merge").unwrap()["count"].as_u64().unwrap();
@@ -37,7 +36,7 @@ fn every_method_has_its_points_at_the_counts_asked_for() {
         let own: Vec<&Value> = points.iter().filter(|point| point["method"] == name).collect();
         let asked: Vec<f64> = own.iter().filter_map(|point| point["asked"].as_f64()).collect();
         if name == "paper-merge" {
-            // Merging alone stops where nothing more is alike.
+            // Merging without pruning stops when no pair is similar enough.
             assert!(asked.iter().all(|asked| asked * total as f64 >= merged_alone as f64 - 0.5), "{asked:?}");
         } else {
             assert_eq!(asked, [0.5, 0.25], "{name}");
@@ -50,13 +49,13 @@ fn every_method_has_its_points_at_the_counts_asked_for() {
             assert!(point["bytes"].as_u64().unwrap() < found["bytes"].as_u64().unwrap(), "{point}");
         }
     }
-    let csv = fs::read_to_string(place.path("curves/sweep.csv")).unwrap();
+    let csv = fs::read_to_string(workplace.path("curves/sweep.csv")).unwrap();
     assert_eq!(csv.lines().count(), points.len() + 1);
     let mut left: Vec<_> =
-        fs::read_dir(place.path("curves")).unwrap().map(|entry| entry.unwrap().file_name()).collect();
+        fs::read_dir(workplace.path("curves")).unwrap().map(|entry| entry.unwrap().file_name()).collect();
     left.sort();
     assert_eq!(left, ["summary.json", "sweep.csv", "sweep.html", "sweep.json"]);
-    let page = fs::read_to_string(place.path("curves/sweep.html")).unwrap();
+    let page = fs::read_to_string(workplace.path("curves/sweep.html")).unwrap();
     for chart in ["PSNR by kept Gaussians", "SSIM by size", "PSNR by run time"] {
         assert!(page.contains(&format!("<figcaption>{chart}</figcaption>")), "{chart} is missing");
     }
@@ -64,17 +63,17 @@ fn every_method_has_its_points_at_the_counts_asked_for() {
 }
 
 #[test]
-fn a_point_is_what_compress_and_evaluate_give() {
-    let place = Workplace::new();
-    let swept = json(&place.done(
+fn point_equals_compress_and_evaluate() {
+    let workplace = Workplace::new();
+    let swept = json(&workplace.done(
         "sweep {tiny} --cameras {tiny} -o curves --methods default,no-refine,paper-prune --fractions 0.4 --max-frames 3 --json",
     ));
     for (method, flags) in
         [("default", ""), ("no-refine", "--no-refine"), ("paper-prune", "--preset paper --prune-only")]
     {
-        place.done(&format!("compress {{tiny}} --cameras {{tiny}} -o {method} --ratio 0.4 {flags}"));
+        workplace.done(&format!("compress {{tiny}} --cameras {{tiny}} -o {method} --ratio 0.4 {flags}"));
         let evaluated =
-            json(&place.done(&format!("evaluate {{tiny}} {method} --cameras {{tiny}} --max-frames 3 --json")));
+            json(&workplace.done(&format!("evaluate {{tiny}} {method} --cameras {{tiny}} --max-frames 3 --json")));
         let points = swept["points"].as_array().unwrap();
         let point = points.iter().find(|point| point["method"] == method && point["asked"] == 0.4).unwrap();
         for name in ["psnr", "ssim", "temporal"] {
@@ -86,18 +85,18 @@ fn a_point_is_what_compress_and_evaluate_give() {
 }
 
 #[test]
-fn a_setting_of_steps_is_what_compress_gives_with_them_and_none_is_no_refining() {
-    let place = Workplace::new();
+fn refinement_step_points_equal_compress() {
+    let workplace = Workplace::new();
     let sweep = "sweep {tiny} --cameras {tiny} -o curves --methods no-refine --fractions 0.3 --max-frames 2 --json";
-    let swept = json(&place.done(&format!("{sweep} --steps 25,0,25 --steps-at 0.3 --repeat 2")));
+    let swept = json(&workplace.done(&format!("{sweep} --steps 25,0,25 --steps-at 0.3 --repeat 2")));
     assert_eq!(swept["runs"], 2);
     let knob = &swept["knobs"][0];
     assert_eq!(knob["parameter"], "refine_steps");
     let settings = knob["settings"].as_array().unwrap();
     assert_eq!(settings.iter().map(|setting| setting["value"].as_u64().unwrap()).collect::<Vec<_>>(), [0, 25]);
-    // Cuts take 8% of the steps each, as in the preset.
-    place.done("compress {tiny} --cameras {tiny} -o small --ratio 0.3 --set refine_steps=25 --set refine_cut_steps=2");
-    let evaluated = json(&place.done("evaluate {tiny} small --cameras {tiny} --max-frames 2 --json"));
+    // Each prune step during refinement takes 8% of the steps, as in the preset.
+    workplace.done("compress {tiny} --cameras {tiny} -o small --ratio 0.3 --set refine_steps=25 --set refine_cut_steps=2");
+    let evaluated = json(&workplace.done("evaluate {tiny} small --cameras {tiny} --max-frames 2 --json"));
     let unrefined = swept["points"].as_array().unwrap().iter().find(|point| point["asked"] == 0.3).unwrap();
     for name in ["psnr", "ssim"] {
         assert_eq!(settings[1][name], evaluated[name], "{name}");
@@ -105,30 +104,31 @@ fn a_setting_of_steps_is_what_compress_gives_with_them_and_none_is_no_refining()
     }
     assert_eq!(settings[1]["bytes"], evaluated["bytes"]["compressed"]);
     assert!(settings.iter().all(|of| of["seconds"].as_f64().unwrap() > 0.0 && of["asked"] == 0.3), "{knob}");
-    let csv = fs::read_to_string(place.path("curves/knobs.csv")).unwrap();
+    let csv = fs::read_to_string(workplace.path("curves/knobs.csv")).unwrap();
     assert_eq!(csv.lines().count(), 3);
     assert!(csv.lines().last().unwrap().starts_with("refine_steps,25,default,0.3,"), "{csv}");
-    let page = fs::read_to_string(place.path("curves/sweep.html")).unwrap();
+    let page = fs::read_to_string(workplace.path("curves/sweep.html")).unwrap();
     assert!(page.contains("Error by run time") && page.contains(">25</text>") && page.contains("knobs.csv"), "{page}");
 }
 
 #[test]
-fn default_is_not_below_another_method_at_the_same_count() {
-    let place = Workplace::new();
-    let swept = json(&place.done("sweep {tiny} --cameras {tiny} -o curves --fractions 0.8,0.5,0.3,0.15 --json"));
+fn default_is_no_worse_than_other_methods() {
+    let workplace = Workplace::new();
+    let swept = json(&workplace.done("sweep {tiny} --cameras {tiny} -o curves --fractions 0.8,0.5,0.3,0.15 --json"));
     let points = swept["points"].as_array().unwrap();
     for ours in points.iter().filter(|point| point["method"] == "default" && !point["asked"].is_null()) {
         for other in points.iter().filter(|point| point["count"] == ours["count"]) {
             let (got, expected) = (ours["psnr"].as_f64().unwrap(), other["psnr"].as_f64().unwrap());
-            // It chooses by the training pictures, and these are held out: of a scene this small they tell a little less.
+            // The default chooses by training views, and these are test views: in so small a scene training views
+            // predict them slightly less well.
             assert!(got >= expected - 0.5, "at {}: {got} dB, {} has {expected}", ours["count"], other["method"]);
         }
     }
 }
 
 #[test]
-fn odd_requests_are_refused_and_leave_nothing() {
-    let place = Workplace::new();
+fn invalid_sweeps_are_refused_and_leave_no_files() {
+    let workplace = Workplace::new();
     for (flags, expected) in [
         ("--fractions 0.5,0", "--fractions: expected numbers above 0 and at most 1, found 0"),
         ("--fractions nan", "found NaN"),
@@ -138,12 +138,12 @@ fn odd_requests_are_refused_and_leave_nothing() {
         ("--methods best", "possible values: default, no-refine, paper"),
         ("--cameras nowhere.json", "nowhere.json"),
     ] {
-        let run = place.run(&format!("sweep {{tiny}} -o curves {flags}"));
+        let run = workplace.run(&format!("sweep {{tiny}} -o curves {flags}"));
         assert!(matches!(run.code, 1 | 2) && run.stderr.contains(expected), "{flags}: {} {}", run.code, run.stderr);
-        assert!(!place.path("curves").exists());
+        assert!(!workplace.path("curves").exists());
     }
-    place.done("sweep {tiny} --cameras {tiny} -o curves --methods random --fractions 0.5 --max-frames 1");
+    workplace.done("sweep {tiny} --cameras {tiny} -o curves --methods random --fractions 0.5 --max-frames 1");
     let again = "sweep {tiny} --cameras {tiny} -o curves --methods random --fractions 0.5 --max-frames 1";
-    assert_eq!(place.run(again).code, 2);
-    place.done(&format!("{again} --overwrite"));
+    assert_eq!(workplace.run(again).code, 2);
+    workplace.done(&format!("{again} --overwrite"));
 }

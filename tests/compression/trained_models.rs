@@ -1,4 +1,4 @@
-//! Trained models as the whole program reads them, against PyTorch in float64: states and statistics.
+//! Frame states and statistics of trained models against PyTorch in float64.
 
 use std::fmt::{self, Display, Formatter};
 use std::path::Path;
@@ -9,11 +9,11 @@ use splatsieve::pipeline::score_scene;
 use splatsieve::pruning::score::UserOverrides;
 use splatsieve::recipe::{MotionParams, Recipe};
 
-fn close(what: impl Display, got: f64, expected: f64, tolerance: f64) {
+fn assert_close(what: impl Display, got: f64, expected: f64, tolerance: f64) {
     assert!((got - expected).abs() <= tolerance, "{what}: got {got}, expected {expected}, tolerance {tolerance:e}");
 }
 
-/// A place in a model, put into words only when something is wrong there: millions of values are looked at.
+/// Place in a model, formatted only if a comparison fails, because millions of values are compared.
 struct At<'a, F> {
     model: &'a Path,
     what: &'a str,
@@ -27,7 +27,7 @@ impl<F: Display> Display for At<'_, F> {
     }
 }
 
-/// The largest side of the box of all positions.
+/// Returns the largest side of the bounding box of all positions.
 fn extent(state: &Gaussians) -> f64 {
     let side = |plane: &[f32]| {
         f64::from(plane.iter().copied().fold(f32::MIN, f32::max) - plane.iter().copied().fold(f32::MAX, f32::min))
@@ -35,15 +35,15 @@ fn extent(state: &Gaussians) -> f64 {
     (0..3).map(|c| side(state.position.plane(c))).fold(0.0, f64::max)
 }
 
-/// Reads the scene through point cloud, configuration, field and cameras, and compares the frames that
-/// `states.npz` names by their number: so the cameras' times are those the model was trained at.
+/// Reads the scene from point cloud, configuration, field and cameras, and compares the frames that `states.npz` lists
+/// by number. This also checks that the cameras give the times of training.
 fn frames_agree(model: &Path) {
     let expected = arrays(&model.join("states.npz"));
     let scene = crate::scene::scene(model);
     let source = scene.source();
     for (row, &frame) in expected["frames"].iter().enumerate() {
         let frame = frame as usize;
-        close("time", source.info().times[frame], expected["times"][row], 1e-12);
+        assert_close("time", source.info().times[frame], expected["times"][row], 1e-12);
         let state = state(source, frame);
         let (n, extent) = (state.len(), extent(&state));
         let values = |name: &str, width: usize| &expected[name][row * n * width..(row + 1) * n * width];
@@ -53,19 +53,19 @@ fn frames_agree(model: &Path) {
             let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
             for c in 0..3 {
                 let position = f64::from(state.position.plane(c)[i]);
-                close(at("position"), position, values("xyz", 3)[3 * i + c], 1e-5 * extent);
+                assert_close(at("position"), position, values("xyz", 3)[3 * i + c], 1e-5 * extent);
                 let scale = f64::from(state.log_scale.plane(c)[i]).exp();
                 let wanted = values("scales", 3)[3 * i + c];
-                close(at("scale"), scale, wanted, 1e-5 * wanted);
+                assert_close(at("scale"), scale, wanted, 1e-5 * wanted);
             }
             for (found, wanted) in q.iter().zip(&values("rotation", 4)[4 * i..]) {
-                close(at("rotation"), found / length, *wanted, 2e-5);
+                assert_close(at("rotation"), found / length, *wanted, 2e-5);
             }
             let opacity = 1.0 / (1.0 + (-f64::from(state.opacity_logit.plane(0)[i])).exp());
-            close(at("opacity"), opacity, values("opacity", 1)[i], 1e-5 * values("opacity", 1)[i]);
+            assert_close(at("opacity"), opacity, values("opacity", 1)[i], 1e-5 * values("opacity", 1)[i]);
             if let Some(sh) = expected.get(&format!("sh_t{frame}")) {
                 for k in 0..48 {
-                    close(at("SH"), f64::from(state.sh.plane(k)[i]), sh[48 * i + k], 2e-5);
+                    assert_close(at("SH"), f64::from(state.sh.plane(k)[i]), sh[48 * i + k], 2e-5);
                 }
             }
         }
@@ -77,7 +77,7 @@ fn rows(model: &Path, motion: MotionParams) -> (Rows, f64) {
     recipe.scan.motion = motion;
     recipe.scan.snap_noise = false;
     let mut scene = crate::scene::scene(model);
-    // Motion and opacity do not look at cameras; those of one frame tell that the scene is in view.
+    // Motion and opacity do not depend on cameras; the cameras of one frame are enough to accept the scene.
     let first = scene.schedule.views(0).to_vec();
     scene.schedule = Schedule::new(scene.schedule.cameras.clone());
     scene.schedule.push(1, &first);
@@ -86,13 +86,13 @@ fn rows(model: &Path, motion: MotionParams) -> (Rows, f64) {
     (scored.rows().unwrap().into_owned(), scored.position_ulp)
 }
 
-/// All frames, both ways to count motion.
+/// Compares the statistics of all frames for both definitions of motion.
 ///
-/// Tolerances follow from the f32 of the states. A position is off by its own rounding, half an ulp of the
-/// largest coordinate, and by that of the field's sums, which are smaller numbers: e ≤ 1 ulp on each axis. A
-/// step is off by at most 2√3·e, and so is the root mean square D; a second difference by 4√3·e, and so is κ
-/// (measured: D 0.7 ulp, κ 1.2 ulp). An opacity is off by a ≤ 1e-6, hence V, a mean of squares of deviations d,
-/// by 2·mean|d|·2a + 4a² ≤ 4a·√V + 4a².
+/// The tolerances follow from the f32 frame states. A position is off by its own rounding, half an ulp of the largest
+/// coordinate, and by that of the sums in the field, which are smaller numbers: e ≤ 1 ulp on each axis. A step is off
+/// by at most 2√3·e, and so is the root mean square D; a second difference by 4√3·e, and so is κ (measured: D 0.7 ulp,
+/// κ 1.2 ulp). An opacity is off by a ≤ 1e-6; hence V, a mean of squares of deviations d, by 2·mean|d|·2a + 4a² ≤ 4a·√V
+/// + 4a².
 fn statistics_agree(model: &Path) {
     let expected = arrays(&model.join("statistics_f64.npz"));
     for (motion, name) in [(MotionParams::Literal, "literal"), (MotionParams::Runs, "runs")] {
@@ -103,11 +103,11 @@ fn statistics_agree(model: &Path) {
         for (i, &v) in expected["V"].iter().enumerate() {
             let at = |what| At { model, what, i, frame: name };
             let (d, kappa) = (of_d[i], of_kappa[i]);
-            // No opacity of these models lies within f32 rounding of the threshold.
+            // No opacity of these models is within f32 rounding of the threshold.
             assert_eq!(f64::from(rows.life[i]), expected["life_frames"][i], "{}", at("life"));
-            close(at("D"), rows.d[i], d, 2.0 * 3f64.sqrt() * e);
-            close(at("kappa"), rows.kappa[i], kappa, 4.0 * 3f64.sqrt() * e);
-            close(at("V"), rows.v[i], v, 4.0 * a * v.sqrt() + 4.0 * a * a);
+            assert_close(at("D"), rows.d[i], d, 2.0 * 3f64.sqrt() * e);
+            assert_close(at("kappa"), rows.kappa[i], kappa, 4.0 * 3f64.sqrt() * e);
+            assert_close(at("V"), rows.v[i], v, 4.0 * a * v.sqrt() + 4.0 * a * a);
             let errors = [(rows.d[i] - d) / ulp, (rows.kappa[i] - kappa) / ulp, rows.v[i] - v];
             (0..3).for_each(|k| worst[k] = worst[k].max(errors[k].abs()));
         }
@@ -115,41 +115,41 @@ fn statistics_agree(model: &Path) {
     }
 }
 
-fn on_shared(name: &str, test: fn(&Path)) {
+fn run_on_trained_model(name: &str, test: fn(&Path)) {
     test(&shared(name));
 }
 
 #[test]
-fn frames_of_the_tiny_model_are_those_of_pytorch() {
+fn frames_of_the_tiny_model_match_pytorch() {
     frames_agree(&tiny());
 }
 
 #[test]
 #[ignore = "needs the trained models"]
-fn frames_of_deform2_are_those_of_pytorch() {
-    // The field is held against all three models beside its code; here it is cameras and point cloud as well.
-    on_shared("deform2", frames_agree);
+fn frames_of_deform2_match_pytorch() {
+    // The tests of the field compare it for all three models; this test adds cameras and point cloud.
+    run_on_trained_model("deform2", frames_agree);
 }
 
 #[test]
-fn statistics_of_the_tiny_model_are_those_of_float64_states() {
+fn statistics_of_the_tiny_model_match_float64_states() {
     statistics_agree(&tiny());
 }
 
 #[test]
 #[ignore = "needs the trained models"]
-fn statistics_of_deform2_are_those_of_float64_states() {
-    on_shared("deform2", statistics_agree);
+fn statistics_of_deform2_match_float64_states() {
+    run_on_trained_model("deform2", statistics_agree);
 }
 
 #[test]
 #[ignore = "needs the trained models"]
-fn statistics_of_room2_dynerf_are_those_of_float64_states() {
-    on_shared("room2_dynerf", statistics_agree);
+fn statistics_of_room2_dynerf_match_float64_states() {
+    run_on_trained_model("room2_dynerf", statistics_agree);
 }
 
 #[test]
 #[ignore = "needs the trained models"]
-fn statistics_of_room2_big_are_those_of_float64_states() {
-    on_shared("room2_big", statistics_agree);
+fn statistics_of_room2_big_match_float64_states() {
+    run_on_trained_model("room2_big", statistics_agree);
 }

@@ -1,6 +1,6 @@
-//! The trained models the tests look at: states at the recorded frames, cameras, reference renders.
+//! Trained models for tests: frame states at the recorded frames, cameras, and reference renders.
 //!
-//! A loader of its own, for it must not depend on what it helps to test.
+//! This loader is independent of the library, which it helps to test.
 
 #![allow(dead_code, reason = "each test and bench uses its part")]
 
@@ -11,15 +11,15 @@ use std::path::{Path, PathBuf};
 use glam::{DMat3, DVec3};
 use splatsieve::model::{Camera, Gaussians};
 
-/// The models, by folder name.
+/// Folder names of the models.
 pub(crate) const NAMES: [&str; 3] = ["deform2", "room2_dynerf", "room2_big"];
 
-/// The folder of trained models, which must be there: `SPLATSIEVE_DATA`, else `../shared/data`.
+/// Returns the folder of trained models: `SPLATSIEVE_DATA`, or else `../shared/data`. Panics if it is missing.
 pub(crate) fn folder() -> PathBuf {
     found().expect("trained models (SPLATSIEVE_DATA)")
 }
 
-/// The same for what does without: none, with a note, where there are none.
+/// Returns the folder of trained models; prints a note and returns `None` if it is missing.
 pub(crate) fn found() -> Option<PathBuf> {
     let folder = std::env::var_os("SPLATSIEVE_DATA")
         .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data"), PathBuf::from);
@@ -30,7 +30,7 @@ pub(crate) fn found() -> Option<PathBuf> {
     Some(folder)
 }
 
-/// One of the trained models.
+/// Trained model with recorded frame states.
 pub(crate) struct Model {
     folder: PathBuf,
     cameras: serde_json::Value,
@@ -66,12 +66,12 @@ impl Model {
         }
     }
 
-    /// Frames whose state is recorded.
+    /// Returns the frames whose states are recorded.
     pub(crate) fn frames(&self) -> Vec<u64> {
         self.array::<i64>("frames").unwrap().into_iter().map(|frame| frame as u64).collect()
     }
 
-    /// (frame, view) of every reference render.
+    /// Returns (frame, view) of every reference render.
     pub(crate) fn renders(&self) -> Vec<(u64, u64)> {
         let mut renders: Vec<(u64, u64)> = fs::read_dir(self.folder.join("ref_renders"))
             .unwrap()
@@ -84,13 +84,13 @@ impl Model {
         renders
     }
 
-    /// `[height, width, 3]`.
+    /// Returns a reference render, shape `[height, width, 3]`.
     pub(crate) fn reference(&self, frame: u64, view: u64) -> Vec<f32> {
         let path = self.folder.join(format!("ref_renders/t{frame:03}_v{view:02}.npy"));
         npyz::NpyFile::new(BufReader::new(File::open(path).unwrap())).unwrap().into_vec().unwrap()
     }
 
-    /// What the original deformation code gives at a recorded frame, in stored encoding.
+    /// Returns the frame state that the trainer's code gives at a recorded frame, in stored encoding.
     pub(crate) fn state(&self, frame: u64) -> Gaussians {
         let at = self.frames().iter().position(|&f| f == frame).unwrap();
         let xyz: Vec<f32> = self.array("xyz").unwrap();
@@ -98,7 +98,7 @@ impl Model {
         let scales: Vec<f32> = self.array("scales").unwrap();
         let opacity: Vec<f32> = self.array("opacity").unwrap();
         let count = xyz.len() / 3 / self.frames().len();
-        // [coefficient][channel] of each Gaussian, as the planes of `Gaussians::sh` are ordered.
+        // Shape [coefficient][channel] for each Gaussian, in the order of the planes of `Gaussians::sh`.
         let sh = self.array(&format!("sh_t{frame}")).unwrap_or_else(|| self.canonical_sh(count));
         let mut state = Gaussians::zeros(count, 3);
         for i in 0..count {
@@ -120,8 +120,8 @@ impl Model {
         Some(archive.by_name(name).unwrap()?.into_vec().unwrap())
     }
 
-    /// `[count, 16, 3]` from the model's PLY: 62 floats per Gaussian, the colors after position and normal,
-    /// `f_rest` channel by channel.
+    /// Returns the SH of the model's PLY, shape `[count, 16, 3]`. Each row of the file has 62 floats; the colors follow
+    /// position and normal, and `f_rest` is ordered by channel.
     fn canonical_sh(&self, count: usize) -> Vec<f32> {
         let iteration = fs::read_dir(self.folder.join("point_cloud")).unwrap().next().unwrap().unwrap().path();
         let bytes = fs::read(iteration.join("point_cloud.ply")).unwrap();

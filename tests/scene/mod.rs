@@ -1,5 +1,5 @@
-//! What the tests of the whole program share: models to read, the program to run, and plain readers of
-//! what it writes that share no code with it.
+//! Shared code of the integration tests: models to read, the program to run, and simple readers of its outputs that
+//! share no code with it.
 
 #![allow(dead_code, reason = "every test crate compiles this module and uses a part of it")]
 
@@ -18,17 +18,18 @@ use splatsieve::scene::{InputOptions, Scene, open_scene};
 use splatsieve::source::FrameSource;
 use tempfile::TempDir;
 
-/// The model that lives with the code; see `scripts/make_fixture.py`.
+/// Returns the path of the model in the repository; `scripts/make_fixture.py` made it.
 pub(crate) fn tiny() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/tiny_model")
 }
 
-/// The program: the one that was built with this test, or another one that `SPLATSIEVE_PROGRAM` names, an optimized one.
+/// Returns the path of the program: the one built with this test, or another (an optimized one) that
+/// `SPLATSIEVE_PROGRAM` names.
 pub(crate) fn program() -> PathBuf {
     std::env::var_os("SPLATSIEVE_PROGRAM").map_or_else(|| assert_cmd::cargo::cargo_bin("splatsieve"), PathBuf::from)
 }
 
-/// Runs `command`, to whose standard input `write` writes meanwhile.
+/// Runs `command` while `write` writes to its standard input.
 pub(crate) fn piped(command: &mut process::Command, write: impl FnOnce(ChildStdin) + Send + 'static) -> Output {
     let mut child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
     let pipe = child.stdin.take().unwrap();
@@ -38,7 +39,8 @@ pub(crate) fn piped(command: &mut process::Command, write: impl FnOnce(ChildStdi
     output
 }
 
-/// Runs `check_model_folder.py`; gives whether it accepts, and what it printed. `PYTHON` names another than python3.
+/// Runs `check_model_folder.py` with `python3`, or with the Python that `PYTHON` names. Returns whether it accepts the
+/// folder, and its output.
 pub(crate) fn check_model_folder(original: &Path, compressed: &Path) -> (bool, String) {
     let python = std::env::var_os("PYTHON").map_or_else(|| PathBuf::from("python3"), PathBuf::from);
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("scripts/check_model_folder.py");
@@ -47,7 +49,7 @@ pub(crate) fn check_model_folder(original: &Path, compressed: &Path) -> (bool, S
     (output.status.success(), format!("{complaints}{text}"))
 }
 
-/// A trained model in `SPLATSIEVE_DATA`, else `../shared/data`, which must be there.
+/// Returns the path of a trained model in `SPLATSIEVE_DATA`, or else in `../shared/data`. Panics if it is missing.
 pub(crate) fn shared(name: &str) -> PathBuf {
     let folder = std::env::var_os("SPLATSIEVE_DATA")
         .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data"), PathBuf::from)
@@ -56,7 +58,7 @@ pub(crate) fn shared(name: &str) -> PathBuf {
     folder
 }
 
-/// Copies the model at `from` to the new folder `to`, but that nothing deforms its colors.
+/// Copies the model at `from` to the new folder `to` with a configuration in which no head deforms SH colors.
 pub(crate) fn without_sh_head(from: &Path, to: &Path) {
     for (name, bytes) in files(from) {
         let path = to.join(&name);
@@ -73,28 +75,28 @@ pub(crate) fn without_sh_head(from: &Path, to: &Path) {
     }
 }
 
-/// The scene of a model folder that holds its cameras, all pictures.
+/// Opens a model folder that contains its cameras, with all views.
 pub(crate) fn scene(model: &Path) -> Scene {
     let options = InputOptions { path: model.to_owned(), cameras: Some(model.to_owned()), ..InputOptions::default() };
     open_scene(&options).unwrap()
 }
 
-/// All columns of every Gaussian at `frame`.
+/// Returns all attributes of every Gaussian at `frame`.
 pub(crate) fn state(source: &dyn FrameSource, frame: usize) -> Gaussians {
     let ids: Vec<u32> = (0..source.info().count as u32).collect();
     gather(source, &ids, frame, Columns::all()).unwrap()
 }
 
-/// Every value of row `i`, column after column, as bits.
+/// Returns all values of row `i` as bits, attribute by attribute.
 pub(crate) fn bits(state: &Gaussians, i: usize) -> Vec<u32> {
     let planes = |column: Columns| (0..state.column(column).width()).map(move |c| (column, c));
     Columns::all().iter().flat_map(planes).map(|(column, c)| state.column(column).plane(c)[i].to_bits()).collect()
 }
 
-/// A folder to write into, and the program to run in it.
+/// Temporary folder in which tests run the program and write files.
 pub(crate) struct Workplace(TempDir);
 
-/// What a run left behind.
+/// Exit code and outputs of a run.
 pub(crate) struct Run {
     pub(crate) code: i32,
     pub(crate) stdout: String,
@@ -110,8 +112,8 @@ impl Workplace {
         self.0.path().join(name)
     }
 
-    /// Runs the program with arguments separated by blanks; paths are relative to this folder, and
-    /// `{tiny}` is the tiny model.
+    /// Runs the program in this folder with arguments separated by spaces; `{tiny}` is replaced by the path of the tiny
+    /// model.
     pub(crate) fn run(&self, arguments: &str) -> Run {
         self.run_words(arguments.split_whitespace().map(|word| match word {
             "{tiny}" => tiny(),
@@ -119,7 +121,7 @@ impl Workplace {
         }))
     }
 
-    /// Runs the program with these arguments, which may hold blanks.
+    /// Runs the program with these arguments, which may contain spaces.
     pub(crate) fn run_words(&self, words: impl IntoIterator<Item = impl AsRef<OsStr>>) -> Run {
         let output = Command::new(program()).current_dir(self.0.path()).args(words).output().unwrap();
         Run {
@@ -129,7 +131,7 @@ impl Workplace {
         }
     }
 
-    /// The program with these arguments, to be run here.
+    /// Returns a command that runs the program with these arguments in this folder.
     pub(crate) fn command(&self, arguments: &str) -> process::Command {
         let mut command = process::Command::new(program());
         let tiny = tiny().display().to_string();
@@ -140,24 +142,24 @@ impl Workplace {
     /// Runs the program with `stdin` on its standard input.
     pub(crate) fn piped(&self, arguments: &str, stdin: &[u8]) -> Output {
         let bytes = stdin.to_owned();
-        // It may stop reading early: then the rest has nowhere to go.
+        // Writing fails if the program stops reading early; the rest is dropped.
         piped(&mut self.command(arguments), move |mut pipe| drop(pipe.write_all(&bytes)))
     }
 
-    /// Runs the program, which must succeed; gives its stdout.
+    /// Runs the program, checks that it succeeds, and returns its standard output.
     pub(crate) fn done(&self, arguments: &str) -> String {
         let run = self.run(arguments);
         assert_eq!(run.code, 0, "{arguments}\n{}", run.stderr);
         run.stdout
     }
 
-    /// Runs a compression with `--json`; gives its summary.
+    /// Runs a compression with `--json` and returns its summary.
     pub(crate) fn summary(&self, arguments: &str) -> serde_json::Value {
         serde_json::from_str(&self.done(&format!("compress --json {arguments}"))).unwrap()
     }
 
-    /// Runs the program, which must fail with `code`, name every one of `parts` on stderr, print nothing
-    /// on stdout and leave this folder as it was.
+    /// Runs the program and checks that it fails with `code`, prints every one of `parts` on standard error and nothing
+    /// on standard output, and leaves this folder unchanged.
     pub(crate) fn refused(&self, code: i32, arguments: &str, parts: &[&str]) {
         let before = files(self.0.path());
         let run = self.run(arguments);
@@ -170,7 +172,7 @@ impl Workplace {
         assert!(before == after, "{arguments}: left {:?}, found {:?}", after.keys(), before.keys());
     }
 
-    /// Writes an INRIA PLY.
+    /// Writes a PLY in the format of INRIA.
     pub(crate) fn ply(&self, name: &str, gaussians: &Gaussians) -> PathBuf {
         let path = self.path(name);
         fs::create_dir_all(path.parent().unwrap()).unwrap();
@@ -179,13 +181,13 @@ impl Workplace {
     }
 }
 
-/// What the system says of a process's memory: Linux always does.
+/// Returns `memory`; on Linux, which always reports the memory of a process, panics if it is `None`.
 pub(crate) fn said<T>(memory: Option<T>) -> Option<T> {
     assert!(memory.is_some() || !cfg!(target_os = "linux"), "nothing is said of memory");
     memory
 }
 
-/// What a run with `--explain` says at its end that it took, MiB; none where the system does not say.
+/// Returns the memory that a run with `--explain` reports as used, in MiB; `None` if the system does not report it.
 pub(crate) fn taken(stderr: &str) -> Option<f64> {
     let line = stderr.lines().find_map(|line| line.strip_prefix("memory: at most ")?.strip_suffix(" taken"));
     let words: Option<Vec<&str>> = said(line).map(|line| line.split(' ').collect());
@@ -195,7 +197,7 @@ pub(crate) fn taken(stderr: &str) -> Option<f64> {
     })
 }
 
-/// Every file below `folder` by its relative path, and its bytes; folders have none.
+/// Returns every file below `folder` with its bytes, by relative path; folders have no bytes.
 pub(crate) fn files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
     let mut found = BTreeMap::new();
     let mut pending = vec![folder.to_owned()];
@@ -214,14 +216,14 @@ pub(crate) fn files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
     found
 }
 
-/// [`files`] without the summary, the only output that may differ between runs.
+/// Returns [`files`] without summaries, which are the only outputs that may differ between runs.
 pub(crate) fn lasting_files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
     let mut found = files(folder);
     found.retain(|name, _| !name.to_str().unwrap().ends_with("summary.json"));
     found
 }
 
-/// A PLY of float properties: their names and the bytes of every row.
+/// PLY with float properties: their names, and the bytes of every row.
 pub(crate) struct PlyRows {
     pub(crate) names: Vec<String>,
     pub(crate) rows: Vec<Vec<u8>>,
@@ -243,20 +245,20 @@ impl PlyRows {
         PlyRows { names, rows }
     }
 
-    /// The value of property `name` in row `i`.
+    /// Returns the value of property `name` in row `i`.
     pub(crate) fn value(&self, i: usize, name: &str) -> f32 {
         let at = 4 * self.names.iter().position(|found| found == name).unwrap();
         f32::from_le_bytes(self.rows[i][at..at + 4].try_into().unwrap())
     }
 }
 
-/// An index map: for every Gaussian of the input its place in the output, or −1.
+/// Reads an index map: the place in the output of every Gaussian of the input, or −1.
 pub(crate) fn index_map(path: &Path) -> Vec<i64> {
     let bytes = fs::read(path).unwrap();
     npyz::NpyFile::new(&bytes[..]).unwrap().into_vec().unwrap()
 }
 
-/// Every array of an `.npz`, as f64.
+/// Reads every array of an `.npz` as f64.
 pub(crate) fn arrays(path: &Path) -> BTreeMap<String, Vec<f64>> {
     let mut archive = npyz::npz::NpzArchive::open(path).unwrap();
     let names: Vec<String> = archive.array_names().map(str::to_owned).collect();
@@ -282,7 +284,7 @@ pub(crate) fn arrays(path: &Path) -> BTreeMap<String, Vec<f64>> {
     names.iter().map(|name| (name.clone(), read(name))).collect()
 }
 
-/// A preset that scores by projected coverage and leaves nothing to renders: what the formulas decide alone.
+/// Returns a preset that scores by projected coverage and uses no renders, so that formulas alone decide.
 pub(crate) fn by_formula(preset: &str) -> splatsieve::recipe::Recipe {
     use splatsieve::model::Columns;
     use splatsieve::recipe::{AttributeGroups, Coverage, Precision, Recipe, StaticTerm, WhichBands};

@@ -194,8 +194,7 @@ impl ByteLimit {
     /// because refined values may compress worse than those by which the count was found. Protected Gaussians stay.
     ///
     /// # Errors
-    /// Fails if the protected Gaussians alone do not fit, if frames cannot be read, or if a write fails. What is
-    /// protected does not fit; frames that cannot be read, a failed write.
+    /// Fails if the protected Gaussians alone do not fit, if frames cannot be read, or if a write fails.
     fn shrink(
         &self,
         scene: &Scene,

@@ -116,7 +116,9 @@ mod tests {
 
     proptest! {
         #[test]
-        fn percentiles_equal_those_of_sorted_values(values in prop::collection::vec(any_value(), 0..300), p in 0u32..=100) {
+        fn percentiles_equal_those_of_sorted_values(
+            values in prop::collection::vec(any_value(), 0..300), p in 0u32..=100
+        ) {
             let sketch = FloatSketch::from_values(values.iter().copied());
             let got = sketch.percentile(f64::from(p), values.iter().copied());
             prop_assert_eq!(got, sorted_percentile(&values, p));
@@ -136,7 +138,8 @@ mod tests {
             values in prop::collection::vec(-1e6..1e6f64, 1..300), p in 0u32..=100, bits in 1u32..=MOST_BITS
         ) {
             let exact = sorted_percentile(&values, p).unwrap();
-            let rough = FloatSketch::with_mantissa_bits(bits, values.iter().copied()).rough_percentile(f64::from(p)).unwrap();
+            let sketch = FloatSketch::with_mantissa_bits(bits, values.iter().copied());
+            let rough = sketch.rough_percentile(f64::from(p)).unwrap();
             // Half of a bucket [m, m + 1)·2^(e − bits) is at most 2^−bits / 2 of its least value, except for
             // subnormals.
             prop_assert!((rough - exact).abs() <= 0.51 * exact.abs().max(1e-37) * 0.5f64.powi(bits as i32));
