@@ -11,7 +11,7 @@ use std::path::Path;
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use splatsieve::deform::{Deltas, Field, FieldConfig, Scratch, Tensor, Tensors};
-use splatsieve::model::{Column, Columns, Gaussians};
+use splatsieve::model::{AttributeValues, Attributes, Gaussians};
 
 const BLOCK: usize = 1024;
 
@@ -21,7 +21,7 @@ fn noise(seed: &mut u64) -> f32 {
     (*seed >> 40) as f32 / (1 << 23) as f32 - 1.0
 }
 
-fn field(width: usize, channels: usize, active: Columns) -> Field {
+fn field(width: usize, channels: usize, active: Attributes) -> Field {
     let mut seed = 1;
     let mut tensors = Tensors::new();
     let mut add = |name: String, shape: &[usize]| {
@@ -60,16 +60,16 @@ fn field(width: usize, channels: usize, active: Columns) -> Field {
 
 fn deform(criterion: &mut Criterion) {
     let mut seed = 2;
-    let mut position = Column::zeros(3, BLOCK);
+    let mut position = AttributeValues::zeros(3, BLOCK);
     position.planes_mut().iter_mut().for_each(|x| *x = noise(&mut seed));
-    let three = Columns::POSITION | Columns::LOG_SCALE | Columns::ROTATION;
+    let three = Attributes::POSITION | Attributes::LOG_SCALE | Attributes::ROTATION;
     let mut group = criterion.benchmark_group("deform");
     group.throughput(Throughput::Elements(BLOCK as u64));
     for (name, field, want) in [
-        ("dnerf_all", field(64, 32, three), Columns::all()),
-        ("dnerf_position", field(64, 32, three), Columns::POSITION),
-        ("dynerf_all", field(128, 16, Columns::all()), Columns::all()),
-        ("dynerf_position_opacity", field(128, 16, Columns::all()), Columns::POSITION | Columns::OPACITY),
+        ("dnerf_all", field(64, 32, three), Attributes::all()),
+        ("dnerf_position", field(64, 32, three), Attributes::POSITION),
+        ("dynerf_all", field(128, 16, Attributes::all()), Attributes::all()),
+        ("dynerf_position_opacity", field(128, 16, Attributes::all()), Attributes::POSITION | Attributes::OPACITY),
     ] {
         let prepared = field.prepare(&position);
         let mut scratch = Scratch::default();
@@ -85,9 +85,10 @@ fn deform(criterion: &mut Criterion) {
     // How states change with positions: forward to the position's head, and back for each component.
     let mut raw = Gaussians::zeros(BLOCK, 3);
     raw.position = position;
-    for (name, field) in [("dnerf_jacobian", field(64, 32, three)), ("dynerf_jacobian", field(128, 16, Columns::all()))]
+    for (name, field) in
+        [("dnerf_jacobian", field(64, 32, three)), ("dynerf_jacobian", field(128, 16, Attributes::all()))]
     {
-        group.bench_function(name, |bencher| bencher.iter(|| field.jacobian(&raw, 0.4, Columns::POSITION)));
+        group.bench_function(name, |bencher| bencher.iter(|| field.jacobian(&raw, 0.4, Attributes::POSITION)));
     }
     group.finish();
 }

@@ -21,7 +21,7 @@ use cpu_time::ProcessTime;
 use criterion::measurement::{Measurement, ValueFormatter, WallTime};
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use splatsieve::deform::{Network, PredictedMotion, Tensor, Tensors};
-use splatsieve::model::{Column, Columns, Gaussians};
+use splatsieve::model::{AttributeValues, Attributes, Gaussians};
 
 use splatsieve::models::OpenOptions;
 use splatsieve::source::Ids;
@@ -128,13 +128,13 @@ fn networks(criterion: &mut Criterion<Processor>) {
     let mut group = criterion.benchmark_group("network");
     group.throughput(Throughput::Elements(BLOCK as u64));
     let (network, mut seed) = (network(), 2);
-    let mut position = Column::zeros(3, BLOCK);
+    let mut position = AttributeValues::zeros(3, BLOCK);
     position.planes_mut().iter_mut().for_each(|x| *x = noise(&mut seed));
     let (encoded, mut motion, mut frame) = (network.encode(&position), PredictedMotion::default(), 0);
     group.bench_function("d3g", |bencher| {
         bencher.iter(|| {
             frame = (frame + 1) % 60;
-            network.motion(&encoded, f64::from(frame) / 60.0, Columns::all(), &mut motion)
+            network.motion(&encoded, f64::from(frame) / 60.0, Attributes::all(), &mut motion)
         });
     });
     let mut filled = |len: usize| (0..len).map(|_| noise(&mut seed)).collect::<Vec<f32>>();
@@ -171,15 +171,15 @@ fn states(criterion: &mut Criterion<Processor>) {
     // More than those of which outputs for nodes are kept.
     let times: Vec<f64> = (0..1500).map(|frame| f64::from(frame) / 1499.0).collect();
     let scratch = tempfile::tempdir().expect("a folder for temporary files");
-    let still = Columns::all().difference(Columns::SH);
+    let still = Attributes::all().difference(Attributes::SH);
     for (name, model, want) in [
         ("d3g", "deformable3d", still),
         ("d3g_6dof", "deformable3d_6dof", still),
         ("sc_gs", "scgs", still),
-        ("spacetime", "stg_lite", Columns::all()),
+        ("spacetime", "stg_lite", Attributes::all()),
         ("free_time", "ftgs", still),
         ("native_4d", "yang4d", still),
-        ("native_4d_colours", "yang4d", Columns::all()),
+        ("native_4d_colours", "yang4d", Attributes::all()),
     ] {
         let model = folder.join("families").join(model);
         let (path, count) = match name {

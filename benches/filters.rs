@@ -17,7 +17,7 @@ use std::hint::black_box;
 
 use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
 use gseq::{Compression, encode_tile};
-use splatsieve::model::Columns;
+use splatsieve::model::Attributes;
 use splatsieve::source::FrameSource;
 
 struct Filter {
@@ -106,11 +106,11 @@ fn predictors(before: &[u32], frame: usize, plane: usize, order: usize) -> (&[u3
 }
 
 /// Bound of a column in the second table.
-fn bound(column: Columns) -> f64 {
+fn bound(column: Attributes) -> f64 {
     match column {
-        Columns::POSITION => 1e-3,
-        Columns::ROTATION => 5e-3,
-        Columns::OPACITY => 2e-2,
+        Attributes::POSITION => 1e-3,
+        Attributes::ROTATION => 5e-3,
+        Attributes::OPACITY => 2e-2,
         _ => 1e-2,
     }
 }
@@ -142,7 +142,7 @@ fn multiples(bits: &[u32], plane: usize, bound: f64, apart: bool, by_track: bool
 type TileBits = (Vec<u32>, usize);
 
 /// The second table: a row of each column.
-fn within_bounds(name: &str, column: Columns, tiles: &[TileBits]) -> String {
+fn within_bounds(name: &str, column: Attributes, tiles: &[TileBits]) -> String {
     let raw: usize = tiles.iter().map(|(bits, _)| 4 * bits.len()).sum();
     let times =
         |size: &dyn Fn(&TileBits) -> usize| format!("{:.0}", raw as f64 / tiles.iter().map(size).sum::<usize>() as f64);
@@ -165,7 +165,8 @@ fn within_bounds(name: &str, column: Columns, tiles: &[TileBits]) -> String {
 }
 
 fn benches(criterion: &mut Criterion) {
-    let mut columns: Vec<(Columns, Vec<TileBits>)> = Columns::all().iter().map(|column| (column, Vec::new())).collect();
+    let mut columns: Vec<(Attributes, Vec<TileBits>)> =
+        Attributes::all().iter().map(|column| (column, Vec::new())).collect();
     let names: Vec<String> = filters().map(|filter| filter.name()).collect();
     eprintln!("| scene | column | {} |\n|---|---|{}", names.join(" | "), "---|".repeat(names.len()));
     let mut within = Vec::new();

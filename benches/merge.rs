@@ -32,7 +32,7 @@ use splatsieve::merging::tree::{Nearest, Tree, TreePoint};
 use splatsieve::merging::voxels::voxel_order;
 use splatsieve::merging::{RequestedPairs, Survivors};
 use splatsieve::model::hash_id;
-use splatsieve::model::{Column, Columns, Gaussians};
+use splatsieve::model::{AttributeValues, Attributes, Gaussians};
 use splatsieve::outputs::container::write_container;
 use splatsieve::passes::gather;
 use splatsieve::progress::Events;
@@ -61,19 +61,19 @@ fn strewn(n: usize) -> (Gaussians, f64) {
 }
 
 /// Number of neighbors found in all, from positions and ε.
-type Find = fn(&Column, f64) -> usize;
+type Find = fn(&AttributeValues, f64) -> usize;
 
-fn points(position: &Column) -> Vec<TreePoint> {
+fn points(position: &AttributeValues) -> Vec<TreePoint> {
     (0..position.len()).map(|i| TreePoint { at: position.row(i), index: i as u32 }).collect()
 }
 
-fn by_voxels(position: &Column, epsilon: f64) -> usize {
+fn by_voxels(position: &AttributeValues, epsilon: f64) -> usize {
     let index = PointIndex::new(points(position), epsilon);
     let mut search = index.search();
     index.points().iter().map(|point| search.nearest(point.index, point.at, NEIGHBOURS).0.len()).sum()
 }
 
-fn by_tree(position: &Column, epsilon: f64) -> usize {
+fn by_tree(position: &AttributeValues, epsilon: f64) -> usize {
     let rows: Vec<u32> = (0..position.len() as u32).collect();
     let order = voxel_order(&rows, |row| position.row(row as usize), epsilon);
     let mut points = points(position);
@@ -98,7 +98,7 @@ fn nearest(near: &mut Vec<(f64, u32)>) -> usize {
     near.len()
 }
 
-fn by_all_pairs(position: &Column, epsilon: f64) -> usize {
+fn by_all_pairs(position: &AttributeValues, epsilon: f64) -> usize {
     let mut near = Vec::new();
     let of_one = |i: usize| {
         let at = position.row(i);
@@ -110,7 +110,7 @@ fn by_all_pairs(position: &Column, epsilon: f64) -> usize {
     (0..position.len()).map(of_one).sum()
 }
 
-fn by_plain_hash(position: &Column, epsilon: f64) -> usize {
+fn by_plain_hash(position: &AttributeValues, epsilon: f64) -> usize {
     let voxel = |i: usize| position.row::<3>(i).map(|x| (f64::from(x) / epsilon).floor() as i32);
     let mut voxels: HashMap<[i32; 3], Vec<u32>> = HashMap::new();
     (0..position.len()).for_each(|i| voxels.entry(voxel(i)).or_default().push(i as u32));
@@ -133,8 +133,8 @@ fn by_plain_hash(position: &Column, epsilon: f64) -> usize {
 }
 
 /// `n` points in clusters of 200, each some 0.005 wide.
-fn clustered(n: usize) -> Column {
-    let mut position = Column::zeros(3, n);
+fn clustered(n: usize) -> AttributeValues {
+    let mut position = AttributeValues::zeros(3, n);
     for i in 0..n {
         let cluster = hash_id(i as u64) as usize % (n / 200);
         let spread = |c: usize| (0..3).map(|k| random(16 * i + 3 * k + c) - 0.5).sum::<f32>();
@@ -144,7 +144,7 @@ fn clustered(n: usize) -> Column {
 }
 
 /// Largest side of the box between the 1st and the 99th percentile, as of a scene.
-fn extent(position: &Column) -> f64 {
+fn extent(position: &AttributeValues) -> f64 {
     let side = |c: usize| {
         let mut plane = position.plane(c).to_vec();
         plane.sort_unstable_by(f32::total_cmp);
@@ -155,7 +155,7 @@ fn extent(position: &Column) -> f64 {
 
 fn neighbors(criterion: &mut Criterion) {
     let one_thread = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
-    let mut cases: Vec<(String, Column, f64)> = Vec::new();
+    let mut cases: Vec<(String, AttributeValues, f64)> = Vec::new();
     if let Some(folder) = models::found() {
         for name in models::NAMES {
             let model = models::Model::open(&folder, name);
@@ -175,7 +175,7 @@ fn neighbors(criterion: &mut Criterion) {
         cases.push((format!("clustered densely {n}"), clustered(n), 0.01));
     }
     cases.push(("one voxel".into(), strewn(100_000).0.position, 2.0));
-    cases.push(("one point".into(), Column::zeros(3, 100_000), 0.1));
+    cases.push(("one point".into(), AttributeValues::zeros(3, 100_000), 0.1));
     for (name, position, epsilon) in cases {
         let mut group = criterion.benchmark_group(format!("neighbours/{name}"));
         group.sample_size(10).throughput(Throughput::Elements(position.len() as u64));
@@ -197,7 +197,7 @@ fn neighbors(criterion: &mut Criterion) {
 }
 
 /// Each with its nearest neighbors of higher index.
-fn pairs_of(position: &Column) -> Vec<(u32, u32)> {
+fn pairs_of(position: &AttributeValues) -> Vec<(u32, u32)> {
     let index = PointIndex::new(points(position), f64::INFINITY);
     let mut search = index.search();
     let mut pairs = Vec::new();
@@ -237,7 +237,7 @@ fn motion(criterion: &mut Criterion) {
     write_container(&scene, &path, Compression::Zstd(1), BTreeMap::new(), |_| ()).unwrap();
     let container = Container::open(&path).unwrap();
     let ids: Vec<u32> = (0..scene.info().count as u32).collect();
-    let reference = gather(&container, &ids, 0, Columns::POSITION).unwrap().position;
+    let reference = gather(&container, &ids, 0, Attributes::POSITION).unwrap().position;
     let pairs = pairs_of(&reference);
     let mut group = criterion.benchmark_group("measure");
     group.sample_size(10).throughput(Throughput::Elements((48 * pairs.len()) as u64));

@@ -17,7 +17,7 @@ use std::path::Path;
 
 use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
 use gseq::{Compression, Reader, TileBuffer, TileId, encode_tile};
-use splatsieve::model::Columns;
+use splatsieve::model::Attributes;
 use splatsieve::outputs::bounds::{Bounds, MaxError};
 use splatsieve::outputs::container::{GAUSSIAN_BLOCK, Packing, write_container};
 use splatsieve::passes::HeldFrames;
@@ -29,7 +29,7 @@ const WITHIN: Compression = Compression::Bounded { max_error: 1e-3, level: 15 };
 /// Every tile of the varying columns, with its width.
 fn tiles_of(scene: &HeldFrames) -> Vec<(u32, Vec<f32>)> {
     let info = scene.info();
-    let of = |column: Columns| {
+    let of = |column: Attributes| {
         trajectories::tiles(scene, column).into_iter().map(move |tile| (column.width(info.sh_degree) as u32, tile))
     };
     info.varying.iter().flat_map(of).collect()
@@ -39,9 +39,9 @@ fn write(scene: &HeldFrames, path: &Path, packing: impl Into<Packing>) {
     write_container(scene, path, packing, BTreeMap::new(), |_| ()).unwrap();
 }
 
-fn decode_all(reader: &Reader, varying: Columns, buffer: &mut TileBuffer) {
+fn decode_all(reader: &Reader, varying: Attributes, buffer: &mut TileBuffer) {
     for gaussian_block in 0..reader.layout().gaussian_blocks() {
-        for (column, of) in Columns::all().iter().enumerate() {
+        for (column, of) in Attributes::all().iter().enumerate() {
             if varying.contains(of) {
                 let at = TileId { column: column as u32, gaussian_block, frame_block: 0 };
                 black_box(reader.read_tile(at, buffer).unwrap().values());
@@ -73,9 +73,9 @@ fn benches(criterion: &mut Criterion) {
         let path = folder.path().join("scene.gseq");
         let [raw_path, within_path] = ["raw.gseq", "within.gseq"].map(|name| folder.path().join(name));
         write(&scene, &path, Compression::Zstd(LEVEL));
-        write(&scene, &raw_path, Compression::Raw);
+        write(&scene, &raw_path, Compression::StoredParams);
         let bounds: Vec<MaxError> =
-            Columns::all().iter().map(|column| format!("{}=1e-3", column.name()).parse().unwrap()).collect();
+            Attributes::all().iter().map(|column| format!("{}=1e-3", column.name()).parse().unwrap()).collect();
         write(&scene, &within_path, Packing::within(Bounds::from_errors(&bounds, || Ok(1.0)).unwrap(), 15));
         let [reader, raw_reader, within] = [&path, &raw_path, &within_path].map(|path| Reader::open(path).unwrap());
         let most = raw.iter().map(Vec::len).max().unwrap_or(0);

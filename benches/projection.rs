@@ -9,7 +9,7 @@
 use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
 use glam::{DMat3, DVec3};
 use splatsieve::model::hash_id;
-use splatsieve::model::{Camera, Columns, Gaussians, Schedule};
+use splatsieve::model::{Attributes, Camera, Gaussians, ViewSchedule};
 use splatsieve::recipe::Recipe;
 use splatsieve::statistics::{BlockScan, ScanPlan};
 
@@ -50,9 +50,9 @@ fn projection(c: &mut Criterion) {
     let scan = Recipe::preset("default").unwrap().scan;
     let block = block();
     let mut group = c.benchmark_group("scan");
-    for (views, changed) in [(16, Columns::POSITION), (1, Columns::all())] {
+    for (views, changed) in [(16, Attributes::POSITION), (1, Attributes::all())] {
         let cameras = cameras(views);
-        let mut schedule = Schedule::new(cameras.clone());
+        let mut schedule = ViewSchedule::new(cameras.clone());
         schedule.push(1, &(0..views as u32).map(|v| (v, v)).collect::<Vec<_>>());
         let plan = ScanPlan::new(&scan, &[0.0], &schedule).unwrap();
         let seen: Vec<&Camera> = cameras.iter().collect();

@@ -34,7 +34,7 @@ use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_m
 use glam::{DMat3, DVec3, Quat, Vec3};
 use splatsieve::diagnostics::demo_scene::Scene;
 use splatsieve::diagnostics::selfcheck::oracle::picture as oracle;
-use splatsieve::model::{Camera, Columns, Gaussians, Gradients};
+use splatsieve::model::{Attributes, Camera, Gaussians, Gradients};
 use splatsieve::render::{Contribution, Image, Renderer};
 use splatsieve::source::{FrameSource, Ids};
 
@@ -58,7 +58,7 @@ fn measure(criterion: &mut Criterion, group: &str, name: &str, state: &Gaussians
         let pull: Vec<f32> = picture.data.iter().zip(&target.data).map(|(a, b)| a - b).collect();
         (0.0, Image { data: pull, ..*picture })
     };
-    let mut gradients = Gradients::new(count, Columns::all(), state.sh_degree());
+    let mut gradients = Gradients::new(count, Attributes::all(), state.sh_degree());
     // By turns, so that what else the machine does slows both.
     let (mut pictures, mut derivatives) = (Vec::new(), Vec::new());
     for _ in 0..PICTURES {
@@ -178,7 +178,7 @@ fn pictures(criterion: &mut Criterion) {
     let demo = Scene::new(Scene::COUNT, Scene::FRAMES);
     let mut state = Gaussians::zeros(0, demo.info().sh_degree);
     let everything = Ids::Range(0..demo.info().count);
-    demo.open(everything).unwrap().read(Scene::FRAMES / 2, Columns::all(), &mut state).unwrap();
+    demo.open(everything).unwrap().read(Scene::FRAMES / 2, Attributes::all(), &mut state).unwrap();
     measure(criterion, "picture", "demo", &state, &demo.rig().cameras[0]);
     let Some(folder) = models::found() else { return };
     for name in models::NAMES {

@@ -28,12 +28,12 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use criterion::{BatchSize, BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
-use gseq::{Compression, Reader, TileBuffer, TileFrames, TileId, Touched};
+use gseq::{Compression, Reader, TileBuffer, TileFrames, TileId, TouchedPages};
 use rayon::prelude::*;
 use splatsieve::error::Result;
 use splatsieve::files::container::Container;
 use splatsieve::model::hash_id;
-use splatsieve::model::{Columns, Gaussians, Schedule, SequenceInfo};
+use splatsieve::model::{Attributes, Gaussians, SequenceInfo, ViewSchedule};
 use splatsieve::outputs::container::write_container;
 use splatsieve::recipe::Recipe;
 use splatsieve::source::{BlockReader, FrameSource, Ids, Prefetch};
@@ -64,11 +64,11 @@ impl FrameSource for Curves {
 
 struct CurveReader {
     ids: Vec<usize>,
-    varying: Columns,
+    varying: Attributes,
 }
 
 impl BlockReader for CurveReader {
-    fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
+    fn read(&mut self, frame: usize, want: Attributes, out: &mut Gaussians) -> Result<()> {
         for column in want.iter() {
             let time = if self.varying.contains(column) { frame } else { 0 };
             let to = out.column_mut(column);
@@ -86,11 +86,11 @@ impl BlockReader for CurveReader {
 }
 
 /// Decodes every tile that a scan reads: all of a varying column, of others the first frames.
-fn each_tile(reader: &Reader, varying: Columns, mut take: impl FnMut(&[f32])) {
+fn each_tile(reader: &Reader, varying: Attributes, mut take: impl FnMut(&[f32])) {
     let mut buffer = TileBuffer::default();
     for gaussian_block in 0..reader.layout().gaussian_blocks() {
         for frame_block in 0..reader.frame_blocks() {
-            for (column, of) in Columns::all().iter().enumerate() {
+            for (column, of) in Attributes::all().iter().enumerate() {
                 if frame_block == 0 || varying.contains(of) {
                     let at = TileId { column: column as u32, gaussian_block, frame_block };
                     take(reader.tile(at, &mut buffer).unwrap().values());
@@ -103,14 +103,14 @@ fn each_tile(reader: &Reader, varying: Columns, mut take: impl FnMut(&[f32])) {
 fn benches(criterion: &mut Criterion) {
     let recipe = Recipe::preset("default").unwrap().scan;
     let times: Vec<f64> = (0..FRAMES).map(|t| t as f64).collect();
-    let mut schedule = Schedule::default();
+    let mut schedule = ViewSchedule::default();
     schedule.push(FRAMES, &[]);
     let plan = ScanPlan::new(&recipe, &times, &schedule).unwrap();
     let folder = tempfile::tempdir().unwrap();
     let one_thread = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
-    let dynamic = Columns::all().difference(Columns::SH);
-    for (kind, compression) in [("packed", Compression::Zstd(1)), ("raw", Compression::Raw)] {
-        for (name, varying) in [("position", Columns::POSITION), ("all_but_sh", dynamic)] {
+    let dynamic = Attributes::all().difference(Attributes::SH);
+    for (kind, compression) in [("packed", Compression::Zstd(1)), ("raw", Compression::StoredParams)] {
+        for (name, varying) in [("position", Attributes::POSITION), ("all_but_sh", dynamic)] {
             let source = Curves(SequenceInfo { count: GAUSSIANS, times: times.clone(), sh_degree: 0, varying });
             let path = folder.path().join(format!("{kind}_{name}.gseq"));
             pack(&source, &path, compression);
@@ -188,12 +188,12 @@ struct Fed<'a> {
 }
 
 impl Fed<'_> {
-    fn bytes(&self, gaussians: Range<usize>, frames: Range<usize>, want: Columns) -> u64 {
+    fn bytes(&self, gaussians: Range<usize>, frames: Range<usize>, want: Attributes) -> u64 {
         let reader = self.container.reader();
         let layout = reader.layout();
         let block = |id: usize, of: u32| (id / of as usize) as u32;
         let mut sum = 0;
-        for (column, _) in Columns::all().iter().enumerate().filter(|&(_, column)| want.contains(column)) {
+        for (column, _) in Attributes::all().iter().enumerate().filter(|&(_, column)| want.contains(column)) {
             for gaussian_block in
                 block(gaussians.start, layout.gaussian_block)..=block(gaussians.end - 1, layout.gaussian_block)
             {
@@ -231,7 +231,7 @@ impl Prefetch for Fed<'_> {
         self.container.frame_block()
     }
 
-    fn fetch(&self, gaussians: Range<usize>, frames: Range<usize>, want: Columns) {
+    fn fetch(&self, gaussians: Range<usize>, frames: Range<usize>, want: Attributes) {
         match &self.disk {
             Some(disk) => wait_for(disk.order(self.bytes(gaussians, frames, want))),
             None => self.container.fetch(gaussians, frames, want),
@@ -249,7 +249,7 @@ struct Waiting<'a> {
 }
 
 impl BlockReader for Waiting<'_> {
-    fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
+    fn read(&mut self, frame: usize, want: Attributes, out: &mut Gaussians) -> Result<()> {
         let (of_block, info) = (self.fed.frame_block(), self.fed.info());
         if frame.is_multiple_of(of_block)
             && let Some(disk) = &self.fed.disk
@@ -278,14 +278,14 @@ fn drop_cached(path: &Path) {
 fn ways(criterion: &mut Criterion) {
     let recipe = Recipe::preset("default").unwrap().scan;
     let times: Vec<f64> = (0..FRAMES).map(|t| t as f64).collect();
-    let mut schedule = Schedule::default();
+    let mut schedule = ViewSchedule::default();
     schedule.push(FRAMES, &[]);
     let plan = ScanPlan::new(&recipe, &times, &schedule).unwrap();
     // Not where temporary files may lie in memory.
     let folder = tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).unwrap();
-    let varying = Columns::all().difference(Columns::SH);
+    let varying = Attributes::all().difference(Attributes::SH);
     let source = Curves(SequenceInfo { count: GAUSSIANS, times, sh_degree: 0, varying });
-    for (kind, compression) in [("packed", Compression::Zstd(1)), ("raw", Compression::Raw)] {
+    for (kind, compression) in [("packed", Compression::Zstd(1)), ("raw", Compression::StoredParams)] {
         let path = folder.path().join(format!("{kind}.gseq"));
         pack(&source, &path, compression);
         let container = Container::open(&path).unwrap();
@@ -313,8 +313,8 @@ fn ways(criterion: &mut Criterion) {
 }
 
 /// Every frame of raw tiles to the state of a caller.
-fn raw_frames(criterion: &mut Criterion, reader: &Reader, varying: Columns) {
-    let columns: Vec<(u32, usize)> = Columns::all()
+fn raw_frames(criterion: &mut Criterion, reader: &Reader, varying: Attributes) {
+    let columns: Vec<(u32, usize)> = Attributes::all()
         .iter()
         .zip(0..)
         .filter(|&(column, _)| varying.contains(column))
@@ -323,7 +323,7 @@ fn raw_frames(criterion: &mut Criterion, reader: &Reader, varying: Columns) {
     let read = |in_place: bool, release_frames: usize| {
         (0..reader.layout().gaussian_blocks()).into_par_iter().for_each(|gaussian_block| {
             let len = reader.layout().gaussian_range(gaussian_block).count();
-            let (mut buffer, mut touched) = (TileBuffer::default(), Touched::default());
+            let (mut buffer, mut touched) = (TileBuffer::default(), TouchedPages::default());
             let mut state: Vec<Vec<f32>> = columns.iter().map(|&(_, width)| vec![0.0; width * len]).collect();
             let mut tiles: Vec<TileFrames> = columns.iter().map(|_| TileFrames::default()).collect();
             for frame_block in 0..reader.frame_blocks() {

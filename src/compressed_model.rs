@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::model::{ALL_HARMONICS, Column, Columns, Gaussians, Raw};
+use crate::model::{AttributeValues, Attributes, Gaussians, NO_SH_LIMIT, StoredParams};
 use crate::recipe::{MergeParams, Precision};
 
 /// Frame at which Gaussians are compared, and the extent of the scene at this frame.
@@ -30,7 +30,7 @@ pub struct Cluster {
 pub struct Proxies {
     /// Raw parameters, one row per cluster, for model formats that store proxies as rows. `None` where a proxy is
     /// computed from its members frame by frame.
-    pub raw: Option<Raw>,
+    pub raw: Option<StoredParams>,
     /// Increasing indices of clusters that no proxy represents well enough. Their leaders stay unmerged.
     pub refused: Vec<usize>,
     /// Largest distance between a proxy and its position among its members over sampled frames, scene units. `None`
@@ -49,9 +49,9 @@ pub struct ParamDelta(pub Gaussians);
 
 impl ParamDelta {
     /// Returns the attributes that change.
-    pub fn columns(&self) -> Columns {
-        let changes = |&column: &Columns| !self.0.column(column).is_empty();
-        Columns::all().iter().filter(changes).collect()
+    pub fn columns(&self) -> Attributes {
+        let changes = |&column: &Attributes| !self.0.column(column).is_empty();
+        Attributes::all().iter().filter(changes).collect()
     }
 
     /// Returns whether no attribute changes.
@@ -70,7 +70,7 @@ impl ParamDelta {
 
     /// Multiplies the delta by `by`.
     pub fn scale(&mut self, by: f32) {
-        self.0.columns_mut(Columns::all()).flat_map(Column::planes_mut).for_each(|x| *x *= by);
+        self.0.columns_mut(Attributes::all()).flat_map(AttributeValues::planes_mut).for_each(|x| *x *= by);
     }
 
     /// Returns the sum of this delta and `more`. Where both have SH coefficients, the degree of `more` must not be
@@ -96,7 +96,7 @@ impl ParamDelta {
 
     /// Adds the attributes `attributes` of the delta to `state`, row by row. A delta of zero leaves the bits of a value
     /// unchanged.
-    pub fn add_to(&self, state: &mut Gaussians, attributes: Columns) {
+    pub fn add_to(&self, state: &mut Gaussians, attributes: Attributes) {
         for column in (self.columns() & attributes).iter() {
             let (by, values) = (self.0.column(column), state.column_mut(column));
             for c in 0..by.width().min(values.width()) {
@@ -129,8 +129,8 @@ impl TrajectoryDelta {
     }
 
     /// Returns the attributes that change.
-    pub fn columns(&self) -> Columns {
-        self.0.first().map_or(Columns::empty(), ParamDelta::columns)
+    pub fn columns(&self) -> Attributes {
+        self.0.first().map_or(Attributes::empty(), ParamDelta::columns)
     }
 
     /// Returns the interpolated delta at `frame` of `frames`.
@@ -193,7 +193,7 @@ impl CompressedModel {
             change: ParamDelta::default(),
             course: TrajectoryDelta::default(),
             field: Precision::Exact,
-            sh_degree: ALL_HARMONICS,
+            sh_degree: NO_SH_LIMIT,
         }
     }
 
@@ -239,7 +239,7 @@ impl CompressedModel {
     }
 
     /// Returns the total delta at `frame` of `frames`.
-    pub fn change_at(&self, frame: usize, frames: usize) -> ParamDelta {
+    pub fn delta_at(&self, frame: usize, frames: usize) -> ParamDelta {
         // The trajectory delta never has a higher SH degree than the constant one.
         self.course.at(frame, frames).and(self.change.clone())
     }
@@ -273,14 +273,14 @@ mod tests {
         by.position.set_row(1, [1.0, 0.0, -2.0]);
         by.sh.set_row(0, [0.5, 0.0, 0.25]);
         let change = ParamDelta(by);
-        assert_eq!(change.columns(), Columns::all().difference(Columns::ROTATION));
+        assert_eq!(change.columns(), Attributes::all().difference(Attributes::ROTATION));
         let mut changed = state.clone();
-        change.add_to(&mut changed, change.columns().difference(Columns::LOG_SCALE));
+        change.add_to(&mut changed, change.columns().difference(Attributes::LOG_SCALE));
         assert_eq!(changed.opacity_logit.row::<1>(0)[0].to_bits(), (-0.0f32).to_bits());
         assert_eq!(changed.position.row(1), [1.0, 0.0, -2.0]);
         assert_eq!(changed.sh.row(0), [0.5, 0.0, 0.25, 0.0, 0.0]);
         assert_eq!((&changed.rotation, &changed.log_scale), (&state.rotation, &state.log_scale));
-        change.pick(&[1, 0]).add_to(&mut state, Columns::all());
+        change.pick(&[1, 0]).add_to(&mut state, Attributes::all());
         assert_eq!((state.position.row(0), state.sh.row(1)), ([1.0, 0.0, -2.0], [0.5, 0.0, 0.25]));
         assert!(ParamDelta::default().is_empty() && !change.is_empty());
     }
@@ -289,12 +289,12 @@ mod tests {
     fn trajectory_delta_is_linear_between_keyframes() {
         let knot = |x: f32, logit: f32| {
             let mut by = Gaussians::zeros(0, 0);
-            by.position = Column::from_planes(3, vec![x, 0.0, 2.0 * x, 0.0, 0.0, -x]);
-            by.opacity_logit = Column::from_planes(1, vec![logit, 1.0]);
+            by.position = AttributeValues::from_planes(3, vec![x, 0.0, 2.0 * x, 0.0, 0.0, -x]);
+            by.opacity_logit = AttributeValues::from_planes(1, vec![logit, 1.0]);
             ParamDelta(by)
         };
         let course = TrajectoryDelta(vec![knot(1.0, 0.0), knot(3.0, 4.0), knot(-1.0, 4.0)]);
-        assert_eq!(course.columns(), Columns::POSITION | Columns::OPACITY);
+        assert_eq!(course.columns(), Attributes::POSITION | Attributes::OPACITY);
         for (frame, x, logit) in [(0, 1.0, 0.0), (1, 1.5, 1.0), (4, 3.0, 4.0), (7, 0.0, 4.0), (8, -1.0, 4.0)] {
             assert_eq!(course.at(frame, 9), knot(x, logit), "frame {frame}");
             assert_eq!(course.pick(&[1, 0, 1]).at(frame, 9), knot(x, logit).pick(&[1, 0, 1]));
@@ -308,9 +308,9 @@ mod tests {
         of_all.sh.planes_mut().fill(0.5);
         let mut reduction = CompressedModel::pruned(vec![2, 7], &Recipe::preset("default").unwrap().merge);
         (reduction.change, reduction.course) = (ParamDelta(of_all), course);
-        let both = reduction.change_at(4, 9);
+        let both = reduction.delta_at(4, 9);
         assert_eq!((both.0.position.row(0), both.0.sh.row::<12>(1)), ([3.0, 6.0, 0.0], [0.5; 12]));
-        assert_eq!(reduction.pick(&[1]).change_at(4, 9), both.pick(&[1]));
+        assert_eq!(reduction.pick(&[1]).delta_at(4, 9), both.pick(&[1]));
     }
 
     #[test]
@@ -323,7 +323,7 @@ mod tests {
             members: vec![(leader, 0.5), (other, 0.5)],
         };
         reduction.clusters = vec![cluster(0, 1, 2), cluster(1, 4, 5), cluster(2, 6, 7)];
-        let mut raw = Raw::from(Gaussians::zeros(3, 0));
+        let mut raw = StoredParams::from(Gaussians::zeros(3, 0));
         (0..3).for_each(|row| raw.gaussians.position.set_row(row, [row as f32; 3]));
         reduction.make(Proxies { raw: Some(raw), refused: vec![1], ..Proxies::default() });
         assert_eq!(reduction.index_map(8), [None, Some(0), Some(0), None, Some(1), None, Some(2), Some(2)]);

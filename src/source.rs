@@ -8,7 +8,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use serde::{Deserialize, Serialize};
 
 use crate::error::Result;
-use crate::model::{Column, Columns, Gaussians, Jacobian, Raw, SequenceInfo};
+use crate::model::{AttributeValues, Attributes, Gaussians, Jacobian, SequenceInfo, StoredParams};
 
 /// Gaussians of a sequence that a reader covers.
 #[derive(Debug, Clone)]
@@ -196,24 +196,24 @@ pub trait FrameSource: Send + Sync {
 /// States computed from stored parameters, which are the same for all frames, by a differentiable function.
 pub trait Deformation: Sync {
     /// Returns the stored parameters.
-    fn stored(&self) -> &Raw;
+    fn stored(&self) -> &StoredParams;
 
     /// Returns the columns of the stored parameters that have derivatives.
-    fn movable(&self) -> Columns;
+    fn movable(&self) -> Attributes;
 
     /// Writes the columns `want` of the state at `frame` to `out`, for Gaussians with the parameters `stored`. Resizes
     /// these columns of `out`.
-    fn state(&self, frame: usize, stored: &Raw, want: Columns, out: &mut Gaussians) -> Result<()>;
+    fn state(&self, frame: usize, stored: &StoredParams, want: Attributes, out: &mut Gaussians) -> Result<()>;
 
     /// Returns the derivatives of the columns `want` of that state with respect to the same columns of `stored`.
-    fn jacobian(&self, frame: usize, stored: &Raw, want: Columns) -> Result<Jacobian>;
+    fn jacobian(&self, frame: usize, stored: &StoredParams, want: Attributes) -> Result<Jacobian>;
 }
 
 /// Decoder of features that take the place of colors. Features are blended without a background, and the decoder
 /// computes the color of each pixel from the blended features.
 pub trait FeatureDecoder: Sync {
     /// Writes the features of all Gaussians at `frame` to `out`, one plane per feature.
-    fn features(&self, frame: usize, out: &mut Column) -> Result<()>;
+    fn features(&self, frame: usize, out: &mut AttributeValues) -> Result<()>;
 
     /// Returns red, green and blue of a pixel with the blended `features`, seen from `center` along the unit vector
     /// `ray`.
@@ -227,7 +227,7 @@ pub trait Prefetch: Sync {
 
     /// Fetches the bytes of the columns `want` of `gaussians` at `frames`, and waits for them. Failures are reported
     /// when the bytes are read.
-    fn fetch(&self, gaussians: Range<usize>, frames: Range<usize>, want: Columns);
+    fn fetch(&self, gaussians: Range<usize>, frames: Range<usize>, want: Attributes);
 }
 
 /// Reader of one block of Gaussians at any frame.
@@ -237,7 +237,7 @@ pub trait BlockReader: Send {
     ///
     /// # Errors
     /// A frame that cannot be read.
-    fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()>;
+    fn read(&mut self, frame: usize, want: Attributes, out: &mut Gaussians) -> Result<()>;
 
     /// Announces the frames that the reader will be asked for from now on, and how many it may keep. Readers that keep
     /// no frames ignore it.
@@ -245,7 +245,7 @@ pub trait BlockReader: Send {
 
     /// Does the work of reading `want` at `frame`, and at the frames decoded with it, except for copying, as far as the
     /// reader may keep the result.
-    fn prepare(&mut self, _frame: usize, _want: Columns) -> Result<()> {
+    fn prepare(&mut self, _frame: usize, _want: Attributes) -> Result<()> {
         Ok(())
     }
 }

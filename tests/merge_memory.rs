@@ -14,7 +14,7 @@ use splatsieve::merging::motion::MotionGate;
 use splatsieve::merging::motion_pass::{BYTES_PER_PAIR, PairMeter, bytes_per_gaussian};
 use splatsieve::merging::neighbors::PointIndex;
 use splatsieve::merging::tree::TreePoint;
-use splatsieve::model::Columns;
+use splatsieve::model::Attributes;
 use splatsieve::outputs::container::write_container;
 use splatsieve::passes::gather;
 use splatsieve::progress::Events;
@@ -36,7 +36,7 @@ fn peak(folder: &Path, frames: usize, partitions: usize) -> (usize, usize) {
     }
     let container = Container::open(&path).unwrap();
     let ids: Vec<u32> = (0..COUNT as u32).collect();
-    let reference = gather(&container, &ids, 0, Columns::POSITION).unwrap().position;
+    let reference = gather(&container, &ids, 0, Attributes::POSITION).unwrap().position;
     let point = |&index: &u32| TreePoint { at: reference.row(index as usize), index };
     let index = PointIndex::new(ids.iter().map(point).collect(), f64::INFINITY);
     let mut search = index.search();

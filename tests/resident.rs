@@ -9,7 +9,7 @@ use std::hint::black_box;
 use gseq::{Compression, TileBuffer, TileId};
 use splatsieve::diagnostics::demo_scene::Scene;
 use splatsieve::files::container::Container;
-use splatsieve::model::{Columns, Gaussians};
+use splatsieve::model::{Attributes, Gaussians};
 use splatsieve::outputs::container::{FRAME_BLOCK, write_container};
 use splatsieve::passes::FrameReaders;
 use splatsieve::source::{BlockReader, FrameSource, Ids, ReadPlan};
@@ -28,7 +28,7 @@ fn status(line: &str) -> usize {
 fn reading_raw_tiles_keeps_no_pages_resident() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("raw.gseq");
-    write_container(&Scene::new(COUNT, FRAMES), &path, Compression::Raw, BTreeMap::new(), |_| ()).unwrap();
+    write_container(&Scene::new(COUNT, FRAMES), &path, Compression::StoredParams, BTreeMap::new(), |_| ()).unwrap();
     let file = fs::metadata(&path).unwrap().len() as usize;
     let container = Container::open(&path).unwrap();
     let varying = container.info().varying;
@@ -40,7 +40,7 @@ fn reading_raw_tiles_keeps_no_pages_resident() {
     for start in (0..COUNT).step_by(1024) {
         let mut reader = container.open(Ids::Range(start..COUNT.min(start + 1024))).unwrap();
         for frame in 0..FRAMES {
-            reader.read(frame, if frame == 0 { Columns::all() } else { varying }, &mut state).unwrap();
+            reader.read(frame, if frame == 0 { Attributes::all() } else { varying }, &mut state).unwrap();
         }
         most = most.max(status("RssFile:"));
     }

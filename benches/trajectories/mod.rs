@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use splatsieve::model::hash_id;
-use splatsieve::model::{Columns, Gaussians};
+use splatsieve::model::{Attributes, Gaussians};
 use splatsieve::models::ModelFolder;
 use splatsieve::passes::HeldFrames;
 use splatsieve::source::{FrameSource, Ids};
@@ -45,7 +45,7 @@ fn trained(folder: &Path, name: &str) -> HeldFrames {
 /// Smooth curves with 1e-4 of noise in every column but the harmonics.
 fn curves() -> HeldFrames {
     let random = |k: usize| (hash_id(k as u64) >> 40) as f32 / (1 << 24) as f32;
-    let varying = Columns::all().difference(Columns::SH);
+    let varying = Attributes::all().difference(Attributes::SH);
     let mut held = HeldFrames::new(GAUSSIANS, 0, varying, Gaussians::zeros(GAUSSIANS, 0));
     for frame in 0..FRAMES {
         let mut state = Gaussians::zeros(GAUSSIANS, 0);
@@ -61,7 +61,7 @@ fn curves() -> HeldFrames {
 }
 
 /// The values of a column in tiles as the container has them: for each block of Gaussians `[frames][width][len]`.
-pub(crate) fn tiles(scene: &HeldFrames, column: Columns) -> Vec<Vec<f32>> {
+pub(crate) fn tiles(scene: &HeldFrames, column: Attributes) -> Vec<Vec<f32>> {
     const BLOCK: usize = splatsieve::outputs::container::GAUSSIAN_BLOCK;
     let mut state = Gaussians::zeros(0, scene.info().sh_degree);
     let block = |start: usize| {

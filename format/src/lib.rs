@@ -54,7 +54,7 @@ mod writer;
 pub use codec::{Compression, EncodedTile, Encoding, Stats, encode_tile};
 pub use error::{Error, Result};
 pub use layout::{ColumnSpec, Layout, MAGIC, MAX_TILE_BYTES, TileId};
-pub use reader::{Reader, Tile, TileBuffer, TileFrames, TileInfo, TilesRead, Touched};
+pub use reader::{Reader, Tile, TileBuffer, TileFrames, TileInfo, TileReadCounts, TouchedPages};
 pub use recover::{RecoverReport, recover, recover_within};
 pub use text::{ShowPath, ShownPath, printable, quoted};
 pub use verify::VerifyReport;

@@ -17,7 +17,7 @@ use crate::writer::check_times;
 
 mod tile_frames;
 
-pub use tile_frames::{TileFrames, Touched};
+pub use tile_frames::{TileFrames, TouchedPages};
 
 /// Maximum distance in bytes between tiles whose pages are prefetched or released in one call.
 const MERGE_GAP_BYTES: u64 = 1 << 12;
@@ -56,7 +56,7 @@ pub struct TileBuffer {
 
 /// Amount of tile data that was read from a container.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct TilesRead {
+pub struct TileReadCounts {
     /// Stored bytes of the tiles that were read.
     pub bytes: u64,
     /// Number of tiles that were decoded or, if raw, loaded.
@@ -281,7 +281,7 @@ impl Reader {
     /// this way.
     pub fn tile<'a>(&'a self, at: TileId, buffer: &'a mut TileBuffer) -> Result<Tile<'a>> {
         let (index, tile) = self.record(at)?;
-        if tile.encoding == Encoding::Raw && cfg!(target_endian = "little") {
+        if tile.encoding == Encoding::StoredParams && cfg!(target_endian = "little") {
             let bytes = self.file.in_place(tile.offset, tile.stored_bytes.into())?;
             self.verify_in_place(index, &tile, bytes)?;
             self.count(1, bytes.len());
@@ -301,8 +301,11 @@ impl Reader {
 
     /// Returns how much tile data was read so far, by all threads. Bytes count each time they are read; of a raw tile
     /// that was verified before, only the frames that are read count.
-    pub fn tiles_read(&self) -> TilesRead {
-        TilesRead { bytes: self.read_bytes.load(Ordering::Relaxed), tiles: self.read_tiles.load(Ordering::Relaxed) }
+    pub fn tiles_read(&self) -> TileReadCounts {
+        TileReadCounts {
+            bytes: self.read_bytes.load(Ordering::Relaxed),
+            tiles: self.read_tiles.load(Ordering::Relaxed),
+        }
     }
 
     /// Tells the system that tiles will be read soon, so that it reads them from disk during other work. Takes no
@@ -413,7 +416,7 @@ pub(crate) fn read_tile(file: &MappedFile, layout: &Layout, tile: &TileRecord, b
     read_stored(file, tile, stored)?;
     values.resize(tile.value_count(layout), 0.0);
     match tile.encoding {
-        Encoding::Raw => {
+        Encoding::StoredParams => {
             for (value, bytes) in values.iter_mut().zip(stored.as_chunks().0) {
                 *value = f32::from_le_bytes(*bytes);
             }

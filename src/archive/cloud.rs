@@ -11,7 +11,7 @@ use super::entropy::{SYMBOLS, SymbolDecoder, SymbolEncoder, SymbolModel};
 use super::predict::{PredictorFit, PredictorWeights, expected, factors};
 use super::residual::Residuals;
 use super::step::QuantizationGrid;
-use crate::model::{Column, Columns, Gaussians, HIGHEST_DEGREE, sh_coefficients};
+use crate::model::{AttributeValues, Attributes, Gaussians, MAX_SH_DEGREE, sh_coefficients};
 
 /// Attributes with a step each, in the order of [`CloudSteps`]; SH coefficients by degree.
 pub const ATTRIBUTES: [&str; 8] =
@@ -44,18 +44,18 @@ pub(super) struct PointCloudShape {
 }
 
 /// Returns the planes after the positions: attribute, plane in it, and index in [`ATTRIBUTES`].
-fn planes(sh_degree: usize) -> Vec<(Columns, usize, usize)> {
-    let mut planes: Vec<_> = (0..4).map(|c| (Columns::ROTATION, c, 1)).collect();
-    planes.extend((0..3).map(|c| (Columns::LOG_SCALE, c, 2)));
-    planes.push((Columns::OPACITY, 0, 3));
-    planes.extend((0..3 * sh_coefficients(sh_degree)).map(|c| (Columns::SH, c, 4 + (c / 3).isqrt())));
+fn planes(sh_degree: usize) -> Vec<(Attributes, usize, usize)> {
+    let mut planes: Vec<_> = (0..4).map(|c| (Attributes::ROTATION, c, 1)).collect();
+    planes.extend((0..3).map(|c| (Attributes::LOG_SCALE, c, 2)));
+    planes.push((Attributes::OPACITY, 0, 3));
+    planes.extend((0..3 * sh_coefficients(sh_degree)).map(|c| (Attributes::SH, c, 4 + (c / 3).isqrt())));
     planes
 }
 
 impl PointCloudShape {
     /// Checks that the numbers are consistent. Applies to shapes from untrusted files.
     pub(super) fn is_sound(&self) -> bool {
-        self.sh_degree <= HIGHEST_DEGREE
+        self.sh_degree <= MAX_SH_DEGREE
             && self.means.len() == planes(self.sh_degree).len()
             && self.parts.len() == self.means.len()
             && self.steps.iter().all(|step| super::STEPS.contains(step))
@@ -65,7 +65,7 @@ impl PointCloudShape {
 
     /// Returns the number of f32 values of all Gaussians; `None` if it overflows.
     pub(super) fn values(&self) -> Option<usize> {
-        self.gaussians.checked_mul(Columns::all().width(self.sh_degree))
+        self.gaussians.checked_mul(Attributes::all().width(self.sh_degree))
     }
 }
 
@@ -100,7 +100,7 @@ fn gather(x: u64) -> u64 {
 }
 
 /// Returns positions in steps above the minimum, the minimum, and the number of bits that the curve does not use.
-fn grid_positions(position: &Column, grid: QuantizationGrid) -> (Vec<[u64; 3]>, [i64; 3], u32) {
+fn grid_positions(position: &AttributeValues, grid: QuantizationGrid) -> (Vec<[u64; 3]>, [i64; 3], u32) {
     let all: Vec<[i64; 3]> = (0..position.len()).map(|i| position.row(i).map(|x| grid.multiple(x))).collect();
     let lowest = [0, 1, 2].map(|axis| all.iter().map(|p| p[axis]).min().unwrap_or(0));
     let above: Vec<[u64; 3]> = all.iter().map(|p| [0, 1, 2].map(|axis| p[axis].abs_diff(lowest[axis]))).collect();
@@ -285,7 +285,7 @@ impl PlaneCoder {
 
 /// Rounds the values of `attributes` to their grids.
 pub(super) fn round(cloud: &mut Gaussians, steps: &CloudSteps, attributes: &[usize]) {
-    let positions = (0..3).map(|c| (Columns::POSITION, c, 0));
+    let positions = (0..3).map(|c| (Attributes::POSITION, c, 0));
     for (column, c, attribute) in positions.chain(planes(cloud.sh_degree())) {
         if attributes.contains(&attribute) {
             let grid = QuantizationGrid::new(steps[attribute]);
@@ -296,7 +296,7 @@ pub(super) fn round(cloud: &mut Gaussians, steps: &CloudSteps, attributes: &[usi
 
 /// Returns the values of an attribute.
 pub(super) fn values(cloud: &Gaussians, attribute: usize) -> impl Iterator<Item = f32> {
-    let positions = (0..3).map(|c| (Columns::POSITION, c, 0));
+    let positions = (0..3).map(|c| (Attributes::POSITION, c, 0));
     let own = positions.chain(planes(cloud.sh_degree())).filter(move |plane| plane.2 == attribute);
     own.flat_map(|(column, c, _)| cloud.column(column).plane(c).iter().copied())
 }

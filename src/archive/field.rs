@@ -15,7 +15,7 @@ use super::residual::Residuals;
 use super::step::QuantizationGrid;
 use super::texels;
 use crate::deform::{Box3, Tensor, Tensors};
-use crate::model::Column;
+use crate::model::AttributeValues;
 
 /// Eighths of an octave by which the step of a texel is finer for each octave of its summed squared read weights, by
 /// which its squared error counts.
@@ -75,7 +75,7 @@ pub struct TensorSteps {
 /// Positions and times at which planes are read.
 #[derive(Debug)]
 pub(super) struct Readers<'a> {
-    pub(super) position: &'a Column,
+    pub(super) position: &'a AttributeValues,
     pub(super) space: Option<Box3>,
     /// First and last time.
     pub(super) times: [f32; 2],
@@ -280,7 +280,13 @@ pub(super) fn decode(
 
 /// Returns a tensor rounded with `steps`, as an archive would restore it. Ignores that unread rows are restored from
 /// their neighbors.
-pub fn rounded(tensor: &Tensor, role: Role, steps: &TensorSteps, position: &Column, space: Option<Box3>) -> Tensor {
+pub fn rounded(
+    tensor: &Tensor,
+    role: Role,
+    steps: &TensorSteps,
+    position: &AttributeValues,
+    space: Option<Box3>,
+) -> Tensor {
     let entry = TensorEntry::new("", tensor, role, Some(steps));
     let readers = Readers { position, space, times: [-1.0, 1.0] };
     let mut data = tensor.data.clone();

@@ -11,7 +11,7 @@ use std::collections::BTreeMap;
 
 use super::field::Role;
 use crate::deform::{Box3, Tap, Tensor, Tensors, tap};
-use crate::model::Column;
+use crate::model::AttributeValues;
 
 /// Maximum number of Gaussians that are sampled.
 const GAUSSIANS: usize = 256;
@@ -27,7 +27,7 @@ const MAX_OFFSET: f64 = 6.0;
 pub fn offsets(
     field: &BTreeMap<String, Role>,
     tensors: &Tensors,
-    position: &Column,
+    position: &AttributeValues,
     space: Option<Box3>,
     times: [f32; 2],
 ) -> BTreeMap<String, Vec<i8>> {
@@ -212,7 +212,7 @@ const AXES: [[usize; 2]; 6] = [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]];
 
 impl Samples {
     /// Evaluates the planes at some Gaussians and times; `None` if the planes are missing or malformed.
-    fn new(tensors: &Tensors, position: &Column, space: Box3, [first, last]: [f32; 2]) -> Option<Samples> {
+    fn new(tensors: &Tensors, position: &AttributeValues, space: Box3, [first, last]: [f32; 2]) -> Option<Samples> {
         let name = |level: usize, plane: usize| format!("deformation_net.grid.grids.{level}.{plane}");
         let mut levels: Vec<[&Tensor; 6]> = Vec::new();
         while let Some(plane) = tensors.get(&name(levels.len(), 0)) {

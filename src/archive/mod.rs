@@ -33,12 +33,12 @@ pub use step::{STEPS, nearest, step};
 use crate::deform::{Box3, Tensor, Tensors};
 use crate::error::{Error, Result};
 use crate::limits::ReadLimit;
-use crate::model::{Columns, Gaussians};
+use crate::model::{Attributes, Gaussians};
 use field::{Readers, TensorEntry};
 use file::{ArchiveHeader, Damage, Sections};
 
 /// Name of the tensor that holds the box covered by the planes.
-pub const BOX: &str = "deformation_net.grid.aabb";
+pub const BOX_TENSOR: &str = "deformation_net.grid.aabb";
 
 /// Content of an archive.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -217,9 +217,9 @@ fn decoded(
         rest = after;
     }
     // The box is one of the exact tensors; it is needed before planes are decoded.
-    let before = table.tensors.iter().take_while(|entry| entry.name != BOX).filter(count);
+    let before = table.tensors.iter().take_while(|entry| entry.name != BOX_TENSOR).filter(count);
     let start: usize = before.filter_map(TensorEntry::values).sum();
-    let has_box = table.tensors.iter().any(|entry| entry.name == BOX && entry.role == Role::Exact);
+    let has_box = table.tensors.iter().any(|entry| entry.name == BOX_TENSOR && entry.role == Role::Exact);
     let space = exact.get(start..).filter(|_| has_box).and_then(|values| Box3::new(values.get(..6)?));
     if space.is_none() && table.tensors.iter().any(|entry| matches!(entry.role, Role::Plane(_) | Role::TimePlane(_))) {
         return Err(unsound("box of the field"));
@@ -233,7 +233,7 @@ fn decoded(
 
 /// Returns the box covered by the planes of the deformation field; `None` without such a field.
 pub fn space(content: &Content) -> Option<Box3> {
-    content.tensors.get(BOX).and_then(|tensor| Box3::new(&tensor.data))
+    content.tensors.get(BOX_TENSOR).and_then(|tensor| Box3::new(&tensor.data))
 }
 
 /// Rounds `attributes` of the Gaussians to their grids, as in an archive, but without changing their order.
@@ -248,7 +248,7 @@ pub fn attribute(cloud: &Gaussians, k: usize) -> impl Iterator<Item = f32> {
 
 /// Checks that every value is finite and every step is within [`STEPS`].
 fn check(content: &Content, steps: &Steps) -> Result<()> {
-    for column in Columns::all().iter() {
+    for column in Attributes::all().iter() {
         let values = content.cloud.column(column);
         if let Some(at) = values.planes().iter().position(|value| !value.is_finite()) {
             let (id, value) = (at % values.len(), values.planes()[at]);

@@ -27,7 +27,7 @@ fn tensor(noise: &mut SeededNoise, shape: &[usize]) -> Tensor {
 fn content(seed: u64, count: usize, sh_degree: usize) -> Content {
     let mut noise = SeededNoise(seed);
     let mut cloud = Gaussians::zeros(count, sh_degree);
-    for column in cloud.columns_mut(Columns::all()) {
+    for column in cloud.columns_mut(Attributes::all()) {
         column.planes_mut().iter_mut().for_each(|value| *value = 3.0 * noise.next());
     }
     let mut content = Content { cloud, times: [0.0, 1.0], ..Content::default() };
@@ -48,8 +48,8 @@ fn content(seed: u64, count: usize, sh_degree: usize) -> Content {
         content.field.insert(name.to_owned(), role);
     }
     let corners = Tensor { shape: vec![2, 3], data: vec![2.5, 2.0, 3.5, -2.5, -3.0, -2.0] };
-    content.tensors.insert(BOX.to_owned(), corners);
-    content.field.insert(BOX.to_owned(), Role::Exact);
+    content.tensors.insert(BOX_TENSOR.to_owned(), corners);
+    content.field.insert(BOX_TENSOR.to_owned(), Role::Exact);
     content.beside = (0..3 * count).map(|i| (i * 7) as u8).collect();
     content.files.insert("cfg_args".to_owned(), b"Namespace()".to_vec());
     content.files.insert("empty".to_owned(), Vec::new());

@@ -6,7 +6,7 @@
 
 use super::quantized_tensor::UNREAD;
 use crate::deform::{Box3, tap};
-use crate::model::Column;
+use crate::model::AttributeValues;
 
 /// Exponent (floor of log2) of the summed squared weights of class 0. Smaller sums also belong to class 0.
 const MIN_EXPONENT: i32 = -8;
@@ -29,7 +29,7 @@ fn class(squared_weight: f32) -> u8 {
 }
 
 /// Returns the classes `[size_b, size_a]` of a plane over two spatial axes.
-pub(super) fn plane_classes(position: &Column, space: &Box3, axes: [usize; 2], size: [usize; 2]) -> Vec<u8> {
+pub(super) fn plane_classes(position: &AttributeValues, space: &Box3, axes: [usize; 2], size: [usize; 2]) -> Vec<u8> {
     let mut squared_weights = vec![0.0f32; size[0] * size[1]];
     for i in 0..position.len() {
         let u = space.normalized(position.row(i));
@@ -45,7 +45,7 @@ pub(super) fn plane_classes(position: &Column, space: &Box3, axes: [usize; 2], s
 }
 
 /// Returns the classes `[size]` of the columns of a plane over a spatial axis and time.
-pub(super) fn time_plane_classes(position: &Column, space: &Box3, axis: usize, size: usize) -> Vec<u8> {
+pub(super) fn time_plane_classes(position: &AttributeValues, space: &Box3, axis: usize, size: usize) -> Vec<u8> {
     let mut squared_weights = vec![0.0f32; size];
     for i in 0..position.len() {
         let a = tap(space.normalized(position.row(i))[axis], size);

@@ -124,7 +124,7 @@ impl Cache {
     }
 
     /// Returns the stored result of `stage` for `key`, or computes and stores it. A run of a single shard computes it,
-    /// too, unless `compute` ends the run with [`not_divided`](Cache::not_divided).
+    /// too, unless `compute` ends the run with [`end_shard_before`](Cache::not_divided).
     ///
     /// # Errors
     /// Fails if `compute` fails or the folder cannot be read or written.
@@ -146,7 +146,7 @@ impl Cache {
     ///
     /// # Errors
     /// Fails with [`Error::ShardDone`] in a run of a single shard.
-    pub fn not_divided(&self, stage: &str) -> Result<()> {
+    pub fn end_shard_before(&self, stage: &str) -> Result<()> {
         match self.part {
             None => Ok(()),
             Some(part) => Err(Error::ShardDone(format!(
@@ -192,7 +192,7 @@ impl Cache {
     ///
     /// # Errors
     /// Fails where [`Cache::divided`] fails.
-    pub fn divided_spill(
+    pub fn sharded_spill(
         &self,
         stage: &str,
         key: CacheKey,

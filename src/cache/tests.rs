@@ -160,7 +160,7 @@ fn content_on_disk_is_divided_and_unnamed_without_a_folder() {
     };
     let expected: Vec<u8> = (0..50).collect();
     let folder = tempfile::tempdir().unwrap();
-    let spilled = |work: &Cache| work.divided_spill("bytes", CacheKey::new(&1), 50, folder.path(), write);
+    let spilled = |work: &Cache| work.sharded_spill("bytes", CacheKey::new(&1), 50, folder.path(), write);
     assert_eq!(read(spilled(&Cache::none()).unwrap()), expected);
     assert!(names_in(folder.path()).is_empty());
     for index in 1..=3 {
@@ -179,7 +179,7 @@ fn content_on_disk_is_divided_and_unnamed_without_a_folder() {
 fn undivided_stage_ends_a_run_of_a_shard() {
     let folder = tempfile::tempdir().unwrap();
     let run_undivided =
-        |work: &Cache| work.known("alone", CacheKey::new(&1), || work.not_divided("alone").map(|()| 5u8));
+        |work: &Cache| work.known("alone", CacheKey::new(&1), || work.end_shard_before("alone").map(|()| 5u8));
     let message = run_undivided(&open_cache(folder.path(), Some("1/2"))).unwrap_err().to_string();
     assert!(message.contains("the next stage, alone, is not divided"), "{message}");
     assert_eq!(run_undivided(&open_cache(folder.path(), None)).unwrap(), 5);

@@ -28,7 +28,7 @@ use splatsieve::commands::render::{RenderOptions, RenderSelection};
 use splatsieve::commands::video::{FilmPath, VideoOptions, places, video};
 use splatsieve::commands::{container, convert, render, score};
 use splatsieve::diagnostics::demo::DemoOptions;
-use splatsieve::diagnostics::precision::{PrecisionOptions, Turned};
+use splatsieve::diagnostics::precision::{Knob, PrecisionOptions};
 use splatsieve::diagnostics::selfcheck;
 use splatsieve::diagnostics::sweep::SweepOptions;
 use splatsieve::diagnostics::{demo, precision, sweep};
@@ -36,7 +36,7 @@ use splatsieve::error::{Error, Result, ShowPath};
 use splatsieve::evaluation;
 use splatsieve::evaluation::EvaluateOptions;
 use splatsieve::evaluation::method::Method;
-use splatsieve::files::atomic::{Replace, as_named, take_warnings};
+use splatsieve::files::atomic::{Replace, take_warnings, with_user_path};
 use splatsieve::files::cameras::Times;
 use splatsieve::files::image::write::ImageFormat;
 use splatsieve::memory_plan;
@@ -51,7 +51,7 @@ use splatsieve::player::view::ViewOptions;
 use splatsieve::progress::Events;
 use splatsieve::recipe::preset_text;
 use splatsieve::report::{self, ReportOptions, trade_off};
-use splatsieve::scene::pictures::PictureSet;
+use splatsieve::scene::pictures::ViewSet;
 use splatsieve::scene::{InputOptions, scratch_beside};
 
 /// Runs the program on the arguments of this process.
@@ -95,7 +95,7 @@ fn ended_by(error: Error) -> ExitCode {
     if output::has_no_reader(&error) {
         return ExitCode::SUCCESS;
     }
-    let error = as_named(error);
+    let error = with_user_path(error);
     tell(&format!("splatsieve: {error}"));
     ExitCode::from(error.kind().exit_code())
 }
@@ -254,7 +254,7 @@ fn write_converted(args: Convert, events: &Events) -> Result<()> {
     let is_stdout = path.as_os_str() == "-";
     let is_stored_differently = args.raw || args.level.is_some() || !args.max_error.is_empty();
     let storing = match (args.raw, args.max_error) {
-        (true, _) => Storing::Exact(Compression::Raw),
+        (true, _) => Storing::Exact(Compression::StoredParams),
         (_, bounds) if bounds.is_empty() => Storing::Exact(Compression::Zstd(args.level.unwrap_or(1))),
         (_, bounds) => Storing::Within(bounds, args.level.unwrap_or(15)),
     };
@@ -435,8 +435,8 @@ fn render_options(args: Render, events: &Events) -> Result<RenderOptions> {
         Some(ImageKind::Png) | None => ImageFormat::Png,
     };
     let (wanted, part) = match args.frame.zip(args.view) {
-        Some((frame, view)) => (RenderSelection::One { frame: frame as usize, view }, PictureSet::All),
-        None => (RenderSelection::All(format), PictureSet::HeldOut),
+        Some((frame, view)) => (RenderSelection::One { frame: frame as usize, view }, ViewSet::All),
+        None => (RenderSelection::All(format), ViewSet::HeldOut),
     };
     let output = args.output.unwrap_or_default();
     let mut input = input_options(args.input, None, Some(&output), events);
@@ -455,8 +455,8 @@ fn render_options(args: Render, events: &Events) -> Result<RenderOptions> {
 /// `render --video`.
 fn film(args: Render, output: PathBuf, events: &Events) -> Result<()> {
     let (way, part) = match args.path {
-        Some(views) => (FilmPath::Path(views), PictureSet::HeldOut),
-        None => (FilmPath::View(args.view), PictureSet::All),
+        Some(views) => (FilmPath::Path(views), ViewSet::HeldOut),
+        None => (FilmPath::View(args.view), ViewSet::All),
     };
     let mut input = input_options(args.input, None, Some(&output), events);
     args.cameras.apply_to(&mut input);
@@ -491,7 +491,7 @@ fn evaluate_options(args: CompareArgs, events: &Events) -> EvaluateOptions {
         original,
         compressed: args.compressed,
         ground_truth: args.ground_truth,
-        part: args.split.map_or(PictureSet::HeldOut, part_of),
+        part: args.split.map_or(ViewSet::HeldOut, part_of),
         max_frames: args.max_frames.map(|frames| frames as usize),
         max_views: args.max_views.map(|views| views as usize),
         background: args.background.background,
@@ -575,8 +575,8 @@ fn sweep_options(args: Sweep, events: &Events) -> SweepOptions {
 fn precision_options(args: args::PrecisionArgs, events: &Events) -> Result<PrecisionOptions> {
     let mut input = input_options(args.input, None, Some(&args.output), events);
     args.cameras.apply_to(&mut input);
-    let named = |name: &String| Turned::ALL.into_iter().find(|knob| knob.name() == name);
-    let knobs: Vec<Turned> = args.knobs.iter().filter_map(named).collect();
+    let named = |name: &String| Knob::ALL.into_iter().find(|knob| knob.name() == name);
+    let knobs: Vec<Knob> = args.knobs.iter().filter_map(named).collect();
     Ok(PrecisionOptions {
         input,
         recipe: args.recipe.recipe()?,
@@ -589,12 +589,12 @@ fn precision_options(args: args::PrecisionArgs, events: &Events) -> Result<Preci
     })
 }
 
-fn part_of(split: SplitArg) -> PictureSet {
+fn part_of(split: SplitArg) -> ViewSet {
     match split {
-        SplitArg::Train => PictureSet::Split(Split::Train),
-        SplitArg::Val => PictureSet::Split(Split::Val),
-        SplitArg::Test => PictureSet::Split(Split::Test),
-        SplitArg::All => PictureSet::All,
+        SplitArg::Train => ViewSet::Split(Split::Train),
+        SplitArg::Val => ViewSet::Split(Split::Val),
+        SplitArg::Test => ViewSet::Split(Split::Test),
+        SplitArg::All => ViewSet::All,
     }
 }
 

@@ -75,7 +75,7 @@ impl RecipeFlags {
             }
         };
         if let Some(effort) = Effort::ALL.into_iter().find(|effort| self.effort.as_deref() == Some(effort.name())) {
-            recipe = recipe.at_effort(effort);
+            recipe = recipe.with_effort(effort);
         }
         for setting in &self.settings {
             let Setting::Parameter { section, key, value } = setting else { continue };
@@ -217,7 +217,7 @@ pub(super) fn numbers<T: std::str::FromStr>(text: &str) -> std::result::Result<V
 #[cfg(test)]
 mod tests {
     use super::*;
-    use splatsieve::model::Columns;
+    use splatsieve::model::Attributes;
 
     fn parse(args: &[&str]) -> Result<Recipe> {
         let command = RecipeFlags::augment_args(Command::new("t").no_binary_name(true));
@@ -282,10 +282,10 @@ mod tests {
     #[test]
     fn refined_attributes_are_named_in_one_list() {
         let refined = |args: &[&str]| parse(args).unwrap().refine.refine.0;
-        assert_eq!(refined(&[]), Columns::all());
-        assert_eq!(refined(&["--set", "refine=color, scale"]), Columns::SH | Columns::LOG_SCALE);
+        assert_eq!(refined(&[]), Attributes::all());
+        assert_eq!(refined(&["--set", "refine=color, scale"]), Attributes::SH | Attributes::LOG_SCALE);
         for none in [&["--no-refine"][..], &["--set", "refine=none"], &["--preset", "gentle"]] {
-            assert_eq!(refined(none), Columns::empty());
+            assert_eq!(refined(none), Attributes::empty());
         }
         let text = message(&["--set", "refine=color,size"]);
         assert!(text.contains("refine") && text.contains("\"size\"") && text.contains("rotation"), "{text}");

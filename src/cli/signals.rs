@@ -1,6 +1,6 @@
 //! Ends of a run from outside: signals, and input files that other programs cut short.
 
-use splat_platform::{CutShortMessage, end_on_signals, report_cut_short_maps};
+use splat_platform::{TruncatedMapMessage, end_on_signals, report_cut_short_maps};
 use splatsieve::error::ErrorKind;
 use splatsieve::files::atomic::withdraw_all;
 
@@ -8,7 +8,7 @@ use splatsieve::files::atomic::withdraw_all;
 /// is cut short ends the process with a message that names the file.
 pub(super) fn install() {
     end_on_signals(withdraw_all, |signal| ErrorKind::Interrupted { signal }.exit_code());
-    report_cut_short_maps(CutShortMessage {
+    report_cut_short_maps(TruncatedMapMessage {
         before: "splatsieve: ",
         unknown_path: "an input file",
         after: ", end of file: expected the bytes that were there when it was opened, found fewer\n  the file was cut short \

@@ -12,7 +12,7 @@ use crate::files::atomic::{Kind, MARKER, Replace, StagedFile, StagedFolder, chec
 use crate::files::names::name_of;
 use crate::files::open::open_file;
 use crate::limits::ReadLimit;
-use crate::model::Columns;
+use crate::model::Attributes;
 use crate::models::archive::{is_folder, read_archive, unpack};
 use crate::outputs::kind::{OutputKind, check_folder_name};
 
@@ -37,7 +37,7 @@ pub fn is_archive(path: &Path) -> Result<bool> {
 pub fn unpack_archive(path: &Path, output: &Path, overwrite: Replace, memory: ReadLimit) -> Result<Converted> {
     let (content, parts) = read_archive(path, memory)?;
     let values: usize = content.tensors.values().map(|tensor| tensor.data.len()).sum();
-    let attributes = content.cloud.len() * Columns::all().width(content.cloud.sh_degree());
+    let attributes = content.cloud.len() * Attributes::all().width(content.cloud.sh_degree());
     let converted = |kind| Converted {
         path: output.to_owned(),
         kind,

@@ -19,7 +19,7 @@ use crate::files::frame_stream::{FrameStream, StreamHeader};
 use crate::files::open::open_file;
 use crate::limits::Limits;
 use crate::memory_plan::{Budget, Plan, ResourceEstimate, Workload};
-use crate::model::Columns;
+use crate::model::Attributes;
 use crate::models;
 use crate::models::stream::pack_stream;
 use crate::models::{ColumnInfo, InputModel, Size, Timing};
@@ -30,10 +30,10 @@ use crate::outputs::container::{
 use crate::outputs::frame_stream::StreamWriter;
 use crate::outputs::kind::{OutputKind, check_container_name};
 use crate::passes::FrameReaders;
-use crate::pipeline::stages::write::ENCODING;
+use crate::pipeline::stages::write::SECONDS_TO_ENCODE;
 use crate::pipeline::summary::InputSummary;
 use crate::scene::{
-    InputOptions, Opened, first_box, is_linked, kept_work, link_stream, open_input, open_stream, room_to_pack,
+    InputOptions, OpenedInput, first_box, is_linked, kept_work, link_stream, open_input, open_stream, room_to_pack,
 };
 use crate::source::{BlockReader, FrameSource, Ids, ReadPlan};
 
@@ -95,8 +95,8 @@ fn pack_whole(input: &InputOptions, output: &Path, storing: &Storing, overwrite:
             spill_blocks(source, packing, blocks, to, |done| progress.advance(done))
         };
         let spills =
-            work.divided_spill(PACK, packing.key(), packing.frame_blocks(source), &input.scratch_folder(), encode)?;
-        work.not_divided("writing")?;
+            work.sharded_spill(PACK, packing.key(), packing.frame_blocks(source), &input.scratch_folder(), encode)?;
+        work.end_shard_before("writing")?;
         let staged = StagedFile::new(output, overwrite)?;
         join_container(source, staged.path(), packing, attributes, &spills)?;
         staged
@@ -145,7 +145,7 @@ fn packed(output: &Path, gaussians: usize, frames: usize, bytes: u64, notes: Vec
 /// Writes any input as a frame stream; gives the input.
 ///
 /// Memory: see [`unpacking`].
-pub fn unpack_stream(input: &InputOptions, to: impl Write) -> Result<Opened> {
+pub fn unpack_stream(input: &InputOptions, to: impl Write) -> Result<OpenedInput> {
     let opened = open_input(input)?;
     let source = opened.input.source();
     let info = source.info();
@@ -155,10 +155,10 @@ pub fn unpack_stream(input: &InputOptions, to: impl Write) -> Result<Opened> {
     plan.tell_time(input.memory.tell, &input.events);
     let held = plan.limits.frames_held;
     let wanted = ReadPlan::every().holding(held);
-    let mut frames = FrameReaders::open(source, Ids::Range(0..source.info().count), Columns::all(), &wanted)?;
+    let mut frames = FrameReaders::open(source, Ids::Range(0..source.info().count), Attributes::all(), &wanted)?;
     let mut state = frames.state();
     if !info.times.is_empty() {
-        frames.read(0, Columns::all(), &mut state)?;
+        frames.read(0, Attributes::all(), &mut state)?;
     }
     let progress = input.events.task("unpack", "frames", info.times.len() as u64);
     let mut stream = StreamWriter::new(to, Path::new("standard output"), header, &state)?;
@@ -246,7 +246,8 @@ fn workload(input: &dyn InputModel) -> Workload {
 
 /// What it takes to write every frame as a container.
 fn packing(work: &Workload, storing: &Storing) -> Vec<ResourceEstimate> {
-    let seconds = work.reading(work.count(), work.frames as f64) + work.count() * work.frames as f64 * ENCODING;
+    let seconds =
+        work.reading(work.count(), work.frames as f64) + work.count() * work.frames as f64 * SECONDS_TO_ENCODE;
     let level = match storing {
         Storing::Exact(Compression::Zstd(level)) | Storing::Within(_, level) => *level,
         Storing::Exact(_) => 0,
@@ -263,8 +264,8 @@ fn packing(work: &Workload, storing: &Storing) -> Vec<ResourceEstimate> {
 
 /// What it takes to write every frame by itself.
 fn unpacking(work: &Workload, limits: &Limits) -> Vec<ResourceEstimate> {
-    let states = ("states", work.state(Columns::all()));
-    let per_gaussian = vec![states, ("readers", work.input.reader), ("held", work.held(limits, Columns::all()))];
+    let states = ("states", work.state(Attributes::all()));
+    let per_gaussian = vec![states, ("readers", work.input.reader), ("held", work.held(limits, Attributes::all()))];
     let seconds = 2.0 * work.reading(work.count(), work.frames as f64);
     vec![ResourceEstimate { stage: "unpack", reads: 1.0, seconds, per_gaussian, fixed: vec![work.arriving()] }]
 }

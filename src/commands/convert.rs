@@ -15,10 +15,10 @@ use crate::error::{Error, Result, ShowPath};
 use crate::files::atomic::{Kind, MARKER, Replace, StagedFile, StagedFolder, check_target};
 use crate::limits::Limits;
 use crate::memory_plan::{Plan, ResourceEstimate, Workload};
-use crate::model::Columns;
+use crate::model::Attributes;
 use crate::outputs::kind::OutputKind;
-use crate::passes::TRACKED;
-use crate::pipeline::stages::write::ENCODING;
+use crate::passes::TRACK_BLOCK;
+use crate::pipeline::stages::write::SECONDS_TO_ENCODE;
 use crate::pipeline::summary::InputSummary;
 use crate::recipe::Recipe;
 use crate::scene::{InputOptions, open_input};
@@ -125,18 +125,19 @@ pub fn convert(
 
 /// All states once, and what is fitted to them.
 fn need(kind: OutputKind, work: &Workload, limits: &Limits) -> ResourceEstimate {
-    let whole = work.state(Columns::all());
+    let whole = work.state(Attributes::all());
     let fits = matches!(kind, OutputKind::Splatv | OutputKind::FourDgs);
-    let tracked = work.threads * TRACKED as u64 * work.frames * whole;
+    let tracked = work.threads * TRACK_BLOCK as u64 * work.frames * whole;
     let mut fixed = work.writing();
     fixed.push(("tracks", if fits { 2 * tracked } else { 0 }));
     let per_gaussian = vec![
         ("kept", 16),
         ("result", work.input.reduced + work.input.file + whole),
         ("readers", work.input.reader),
-        ("held", if fits { 0 } else { work.held(limits, Columns::all()) }),
+        ("held", if fits { 0 } else { work.held(limits, Attributes::all()) }),
         ("fitted", if fits { FITTED } else { 0 }),
     ];
-    let seconds = work.reading(work.count(), work.frames as f64) + work.count() * work.frames as f64 * ENCODING;
+    let seconds =
+        work.reading(work.count(), work.frames as f64) + work.count() * work.frames as f64 * SECONDS_TO_ENCODE;
     ResourceEstimate { stage: "convert", reads: 1.0, seconds, per_gaussian, fixed }
 }

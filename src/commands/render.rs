@@ -13,13 +13,13 @@ use crate::files::atomic::{Kind, MARKER, Replace, StagedFile, StagedFolder, chec
 use crate::files::image::write::{ImageFormat, image_bytes, write_image};
 use crate::limits::Limits;
 use crate::memory_plan::{ResourceEstimate, Workload};
-use crate::model::{Camera, Picture};
+use crate::model::{Camera, FrameView};
 use crate::outputs::kind::check_folder_name;
-use crate::passes::{Batch, Subject, ViewStates, show};
+use crate::passes::{Batch, RenderedSource, ViewStates, show};
 use crate::pipeline::summary::{CameraSummary, InputSummary};
 use crate::progress::Events;
 use crate::render::Image;
-use crate::scene::pictures::{self, PictureSet, background, picture, pictures};
+use crate::scene::pictures::{self, ViewSet, background, picture, pictures};
 use crate::scene::{InputOptions, open_scene};
 use crate::source::FrameSource;
 
@@ -48,7 +48,7 @@ pub struct RenderOptions {
     /// Which pictures.
     pub wanted: RenderSelection,
     /// Part of the cameras' pictures they are among.
-    pub part: PictureSet,
+    pub part: ViewSet,
     /// Red, green, blue in [0, 1]; none: see [`background`].
     pub background: Option<[f32; 3]>,
     /// File or folder to write.
@@ -113,12 +113,12 @@ fn render_whole(options: &RenderOptions) -> Result<Rendered> {
         job.write(&chosen, |_| staged.path().to_owned())?;
         staged.commit()?;
     } else {
-        let name = |picture: &Picture| format!("{}.{}", picture.name(), format.extension());
+        let name = |picture: &FrameView| format!("{}.{}", picture.name(), format.extension());
         let staged = if scene.work.keeps() {
             let key = scene.work.key(&(&chosen, background, format.extension()));
             let make = |some: Range<usize>, to: &mut SpillWriter| job.spill(&chosen[some], to);
-            let spills = scene.work.divided_spill(NAME, key, chosen.len(), &scene.scratch, make)?;
-            scene.work.not_divided("writing")?;
+            let spills = scene.work.sharded_spill(NAME, key, chosen.len(), &scene.scratch, make)?;
+            scene.work.end_shard_before("writing")?;
             let staged = StagedFolder::new(output, options.overwrite)?;
             for (some, spill) in spills {
                 write_spilled(&chosen[some], &spill, |picture| staged.path().join(name(picture)))?;
@@ -172,13 +172,13 @@ struct RenderJob<'a> {
 }
 
 impl RenderJob<'_> {
-    fn write(&self, pictures: &[Picture], path: impl Fn(&Picture) -> PathBuf + Sync) -> Result<()> {
+    fn write(&self, pictures: &[FrameView], path: impl Fn(&FrameView) -> PathBuf + Sync) -> Result<()> {
         self.make(pictures, |picture, image| write_image(image, self.format, &path(&picture)), |()| Ok(()))
     }
 
     /// Writes a record of the file of each of `pictures`, in order.
-    fn spill(&self, pictures: &[Picture], to: &mut SpillWriter) -> Result<()> {
-        let encode = |picture: Picture, image: &Image| {
+    fn spill(&self, pictures: &[FrameView], to: &mut SpillWriter) -> Result<()> {
+        let encode = |picture: FrameView, image: &Image| {
             let named = PathBuf::from(format!("{}.{}", picture.name(), self.format.extension()));
             image_bytes(image, self.format).map_err(Error::io("make", &named))
         };
@@ -188,12 +188,12 @@ impl RenderJob<'_> {
     /// Has `of_each` do something with each of `pictures`, from any thread, and `then` with what comes of it, in order.
     fn make<T: Send>(
         &self,
-        pictures: &[Picture],
-        of_each: impl Fn(Picture, &Image) -> Result<T> + Sync,
+        pictures: &[FrameView],
+        of_each: impl Fn(FrameView, &Image) -> Result<T> + Sync,
         mut then: impl FnMut(T) -> Result<()>,
     ) -> Result<()> {
         let progress = self.events.task(NAME, "pictures", pictures.len() as u64);
-        show([Subject::all(self.source)], self.cameras, pictures, Batch::of_frame(&self.limits), |views| {
+        show([RenderedSource::all(self.source)], self.cameras, pictures, Batch::of_frame(&self.limits), |views| {
             // Tasks within a picture too: a frame may have fewer pictures than there are threads.
             let made = views.par_iter().map(|view: &ViewStates<'_, 1>| {
                 let made = of_each(view.picture, &view.render(0, self.background))?;
@@ -206,7 +206,7 @@ impl RenderJob<'_> {
 }
 
 /// Writes the files that [`RenderJob::spill`] has made of `pictures`, one at a time.
-fn write_spilled(pictures: &[Picture], spill: &Spill, path: impl Fn(&Picture) -> PathBuf) -> Result<()> {
+fn write_spilled(pictures: &[FrameView], spill: &Spill, path: impl Fn(&FrameView) -> PathBuf) -> Result<()> {
     let (mut at, mut bytes) = (0, Vec::new());
     for picture in pictures {
         at = spill.read_record(at, &mut bytes)?;

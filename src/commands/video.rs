@@ -10,15 +10,15 @@ use crate::error::{Error, Result, ShowPath};
 use crate::files::atomic::{Kind, Replace, StagedFile, check_target};
 use crate::limits::Limits;
 use crate::memory_plan::ResourceEstimate;
-use crate::model::{Camera, Picture, Rig, Shot};
+use crate::model::{Camera, FrameView, Rig, Shot};
 use crate::outputs::film::{FilmFormat, FilmOutput};
-use crate::passes::{Batch, Subject, ViewStates, show};
+use crate::passes::{Batch, RenderedSource, ViewStates, show};
 use crate::progress::Events;
 use crate::render::Image;
 use crate::scene::open_compressed;
 use crate::scene::path::along;
-use crate::scene::pictures::{self, PictureSet, background};
-use crate::scene::{InputOptions, Opened, open_input, scene_of};
+use crate::scene::pictures::{self, ViewSet, background};
+use crate::scene::{InputOptions, OpenedInput, from_input, open_input};
 
 /// What rendering a film is called.
 const NAME: &str = "render";
@@ -44,7 +44,7 @@ pub struct VideoOptions {
     /// From where.
     pub way: FilmPath,
     /// Part of the cameras' pictures whose views count.
-    pub part: PictureSet,
+    pub part: ViewSet,
     /// Frames per second, at least 1.
     pub fps: u32,
     /// Red, green, blue in [0, 1]; none: see [`background`].
@@ -84,7 +84,7 @@ pub fn video(options: &VideoOptions) -> Result<Filmed> {
 
     let mut opened = open_input(&InputOptions { split: None, ..options.input.clone() })?;
     let own = own_shots(&mut opened, options.input.frames.is_some());
-    let mut scene = scene_of(opened, &InputOptions { split: None, ..options.input.clone() })?;
+    let mut scene = from_input(opened, &InputOptions { split: None, ..options.input.clone() })?;
     let beside = options.beside.as_deref().map(|path| open_compressed(path, &scene, &options.input)).transpose()?;
     let models = 1 + u64::from(beside.is_some());
     scene.keep_to(options.input.memory, |work, limits: &Limits| -> Vec<ResourceEstimate> {
@@ -104,8 +104,8 @@ pub fn video(options: &VideoOptions) -> Result<Filmed> {
     let shown =
         FilmSource { cameras: &cameras, pictures: &pictures, limits: &scene.limits, background, events: &scene.events };
     match &beside {
-        None => shown.film([Subject::all(scene.source())], &mut film)?,
-        Some(other) => shown.film([scene.source(), other.source()].map(Subject::all), &mut film)?,
+        None => shown.film([RenderedSource::all(scene.source())], &mut film)?,
+        Some(other) => shown.film([scene.source(), other.source()].map(RenderedSource::all), &mut film)?,
     }
     film.finish()?;
     staged.commit()?;
@@ -113,7 +113,7 @@ pub fn video(options: &VideoOptions) -> Result<Filmed> {
 }
 
 /// The shots with their times, where the frames are none of theirs: every camera may then look at every frame.
-fn own_shots(opened: &mut Opened, are_others: bool) -> Option<Vec<Shot>> {
+fn own_shots(opened: &mut OpenedInput, are_others: bool) -> Option<Vec<Shot>> {
     let rig = opened.rig.as_mut().filter(|_| are_others)?;
     let own = rig.shots.clone();
     rig.shots.iter_mut().for_each(|shot| shot.time = None);
@@ -121,7 +121,7 @@ fn own_shots(opened: &mut Opened, are_others: bool) -> Option<Vec<Shot>> {
 }
 
 /// The shots of `part`, by view, then time, those without one first.
-fn shots(all: &[Shot], rig: &Rig, part: PictureSet) -> Result<Vec<Shot>> {
+fn shots(all: &[Shot], rig: &Rig, part: ViewSet) -> Result<Vec<Shot>> {
     let split = part.split(rig);
     let mut found: Vec<Shot> =
         all.iter().filter(|shot| split.is_none_or(|split| split == shot.split)).cloned().collect();
@@ -134,7 +134,7 @@ fn shots(all: &[Shot], rig: &Rig, part: PictureSet) -> Result<Vec<Shot>> {
 }
 
 /// The cameras of the film and its pictures, one after the other.
-fn plan(way: &FilmPath, shots: &[Shot], rig: &Rig, times: &[f64]) -> Result<(Vec<Camera>, Vec<Picture>)> {
+fn plan(way: &FilmPath, shots: &[Shot], rig: &Rig, times: &[f64]) -> Result<(Vec<Camera>, Vec<FrameView>)> {
     match way {
         FilmPath::View(view) => {
             let view = view.unwrap_or_else(|| shots.first().map_or(0, |shot| shot.view));
@@ -142,7 +142,7 @@ fn plan(way: &FilmPath, shots: &[Shot], rig: &Rig, times: &[f64]) -> Result<(Vec
             let away = |shot: &Shot, time: f64| shot.time.map_or(0.0, |at| (at - time).abs());
             let nearest = |time: f64| own.iter().min_by(|a, b| away(a, time).total_cmp(&away(b, time)));
             let camera = |&time: &f64| nearest(time).map_or(0, |shot| shot.camera);
-            let picture = |(frame, time)| Picture { frame, view, camera: camera(time) };
+            let picture = |(frame, time)| FrameView { frame, view, camera: camera(time) };
             Ok((rig.cameras.clone(), times.iter().enumerate().map(picture).collect()))
         }
         FilmPath::Path(views) => {
@@ -160,7 +160,7 @@ fn plan(way: &FilmPath, shots: &[Shot], rig: &Rig, times: &[f64]) -> Result<(Vec
             let stops = views.iter().map(stop).collect::<Result<Vec<Camera>>>()?;
             one_size(&stops)?;
             let count = if times.len() > 1 { times.len() } else { STEPS * (stops.len() - 1) + 1 };
-            let picture = |k: usize| Picture { frame: k.min(times.len() - 1), view: 0, camera: k as u32 };
+            let picture = |k: usize| FrameView { frame: k.min(times.len() - 1), view: 0, camera: k as u32 };
             Ok((along(&stops, count), (0..count).map(picture).collect()))
         }
     }
@@ -192,14 +192,14 @@ fn one_size(cameras: &[Camera]) -> Result<(u32, u32)> {
 /// What a film shows.
 struct FilmSource<'a> {
     cameras: &'a [Camera],
-    pictures: &'a [Picture],
+    pictures: &'a [FrameView],
     limits: &'a Limits,
     background: [f32; 3],
     events: &'a Events,
 }
 
 impl FilmSource<'_> {
-    fn film<const S: usize>(&self, subjects: [Subject<'_>; S], film: &mut FilmOutput) -> Result<()> {
+    fn film<const S: usize>(&self, subjects: [RenderedSource<'_>; S], film: &mut FilmOutput) -> Result<()> {
         let progress = self.events.task(NAME, "frames", self.pictures.len() as u64);
         show(subjects, self.cameras, self.pictures, Batch::of_frame(self.limits), |views| {
             let made: Vec<Image> = views

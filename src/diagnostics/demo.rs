@@ -16,7 +16,7 @@ use crate::outputs::kind::OutputKind;
 use crate::outputs::kind::check_folder_name;
 use crate::pipeline::summary::Detail;
 use crate::pipeline::summary::Summary;
-use crate::pipeline::{Request, Target, compress_scene, keep_to_budget};
+use crate::pipeline::{Request, Target, compress_scene, set_limits_within_budget};
 use crate::progress::Events;
 use crate::recipe::Recipe;
 use crate::scene::{InputOptions, Scene};
@@ -86,7 +86,7 @@ fn run_in(folder: &Path, options: &DemoOptions) -> Result<DemoReport> {
         target: Some(options.kept),
         ..Request::new(input_options, folder.join("compressed.gseq"), options.recipe.clone())
     };
-    keep_to_budget(&mut scene, &request)?;
+    set_limits_within_budget(&mut scene, &request)?;
     let (mut summary, map) = compress_scene(&scene, &request)?;
     // The path is temporary, so it is not reported.
     summary.output.clear();

@@ -12,7 +12,7 @@ use crate::evaluation::{EvaluateOptions, evaluate_whole};
 use crate::files::atomic::Replace;
 use crate::model::Split;
 use crate::pipeline::{Request, Target, compress};
-use crate::scene::pictures::PictureSet;
+use crate::scene::pictures::ViewSet;
 use crate::scene::{InputOptions, Scene};
 
 /// Settings shared by all runs that are compared with one another.
@@ -71,7 +71,7 @@ impl WholeRun<'_> {
             original: with_training_views(self.input),
             compressed: result.to_owned(),
             ground_truth: None,
-            part: PictureSet::HeldOut,
+            part: ViewSet::HeldOut,
             max_frames: self.max_frames,
             max_views: None,
             background: self.background,

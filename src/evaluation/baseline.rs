@@ -7,7 +7,7 @@ use crate::compressed_model::CompressedModel;
 use crate::error::Result;
 use crate::limits::Limits;
 use crate::model::hash_id;
-use crate::model::{Columns, Gaussians};
+use crate::model::{Attributes, Gaussians};
 use crate::outputs::kind::OutputKind;
 use crate::passes::gather;
 use crate::pipeline::Target;
@@ -40,7 +40,7 @@ pub fn prune_by(baseline: Baseline, options: &InputOptions, target: Option<Targe
     let state = match scene.input.canonical() {
         Some(canonical) => canonical.clone(),
         None if count == 0 => Gaussians::default(),
-        None => gather(source, &ids, 0, Columns::OPACITY | Columns::LOG_SCALE)?,
+        None => gather(source, &ids, 0, Attributes::OPACITY | Attributes::LOG_SCALE)?,
     };
     let kept = best(baseline, &state, ids, wanted);
     let kind = OutputKind::from_path(output, None, scene.input.own_output());

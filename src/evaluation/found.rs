@@ -240,7 +240,7 @@ impl Evaluation {
             "{}: {compressed} Gaussians ({percent:.1}%); bytes: {}: {}",
             Path::new(&self.path.compressed).shown(),
             compared(after.whole(), before.whole()),
-            after.parts_of(&before)
+            after.format_relative_to(&before)
         );
         let frames = self.loss.per_frame.len();
         let _ = writeln!(out, "{} pictures of {frames} frames: {}", self.cameras.pairs, self.cameras.origin);

@@ -4,7 +4,7 @@
 use super::baseline::Baseline;
 use crate::error::{Error, Result};
 use crate::pipeline::Only;
-use crate::recipe::{Coverage, Precision, Recipe, StaticTerm, WhichBands};
+use crate::recipe::{Coverage, Precision, Recipe, ShDegreeRule, StaticTerm};
 
 /// A way to make a model smaller.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -77,7 +77,7 @@ impl Method {
             let mut recipe = unrefined()?;
             // Pruning and nothing else.
             recipe.field.field = Precision::Exact;
-            recipe.bands.bands = WhichBands::All;
+            recipe.bands.bands = ShDegreeRule::All;
             recipe.scan.coverage = coverage;
             recipe.score.static_term = StaticTerm::Mean;
             // S = C without clipping, so that no two Gaussians tie that differ in C.

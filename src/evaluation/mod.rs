@@ -28,14 +28,14 @@ use crate::files::atomic::{Kind, Replace, StagedFile, check_target};
 use crate::limits::Limits;
 use crate::memory_plan::{Budget, Plan, ResourceEstimate, Workload};
 use crate::metrics::{self, flip, psnr, ssim, temporal_error};
-use crate::model::{Camera, Gaussians, Picture};
+use crate::model::{Camera, FrameView, Gaussians};
 use crate::models::InputModel;
-use crate::passes::{Batch, Subject, ViewStates, show};
+use crate::passes::{Batch, RenderedSource, ViewStates, show};
 use crate::pipeline::stages::quality::render_times;
 use crate::pipeline::summary::CameraSummary;
 use crate::render::Image;
 use crate::scene::photographs::Photographs;
-use crate::scene::pictures::{self, PictureSet, background, pictures, spread_views, thin};
+use crate::scene::pictures::{self, ViewSet, background, pictures, spread_views, thin};
 use crate::scene::{InputOptions, Scene, open_compressed, open_scene};
 
 /// What comparing pictures is called.
@@ -51,7 +51,7 @@ pub struct EvaluateOptions {
     /// Folder of photographs.
     pub ground_truth: Option<PathBuf>,
     /// Part of the cameras' pictures to compare.
-    pub part: PictureSet,
+    pub part: ViewSet,
     /// Compare at most this many frames, evenly; none: all.
     pub max_frames: Option<usize>,
     /// Maximum number of views, spread over frames and cameras; `None`: all.
@@ -123,7 +123,7 @@ pub struct ModelPair {
     compressed_as: InputOptions,
     background: [f32; 3],
     flip: bool,
-    pictures: Vec<Picture>,
+    pictures: Vec<FrameView>,
     truth_folder: Option<PathBuf>,
     truth: Option<Photographs>,
 }
@@ -190,7 +190,7 @@ impl ModelPair {
     /// A source or a photograph that cannot be read; those of the work folder.
     pub fn evaluate(&self) -> Result<Evaluation> {
         let evaluation = self.compare()?;
-        self.scene.work.not_divided("averaging")?;
+        self.scene.work.end_shard_before("averaging")?;
         Ok(evaluation)
     }
 
@@ -262,7 +262,7 @@ impl ModelPair {
     /// What the scores of all pictures say.
     fn evaluation(&self, scores: Vec<PairScores>) -> Result<Evaluation> {
         let times = &self.scene.source().info().times;
-        let of_picture = |(&Picture { frame, view, .. }, (loss, truth))| PictureScores {
+        let of_picture = |(&FrameView { frame, view, .. }, (loss, truth))| PictureScores {
             frame,
             time: times[frame],
             view,
@@ -330,7 +330,7 @@ impl ModelPair {
         let mut places = places.to_vec();
         places.sort_unstable();
         places.dedup();
-        let chosen: Vec<Picture> = places.iter().map(|&place| self.pictures[place]).collect();
+        let chosen: Vec<FrameView> = places.iter().map(|&place| self.pictures[place]).collect();
         let mut found = Vec::with_capacity(chosen.len());
         self.show(&chosen, |views| {
             for view in views {
@@ -342,7 +342,7 @@ impl ModelPair {
     }
 
     /// That of the number `place` among [`Evaluation::pictures`].
-    pub fn picture(&self, place: usize) -> Picture {
+    pub fn picture(&self, place: usize) -> FrameView {
         self.pictures[place]
     }
 
@@ -350,7 +350,11 @@ impl ModelPair {
     ///
     /// # Errors
     /// A source that cannot be read; those of `see`.
-    pub fn both<O: Send>(&self, pictures: &[Picture], see: impl Fn([&Image; 2]) -> Result<O> + Sync) -> Result<Vec<O>> {
+    pub fn both<O: Send>(
+        &self,
+        pictures: &[FrameView],
+        see: impl Fn([&Image; 2]) -> Result<O> + Sync,
+    ) -> Result<Vec<O>> {
         let mut found = Vec::with_capacity(pictures.len());
         self.show(pictures, |views| {
             let of = |view: &ViewStates<'_, 2>| {
@@ -369,8 +373,8 @@ impl ModelPair {
     }
 
     /// Shows the original and the compressed model.
-    fn show(&self, pictures: &[Picture], visit: impl FnMut(&[ViewStates<'_, 2>]) -> Result<()>) -> Result<()> {
-        let subjects = [self.scene.source(), self.compressed.source()].map(Subject::all);
+    fn show(&self, pictures: &[FrameView], visit: impl FnMut(&[ViewStates<'_, 2>]) -> Result<()>) -> Result<()> {
+        let subjects = [self.scene.source(), self.compressed.source()].map(RenderedSource::all);
         show(subjects, &self.scene.rig.cameras, pictures, Batch::of_frame(&self.scene.limits), visit)
     }
 
@@ -410,7 +414,7 @@ impl ModelPair {
                 })
                 .collect::<Result<_>>()?;
             for (shown, (taken, found)) in views.iter().zip(taken) {
-                let Picture { frame, view, .. } = shown.picture;
+                let FrameView { frame, view, .. } = shown.picture;
                 if let Some((scores, seen)) = found {
                     all.push(scores);
                     observed.push(seen);
@@ -440,9 +444,9 @@ impl ModelPair {
 }
 
 /// Of every view of `these` the last of the first `start` of `pictures`, in their order.
-fn last_before(pictures: &[Picture], start: usize, these: &[Picture]) -> Vec<Picture> {
+fn last_before(pictures: &[FrameView], start: usize, these: &[FrameView]) -> Vec<FrameView> {
     let mut views: HashSet<u32> = these.iter().map(|picture| picture.view).collect();
-    let mut last: Vec<Picture> =
+    let mut last: Vec<FrameView> =
         pictures[..start].iter().rev().filter(|picture| views.remove(&picture.view)).copied().collect();
     last.reverse();
     last

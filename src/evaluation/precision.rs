@@ -49,7 +49,7 @@ pub struct PrecisionDiagram {
 #[serde(rename_all = "lowercase")]
 pub enum Source {
     /// Something is looked at in samples or in steps.
-    Discretisation,
+    Discretization,
     /// Numbers have so many digits.
     Rounding,
     /// A smaller model stands for a larger one.
@@ -60,7 +60,7 @@ impl Source {
     /// As text has it.
     pub fn name(self) -> &'static str {
         match self {
-            Source::Discretisation => "discretisation",
+            Source::Discretization => "discretisation",
             Source::Rounding => "rounding",
             Source::Model => "model",
         }
@@ -369,7 +369,7 @@ mod tests {
         let knob = PrecisionKnob {
             name: "percentiles".to_owned(),
             about: String::new(),
-            source: Source::Discretisation,
+            source: Source::Discretization,
             curves: vec![curve],
         };
         let found = PrecisionDiagram {

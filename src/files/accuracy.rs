@@ -15,7 +15,7 @@
 //! change it. Distances are maxima over the three axes.
 
 use crate::error::{Error, Result};
-use crate::model::{Column, Gaussians, color, opacity};
+use crate::model::{AttributeValues, Gaussians, color, opacity};
 
 /// Maximum error of a position, as a fraction of the median of the Gaussian's three scales.
 const MAX_POSITION_ERROR_IN_SCALES: f64 = 0.5;
@@ -32,7 +32,7 @@ const MIN_OPACITY: f64 = 1.0 / 255.0;
 
 /// Attributes of one Gaussian as a renderer uses them.
 #[derive(Debug, Clone, Copy)]
-pub struct Drawn {
+pub struct RenderedAttributes {
     /// Position in scene units.
     pub position: [f64; 3],
     /// Standard deviations along the three axes, in scene units.
@@ -43,10 +43,10 @@ pub struct Drawn {
     pub color: [f64; 3],
 }
 
-impl Drawn {
+impl RenderedAttributes {
     /// Returns the attributes of row `row` of `state` after activation.
-    pub fn of_state(state: &Gaussians, row: usize) -> Drawn {
-        Drawn {
+    pub fn of_state(state: &Gaussians, row: usize) -> RenderedAttributes {
+        RenderedAttributes {
             position: state.position.row::<3>(row).map(f64::from),
             scale: state.log_scale.row::<3>(row).map(|scale| f64::from(scale).exp()),
             opacity: opacity(state.opacity_logit.row::<1>(row)[0]),
@@ -86,7 +86,7 @@ pub struct Accuracy {
 
 impl Accuracy {
     /// Starts without errors for a file of Gaussians at `positions`.
-    pub fn new(positions: &Column) -> Accuracy {
+    pub fn new(positions: &AttributeValues) -> Accuracy {
         let count = positions.len();
         let axis = |axis: usize| positions.plane(axis).iter().map(|&x| f64::from(x));
         let middle = [0, 1, 2].map(|k| median(axis(k).collect()));
@@ -105,7 +105,7 @@ impl Accuracy {
     }
 
     /// Adds Gaussian `id` with its original attributes `wanted` and its stored ones `found`.
-    pub fn add(&mut self, id: usize, wanted: &Drawn, found: &Drawn) {
+    pub fn add(&mut self, id: usize, wanted: &RenderedAttributes, found: &RenderedAttributes) {
         if wanted.opacity < MIN_OPACITY && found.opacity < MIN_OPACITY {
             return;
         }
@@ -183,13 +183,13 @@ fn median(mut values: Vec<f64>) -> f64 {
 mod tests {
     use super::*;
 
-    fn drawn(x: f64, scale: f64) -> Drawn {
-        Drawn { position: [x, 0.0, 0.0], scale: [scale; 3], opacity: 0.5, color: [0.5; 3] }
+    fn drawn(x: f64, scale: f64) -> RenderedAttributes {
+        RenderedAttributes { position: [x, 0.0, 0.0], scale: [scale; 3], opacity: 0.5, color: [0.5; 3] }
     }
 
     /// Returns the accuracy of five Gaussians at distances of 2 from one another and one far away. The scene size is 2.
     fn accuracy() -> Accuracy {
-        let mut positions = Column::zeros(3, 6);
+        let mut positions = AttributeValues::zeros(3, 6);
         positions.plane_mut(0).copy_from_slice(&[0.0, 2.0, 4.0, 6.0, 8.0, 1e7]);
         Accuracy::new(&positions)
     }
@@ -220,11 +220,11 @@ mod tests {
     fn scales_opacities_colors_and_nan_have_bounds() {
         let wanted = drawn(0.0, 1.0);
         for (found, quantity) in [
-            (Drawn { scale: [1.0, 1.0, 1.11], ..wanted }, "scale"),
-            (Drawn { opacity: 0.53, ..wanted }, "opacity"),
-            (Drawn { color: [0.5, 0.53, 0.5], ..wanted }, "color"),
-            (Drawn { position: [0.0, f64::NAN, 0.0], ..wanted }, "position"),
-            (Drawn { opacity: f64::NAN, ..wanted }, "opacity"),
+            (RenderedAttributes { scale: [1.0, 1.0, 1.11], ..wanted }, "scale"),
+            (RenderedAttributes { opacity: 0.53, ..wanted }, "opacity"),
+            (RenderedAttributes { color: [0.5, 0.53, 0.5], ..wanted }, "color"),
+            (RenderedAttributes { position: [0.0, f64::NAN, 0.0], ..wanted }, "position"),
+            (RenderedAttributes { opacity: f64::NAN, ..wanted }, "opacity"),
         ] {
             let mut accuracy = accuracy();
             accuracy.add(3, &wanted, &found);
@@ -232,10 +232,10 @@ mod tests {
             assert!(message.contains(&format!("the {quantity} of Gaussian 3")), "{message}");
         }
         let mut accuracy = accuracy();
-        let color = |value: f64| Drawn { color: [value; 3], ..wanted };
+        let color = |value: f64| RenderedAttributes { color: [value; 3], ..wanted };
         accuracy.add(0, &color(7.0), &color(1.0));
-        let unseen = Drawn { opacity: 0.0, ..wanted };
-        accuracy.add(0, &unseen, &Drawn { position: [9.0; 3], ..unseen });
+        let unseen = RenderedAttributes { opacity: 0.0, ..wanted };
+        accuracy.add(0, &unseen, &RenderedAttributes { position: [9.0; 3], ..unseen });
         accuracy.check("a file").unwrap();
     }
 }

@@ -321,7 +321,7 @@ impl ScratchFolder {
 }
 
 /// Replaces the path of a hidden workspace in a system error by the output path that the user gave.
-pub fn as_named(error: Error) -> Error {
+pub fn with_user_path(error: Error) -> Error {
     let (action, path, source) = match error {
         Error::Io { action, path, source } | Error::Container(gseq::Error::Io { action, path, source }) => {
             (action, path, source)

@@ -140,12 +140,12 @@ pub(crate) struct TensorView {
     pub(crate) shape: Vec<usize>,
     pub(crate) stride: Vec<usize>,
     pub(crate) offset: usize,
-    pub(crate) places: Places,
+    pub(crate) places: NumberRanges,
 }
 
 /// Byte ranges in the pickle of the numbers that describe a tensor.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Places {
+pub(crate) struct NumberRanges {
     /// Number of values of its storage.
     pub(crate) numel: Range<usize>,
     pub(crate) offset: Range<usize>,
@@ -319,7 +319,7 @@ impl Checkpoint {
             shape,
             stride,
             offset,
-            places: Places { numel, offset: offset_at, shape: shape_at, stride: stride_at },
+            places: NumberRanges { numel, offset: offset_at, shape: shape_at, stride: stride_at },
         })
     }
 
@@ -382,7 +382,7 @@ impl Checkpoint {
     }
 
     /// Returns the maximum number of elements that all tensors of a storage may have together.
-    pub(crate) fn most_values(&self, key: &str, kind: ValueType) -> usize {
+    pub(crate) fn max_values(&self, key: &str, kind: ValueType) -> usize {
         self.storages.get(key).map_or(0, |&(_, bytes)| (bytes / kind.bytes()).saturating_mul(MAX_EXPANSION))
     }
 

@@ -25,7 +25,7 @@ use std::ops::Range;
 pub use self::store::Container;
 use self::tiles::TileReader;
 use crate::error::Result;
-use crate::model::{Columns, SequenceInfo};
+use crate::model::{Attributes, SequenceInfo};
 use crate::source::{BlockReader, FrameSource, Ids, Prefetch, Reads};
 
 /// Number of offsets of the file that are tested to find out whether it is in the page cache.
@@ -59,7 +59,7 @@ impl Prefetch for Container {
         self.reader.layout().frame_block as usize
     }
 
-    fn fetch(&self, gaussians: Range<usize>, frames: Range<usize>, want: Columns) {
+    fn fetch(&self, gaussians: Range<usize>, frames: Range<usize>, want: Attributes) {
         if gaussians.is_empty() || frames.is_empty() {
             return;
         }

@@ -2,9 +2,9 @@
 
 use std::path::Path;
 
-use super::json::lists::{Ask, each_in};
+use super::json::lists::{ListSelection, each_element_from};
 use super::json::small::{Keep, MAX_ELEMENTS};
-use super::json::{Stopped, read_from};
+use super::json::{ParseAbort, read_from};
 use super::pickle::Pickle;
 use crate::error::Result;
 
@@ -25,11 +25,11 @@ pub fn pickle(bytes: &[u8], memory: u64) -> Option<usize> {
 pub fn cameras_json(bytes: &[u8]) -> Result<usize> {
     let path = Path::new("cameras.json");
     let keep = Keep { wanted: &["frames", "w2c", "transform_matrix"], elements: MAX_ELEMENTS };
-    let outline = read_from(bytes, path, &Stopped::default(), keep)?;
+    let outline = read_from(bytes, path, &ParseAbort::default(), keep)?;
     let mut found = outline.describe().len().min(1);
     let wanted = &["w2c", "transform_matrix", "time"];
     for (keys, nested) in [(&[][..], false), (&["frames"][..], false), (&["k", "w2c"][..], true)] {
-        each_in(bytes, path, Ask { keys, nested, wanted }, |_, value| {
+        each_element_from(bytes, path, ListSelection { keys, nested, wanted }, |_, value| {
             found += value.describe().len().min(1);
             Ok(())
         })?;

@@ -23,9 +23,9 @@ use checked::CheckedReader;
 
 /// Error of a seed, kept here while the parser unwinds because the parser's own error type cannot hold it.
 #[derive(Debug, Default)]
-pub(crate) struct Stopped(RefCell<Option<Error>>);
+pub(crate) struct ParseAbort(RefCell<Option<Error>>);
 
-impl Stopped {
+impl ParseAbort {
     /// Stores `error` and returns the parser error that ends the reading.
     pub(crate) fn by<E: serde::de::Error>(&self, error: Error) -> E {
         *self.0.borrow_mut() = Some(error);
@@ -40,7 +40,7 @@ impl Stopped {
 /// or a string, number or nesting exceeds the limits.
 pub(crate) fn read<T, S: for<'de> DeserializeSeed<'de, Value = T>>(
     path: &Path,
-    stopped: &Stopped,
+    stopped: &ParseAbort,
     seed: S,
 ) -> Result<T> {
     read_from(open_file(path)?, path, stopped, seed)
@@ -53,7 +53,7 @@ pub(crate) fn read<T, S: for<'de> DeserializeSeed<'de, Value = T>>(
 pub(crate) fn read_from<T, S: for<'de> DeserializeSeed<'de, Value = T>>(
     file: impl Read,
     path: &Path,
-    stopped: &Stopped,
+    stopped: &ParseAbort,
     seed: S,
 ) -> Result<T> {
     let mut text = CheckedReader::new(file, path);
@@ -78,7 +78,9 @@ pub(crate) fn read_from<T, S: for<'de> DeserializeSeed<'de, Value = T>>(
             .iter()
             .any(|word| (0..3).any(|at| around.get(at..).is_some_and(|rest| rest.starts_with(word.as_bytes()))));
         match is_number {
-            true => refused.hint("NaN and Infinity are not JSON: if a pose holds them, remove that image from the file"),
+            true => {
+                refused.hint("NaN and Infinity are not JSON: if a pose holds them, remove that image from the file")
+            }
             false => refused,
         }
     })
@@ -90,7 +92,7 @@ pub(crate) fn read_from<T, S: for<'de> DeserializeSeed<'de, Value = T>>(
 /// Fails like [`read_small`] and [`read`].
 pub(crate) fn read_json(path: &Path, most_bytes: u64) -> Result<Value> {
     let bytes = read_small(path, most_bytes, "JSON")?;
-    read_from(&bytes[..], path, &Stopped::default(), PhantomData::<Value>)
+    read_from(&bytes[..], path, &ParseAbort::default(), PhantomData::<Value>)
 }
 
 #[cfg(test)]
@@ -100,7 +102,7 @@ mod tests {
     use super::*;
 
     fn refused(bytes: &[u8]) -> String {
-        read_from(bytes, Path::new("a.json"), &Stopped::default(), PhantomData::<Value>).unwrap_err().to_string()
+        read_from(bytes, Path::new("a.json"), &ParseAbort::default(), PhantomData::<Value>).unwrap_err().to_string()
     }
 
     #[test]
@@ -126,7 +128,7 @@ mod tests {
 
     #[test]
     fn utf_8_byte_order_mark_is_skipped() {
-        let read = |bytes: &[u8]| read_from(bytes, Path::new("a"), &Stopped::default(), PhantomData::<Value>);
+        let read = |bytes: &[u8]| read_from(bytes, Path::new("a"), &ParseAbort::default(), PhantomData::<Value>);
         assert_eq!(read(b"\xef\xbb\xbf{\"a\": 1}").unwrap()["a"], 1);
         assert!(refused(b"\xef\xbb\xbf\"\xe9").contains("byte 4"));
     }
@@ -134,7 +136,7 @@ mod tests {
     #[test]
     fn values_equal_those_of_serde_json() {
         let text = r#" {"a\n\u00e9\ud83d\ude00": [1, -2.5e3, true, null, "\"[{\\", {}], "größe": [[[]]], "b": 18446744073709551615} "#;
-        let read = read_from(text.as_bytes(), Path::new("a"), &Stopped::default(), PhantomData::<Value>).unwrap();
+        let read = read_from(text.as_bytes(), Path::new("a"), &ParseAbort::default(), PhantomData::<Value>).unwrap();
         assert_eq!(read, serde_json::from_str::<Value>(text).unwrap());
     }
 
@@ -155,7 +157,7 @@ mod tests {
             (&deep, "nested at most"),
         ] {
             let ignored =
-                read_from(text.as_bytes(), Path::new("a.json"), &Stopped::default(), PhantomData::<IgnoredAny>);
+                read_from(text.as_bytes(), Path::new("a.json"), &ParseAbort::default(), PhantomData::<IgnoredAny>);
             for message in [refused(text.as_bytes()), ignored.unwrap_err().to_string()] {
                 assert!(message.contains(expected) && message.contains("byte"), "{expected:?} is not in {message:?}");
             }

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use super::ply::{Ply, PlyOptions, check_ids};
 use super::ply_frames::PlyFrames;
 use crate::error::{Error, Result, ShowPath};
-use crate::model::{Columns, Gaussians, SequenceInfo};
+use crate::model::{Attributes, Gaussians, SequenceInfo};
 use crate::source::{BlockReader, Count, FrameSource, Ids, Reads};
 
 /// PLY files of the same Gaussians, one per frame.
@@ -55,7 +55,7 @@ impl PlySequence {
             count: frames.counts()[0] as usize,
             times: frames.times(),
             sh_degree: frames.sh_degree(),
-            varying: if frames.paths().len() == 1 { Columns::empty() } else { Columns::all() },
+            varying: if frames.paths().len() == 1 { Attributes::empty() } else { Attributes::all() },
         };
         let (bytes, states) = (Count::default(), Count::default());
         Ok(PlySequence { frames, info, note: None, bytes, states })
@@ -125,9 +125,9 @@ struct PlyBlock<'a> {
 }
 
 impl BlockReader for PlyBlock<'_> {
-    fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
+    fn read(&mut self, frame: usize, want: Attributes, out: &mut Gaussians) -> Result<()> {
         let (ply, ids) = (self.sequence.frame(frame)?, self.ids.borrow());
-        self.sequence.bytes.add(ply.bytes_of(ids.len()));
+        self.sequence.bytes.add(ply.bytes_read_for(ids.len()));
         self.sequence.states.add(ids.len() as u64);
         ply.gather(&ids, want, out)
     }

@@ -56,7 +56,7 @@ pub struct SplatvGaussian {
 
 impl SplatvGaussian {
     /// Decodes a Gaussian from its words.
-    pub fn of_words(words: &[u32; WORDS]) -> SplatvGaussian {
+    pub fn from_words(words: &[u32; WORDS]) -> SplatvGaussian {
         let half = |at: usize, high: usize| f16::from_bits((words[at] >> (16 * high)) as u16).to_f32();
         let halves = |first: usize, k: usize| half(first + k / 2, k % 2);
         let byte = |k: usize| f64::from((words[7] >> (8 * k)) & 0xff) / 255.0;

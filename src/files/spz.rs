@@ -19,7 +19,7 @@ use std::path::Path;
 
 use flate2::{Compression, GzBuilder};
 
-use super::accuracy::{Accuracy, Drawn};
+use super::accuracy::{Accuracy, RenderedAttributes};
 use crate::error::{Error, Result, ShowPath};
 use crate::model::{Gaussians, color, opacity};
 
@@ -103,9 +103,9 @@ pub fn write_spz(state: &Gaussians, path: &Path) -> Result<f64> {
 fn check_accuracy(state: &Gaussians, unit: f64) -> Result<f64> {
     let mut accuracy = Accuracy::new(&state.position);
     for row in 0..state.len() {
-        let wanted = Drawn::of_state(state, row);
+        let wanted = RenderedAttributes::of_state(state, row);
         let color = |dc: f32| color(((f64::from(color_byte(dc)) / 255.0 - 0.5) / 0.15) as f32);
-        let found = Drawn {
+        let found = RenderedAttributes {
             position: wanted.position.map(|x| f64::from(fixed(x, unit)) * unit),
             scale: state.log_scale.row::<3>(row).map(|scale| (f64::from(scale_byte(scale)) / 16.0 - 10.0).exp()),
             opacity: f64::from(opacity_byte(state.opacity_logit.row::<1>(row)[0])) / 255.0,
@@ -177,7 +177,7 @@ mod tests {
 
     use super::*;
     use crate::diagnostics::demo_scene::Scene;
-    use crate::model::Columns;
+    use crate::model::Attributes;
     use crate::passes::gather_all;
 
     /// Position, opacity, color, scales, rotation wxyz and SH coefficients of a Gaussian.
@@ -229,8 +229,8 @@ mod tests {
 
     #[test]
     fn independent_reader_finds_the_written_values() {
-        let mut state = gather_all(&Scene::new(300, 1), 0, Columns::all()).unwrap();
-        state.sh = crate::model::Column::zeros(48, 300);
+        let mut state = gather_all(&Scene::new(300, 1), 0, Attributes::all()).unwrap();
+        state.sh = crate::model::AttributeValues::zeros(48, 300);
         state.sh.planes_mut().iter_mut().enumerate().for_each(|(k, x)| *x = (k as f32 * 0.618_034).fract() - 0.5);
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.spz");

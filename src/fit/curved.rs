@@ -9,7 +9,7 @@
 //! 1974).
 
 use super::least_squares::polynomial;
-use super::{FittedTrack, Misfit, SEEN, Tolerance};
+use super::{FittedTrack, MIN_VISIBLE_OPACITY, Misfit, Tolerance};
 
 /// Curve of a Gaussian with cubic motion under a window in time.
 #[derive(Debug, Clone, PartialEq)]
@@ -77,7 +77,7 @@ pub fn curved(track: &FittedTrack, tolerance: &Tolerance, misfit: &mut Misfit) -
     }
     let (_, curves, found) = best.unwrap_or_default();
     *misfit = misfit.and(found);
-    curves.into_iter().filter(|curve| curve.opacity >= SEEN).collect()
+    curves.into_iter().filter(|curve| curve.opacity >= MIN_VISIBLE_OPACITY).collect()
 }
 
 fn window(time: f64, center: f64, width: f64) -> f64 {
@@ -168,7 +168,7 @@ fn fit_motion(track: &FittedTrack, center: f64, width: f64, weight: impl Fn(usiz
     let weight = |frame: usize| if track.is_seen(frame) { weight(frame) * track.opacity[frame] } else { 0.0 };
     let samples: Vec<(usize, f64)> = (0..track.len())
         .map(|frame| (frame, weight(frame)))
-        .filter(|(_, weight)| *weight > MIN_WEIGHT * SEEN)
+        .filter(|(_, weight)| *weight > MIN_WEIGHT * MIN_VISIBLE_OPACITY)
         .collect();
     let reach = samples.iter().map(|&(frame, _)| (track.times[frame] - center).abs()).fold(1e-9, f64::max);
     let scaled = |frame: usize| (track.times[frame] - center) / reach;
@@ -203,7 +203,7 @@ fn measure_misfit(track: &FittedTrack, curves: &[CubicTrack], tolerance: &Tolera
         for curve in curves {
             let share = depth(curve.opacity_at(time));
             shown += share;
-            if curve.opacity_at(time) < SEEN {
+            if curve.opacity_at(time) < MIN_VISIBLE_OPACITY {
                 continue;
             }
             let dt = time - curve.center;
@@ -220,11 +220,11 @@ fn measure_misfit(track: &FittedTrack, curves: &[CubicTrack], tolerance: &Tolera
             ]
             .into_iter()
             // A curve that is hardly visible need not be as close.
-            .map(|excess| excess * (share / depth(track.opacity[frame]).max(SEEN)).min(1.0))
+            .map(|excess| excess * (share / depth(track.opacity[frame]).max(MIN_VISIBLE_OPACITY)).min(1.0))
             .fold(worst, f64::max);
         }
         let apart = 1.0 - (-shown).exp() - track.opacity[frame];
-        if track.is_seen(frame) || apart > SEEN {
+        if track.is_seen(frame) || apart > MIN_VISIBLE_OPACITY {
             worst = worst.max(apart.abs() / tolerance.opacity);
             misfit.add(if shown > 0.0 { away / shown } else { 0.0 }, apart);
         }

@@ -11,7 +11,7 @@ mod track;
 pub use curved::{CubicTrack, curved};
 pub(crate) use least_squares::polynomial;
 pub use straight::{LinearPiece, straight};
-pub use track::{FittedTrack, SEEN};
+pub use track::{FittedTrack, MIN_VISIBLE_OPACITY};
 
 /// Maximum error of a fit at every frame where the Gaussian is visible.
 #[derive(Debug, Clone, Copy, PartialEq)]

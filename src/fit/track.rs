@@ -3,7 +3,7 @@
 use crate::model::{Gaussians, opacity};
 
 /// Opacity below which a Gaussian is not drawn (1/255). Fits ignore frames below it.
-pub const SEEN: f64 = 1.0 / 255.0;
+pub const MIN_VISIBLE_OPACITY: f64 = 1.0 / 255.0;
 
 /// States of one Gaussian at all frames.
 #[derive(Debug, Clone, Default)]
@@ -65,7 +65,7 @@ impl FittedTrack {
     /// Returns whether the Gaussian is visible at `frame` and its values are finite.
     pub fn is_seen(&self, frame: usize) -> bool {
         let finite = |values: &[f64]| values.iter().all(|x| x.is_finite());
-        self.opacity[frame] >= SEEN && finite(&self.position[frame]) && finite(&self.log_scale[frame])
+        self.opacity[frame] >= MIN_VISIBLE_OPACITY && finite(&self.position[frame]) && finite(&self.log_scale[frame])
     }
 
     /// Returns the SH coefficients at `frame`.

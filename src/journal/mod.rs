@@ -97,7 +97,7 @@ impl Journal {
     ///
     /// # Errors
     /// Fails if `compute` fails or the cache cannot be used. A run of a single shard ends before the stage.
-    pub fn kept_stage<T: Serialize + DeserializeOwned>(
+    pub fn run_cached_stage<T: Serialize + DeserializeOwned>(
         &mut self,
         name: &'static str,
         gaussians_in: usize,
@@ -106,7 +106,7 @@ impl Journal {
         compute: impl FnOnce(&mut Journal) -> Result<(T, usize)>,
     ) -> Result<T> {
         self.kept(&scene.work, name, key, |journal| {
-            scene.work.not_divided(name)?;
+            scene.work.end_shard_before(name)?;
             journal.stage(name, gaussians_in, scene.source(), compute)
         })
     }

@@ -57,7 +57,7 @@ pub enum Saved {
         reads: f64,
     },
     /// Values that did not change and were not read again.
-    Values {
+    StatisticAccess {
         /// Bytes of these values.
         bytes: u64,
     },
@@ -68,7 +68,7 @@ impl Saved {
     pub fn text(self) -> String {
         match self {
             Saved::Stage { seconds, reads } => format!("about {}, {reads:.2} full reads", duration(seconds)),
-            Saved::Values { bytes } => format!("{} of values", ByteSize(bytes).display().si()),
+            Saved::StatisticAccess { bytes } => format!("{} of values", ByteSize(bytes).display().si()),
         }
     }
 }
@@ -254,7 +254,7 @@ pub struct Forecast {
 /// Percentiles of a term of the score.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct TermSummary {
-    /// Name of the term, see [`Graded::name`](crate::statistics::score::Graded::name).
+    /// Name of the term, see [`Quantity::name`](crate::statistics::score::Graded::name).
     pub name: String,
     /// 1st percentile.
     #[serde(deserialize_with = "number")]

@@ -30,7 +30,7 @@ impl ResourceEstimate {
 }
 
 /// Returns `bytes` per survivor as bytes per Gaussian of the input, if the fraction `left` of the Gaussians survives.
-pub fn of_left(left: f64, bytes: u64) -> u64 {
+pub fn bytes_of_survivors(left: f64, bytes: u64) -> u64 {
     (left * bytes as f64).ceil() as u64
 }
 

@@ -13,6 +13,8 @@ mod plan;
 mod workload;
 
 pub use budget::{Budget, Verbosity, size, taken};
-pub use estimate::{ResourceEstimate, of_left, seconds};
+pub use estimate::{ResourceEstimate, bytes_of_survivors, seconds};
 pub use plan::Plan;
-pub use workload::{LOOK, MemoryPart, PICTURE_ON_ALL_THREADS, REMOVE, RENDER, RenderCost, Throughput, Workload};
+pub use workload::{
+    LOOK, MemoryPart, REMOVE, RENDER, RenderCost, SHARED_VIEW_BYTES_PER_GAUSSIAN, Throughput, Workload,
+};

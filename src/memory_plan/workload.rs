@@ -2,7 +2,7 @@
 
 use crate::files::frame_stream::StreamHeader;
 use crate::limits::Limits;
-use crate::model::{Camera, Columns, Rig, Schedule, SequenceInfo};
+use crate::model::{Attributes, Camera, Rig, SequenceInfo, ViewSchedule};
 use crate::models::MemoryProfile;
 use crate::models::trajectories::state_bytes;
 use crate::outputs::container::{FRAME_BLOCK, GAUSSIAN_BLOCK};
@@ -23,7 +23,7 @@ const PER_FRAME: u64 = 8 + 8 + 8;
 const PER_PICTURE: u64 = 24;
 
 /// Bytes per Gaussian of a view that is rendered on all threads: the data of each thread, and the same data joined.
-pub const PICTURE_ON_ALL_THREADS: u64 = 2 * render::BYTES_PER_VISIBLE as u64;
+pub const SHARED_VIEW_BYTES_PER_GAUSSIAN: u64 = 2 * render::BYTES_PER_VISIBLE as u64;
 
 /// Named part of a stage's memory, in bytes.
 pub type MemoryPart = (&'static str, u64);
@@ -38,7 +38,7 @@ pub struct Workload {
     /// SH degree.
     pub sh_degree: usize,
     /// Columns that vary in time.
-    pub varying: Columns,
+    pub varying: Attributes,
     /// Memory that the input takes while it is open.
     pub input: MemoryProfile,
     /// Number of different view numbers of the cameras.
@@ -78,13 +78,13 @@ impl Workload {
 
     /// Creates the workload of zero Gaussians.
     pub fn nothing() -> Workload {
-        let info = SequenceInfo { count: 0, times: Vec::new(), sh_degree: 0, varying: Columns::empty() };
-        Workload::new(&info, MemoryProfile::of_tiles(0))
+        let info = SequenceInfo { count: 0, times: Vec::new(), sh_degree: 0, varying: Attributes::empty() };
+        Workload::new(&info, MemoryProfile::for_tiles(0))
     }
 
     /// Adds the views of the cameras of `rig` in `schedule`.
-    pub fn seen(self, rig: &Rig, schedule: &Schedule) -> Workload {
-        self.seen_by(rig, schedule.most_views() as u64, schedule.pairs() as u64)
+    pub fn seen(self, rig: &Rig, schedule: &ViewSchedule) -> Workload {
+        self.seen_by(rig, schedule.max_views_per_frame() as u64, schedule.pairs() as u64)
     }
 
     fn seen_by(self, rig: &Rig, views: u64, pairs: u64) -> Workload {
@@ -104,7 +104,7 @@ impl Workload {
 
     /// Creates the workload of a stream whose header has arrived, with the cameras of `rig`. The stream will be packed
     /// into tiles of `frame_block` frames. `frames` is the assumed number of frames; 0: unknown.
-    pub fn of_stream(header: &StreamHeader, frame_block: usize, rig: &Rig, frames: u64) -> Workload {
+    pub fn from_stream_header(header: &StreamHeader, frame_block: usize, rig: &Rig, frames: u64) -> Workload {
         let mut times: Vec<f64> = rig.shots.iter().filter_map(|shot| shot.time).collect();
         times.sort_by(f64::total_cmp);
         let together = times.chunk_by(|a, b| a == b).map(<[f64]>::len).max().unwrap_or(0);
@@ -113,7 +113,7 @@ impl Workload {
         let pairs = if frames > 0 { timeless as u64 * frames + times.len() as u64 } else { 0 };
         let StreamHeader { count, sh_degree, varying, .. } = *header;
         let info = SequenceInfo { count, times: Vec::new(), sh_degree, varying };
-        let work = Workload { frames, ..Workload::new(&info, MemoryProfile::of_tiles(frame_block as u64)) };
+        let work = Workload { frames, ..Workload::new(&info, MemoryProfile::for_tiles(frame_block as u64)) };
         work.seen_by(rig, views, pairs)
     }
 
@@ -128,13 +128,13 @@ impl Workload {
     }
 
     /// Returns the bytes of one Gaussian's columns `columns`.
-    pub fn state(&self, columns: Columns) -> u64 {
+    pub fn state(&self, columns: Attributes) -> u64 {
         state_bytes(self.sh_degree, columns)
     }
 
     /// Returns the bytes per Gaussian of the frames that a reader of the columns `columns` keeps. A reader keeps no
     /// frames if the limit is one frame, and two frames more than the limit otherwise.
-    pub fn held(&self, limits: &Limits, columns: Columns) -> u64 {
+    pub fn held(&self, limits: &Limits, columns: Attributes) -> u64 {
         let frames = match (limits.frames_held as u64).min(self.input.frame_block) {
             0..=1 => 0,
             some => some + 2,
@@ -144,7 +144,7 @@ impl Workload {
 
     /// Returns the memory of the blocks that readers of all threads are reading, and of decoding them.
     pub fn arriving(&self) -> MemoryPart {
-        let block = self.at_most(BLOCK as u64) * (self.state(Columns::all()) + self.input.reader);
+        let block = self.at_most(BLOCK as u64) * (self.state(Attributes::all()) + self.input.reader);
         ("arriving", self.decoding() + self.threads * block)
     }
 
@@ -155,13 +155,13 @@ impl Workload {
         let gaussian_block = self.at_most(gaussian_block);
         let frame_block = self.frames_at_most(frame_block);
         let frames = |column| if self.varying.contains(column) { frame_block } else { 1 };
-        let largest = Columns::all().iter().map(|column| self.state(column) * frames(column)).max().unwrap_or(0);
+        let largest = Attributes::all().iter().map(|column| self.state(column) * frames(column)).max().unwrap_or(0);
         if frame_block == 0 { 0 } else { self.threads * 3 * gaussian_block * largest }
     }
 
     /// Returns the memory of a pass over views, per Gaussian and fixed: states of the columns `columns` that are ready,
     /// states being read, and views being rendered with `sums` bytes of accumulators per Gaussian.
-    pub fn looking(&self, limits: &Limits, columns: Columns, sums: u64) -> (Vec<MemoryPart>, Vec<MemoryPart>) {
+    pub fn looking(&self, limits: &Limits, columns: Attributes, sums: u64) -> (Vec<MemoryPart>, Vec<MemoryPart>) {
         let pictures = self.threads.min(limits.pictures_together as u64);
         let ready = VIEWS_PER_THREAD as u64 * self.threads;
         let per_gaussian = vec![
@@ -188,13 +188,13 @@ impl Workload {
     pub fn writing_together(&self, frames: usize) -> Vec<MemoryPart> {
         let varying = self.frames_at_most(frames as u64) * self.state(self.varying);
         let block =
-            self.at_most(GAUSSIAN_BLOCK as u64) * (2 * self.state(Columns::all()) + 3 * varying + self.input.reader);
+            self.at_most(GAUSSIAN_BLOCK as u64) * (2 * self.state(Attributes::all()) + 3 * varying + self.input.reader);
         vec![("blocks", 2 * self.threads * block), self.arriving(), ("index", self.written_index())]
     }
 
     /// Returns the memory that zstd takes at `level` for tiles of `frames` frames.
     pub fn compressing(&self, level: i32, frames: usize) -> MemoryPart {
-        let widest = Columns::all().iter().map(|column| self.state(column)).max().unwrap_or(0);
+        let widest = Attributes::all().iter().map(|column| self.state(column)).max().unwrap_or(0);
         ("zstd", self.threads * zstd_tables(level, (GAUSSIAN_BLOCK * frames) as u64 * widest))
     }
 
@@ -220,7 +220,12 @@ impl Workload {
 
     /// Returns the time in seconds of one processor for rendering `pictures` views of `gaussians` Gaussians at the
     /// given cost.
-    pub fn picturing(&self, pictures: f64, gaussians: f64, RenderCost { gaussian, pixel, pace }: RenderCost) -> f64 {
+    pub fn render_seconds(
+        &self,
+        pictures: f64,
+        gaussians: f64,
+        RenderCost { gaussian, pixel, pace }: RenderCost,
+    ) -> f64 {
         pace(&self.pace) * pictures * (gaussians * gaussian + self.pixels as f64 * pixel)
     }
 
@@ -248,7 +253,7 @@ impl Workload {
 
     /// Returns the bytes of the index of a container that is being written.
     fn written_index(&self) -> u64 {
-        let slots = Columns::all().iter().count() as u64 * self.gaussians.div_ceil(GAUSSIAN_BLOCK as u64);
+        let slots = Attributes::all().iter().count() as u64 * self.gaussians.div_ceil(GAUSSIAN_BLOCK as u64);
         PER_SLOT * slots + PER_WRITTEN_FRAME * self.frames
     }
 }

@@ -3,14 +3,14 @@
 //! Memory: [`KNOWN_BYTES`] per pair.
 
 /// Memory of one pair with known similarity, in bytes.
-pub const KNOWN_BYTES: usize = size_of::<Likeness>();
+pub const KNOWN_BYTES: usize = size_of::<PairSimilarity>();
 
 /// Two rows, the smaller first, and their motion similarity ([`super::motion::MotionGate::likeness`]).
-pub type Likeness = (u32, u32, f64);
+pub type PairSimilarity = (u32, u32, f64);
 
 /// Motion similarities of pairs of rows, sorted by pair.
 #[derive(Debug, Default)]
-pub struct KnownPairs(Vec<Likeness>);
+pub struct KnownPairs(Vec<PairSimilarity>);
 
 impl KnownPairs {
     /// Returns the pairs of `pairs` whose similarity is not known yet: the smaller row first, increasing, without
@@ -24,7 +24,7 @@ impl KnownPairs {
     }
 
     /// Creates the cache from measured pairs, in any order, without duplicates.
-    pub fn new(mut found: Vec<Likeness>) -> Self {
+    pub fn new(mut found: Vec<PairSimilarity>) -> Self {
         found.sort_unstable_by_key(|&(a, b, _)| (a, b));
         KnownPairs(found)
     }

@@ -11,14 +11,14 @@ use rayon::prelude::*;
 
 use crate::error::Result;
 use crate::merging::proxy::{ProxyState, merge_state};
-use crate::model::{Columns, Gaussians, SequenceInfo};
+use crate::model::{Attributes, Gaussians, SequenceInfo};
 use crate::passes::FrameReaders;
 use crate::recipe::{MergeParams, Placement};
 use crate::source::{BlockReader, FrameSource, Ids, ReadPlan, Reads};
 
 /// Attributes that depend on each other in a proxy: moments mix position, rotation and scale, and opacity depends on
 /// areas.
-const MIXED: Columns = Columns::all().difference(Columns::SH);
+const MIXED: Attributes = Attributes::all().difference(Attributes::SH);
 
 /// Number of proxies computed in one batch.
 const BATCH: usize = 4096;
@@ -70,7 +70,7 @@ impl MergedSequence<'_> {
     /// Memory per Gaussian to be read, members included: its reader, its state at one frame, and 24 bytes.
     pub fn together(&self, places: Range<usize>, wanted: &ReadPlan) -> Result<Box<dyn BlockReader + '_>> {
         let inputs = MergedMembers::new(self, places);
-        let frames = FrameReaders::open(self.source, Ids::List(&inputs.ids), Columns::all(), wanted)?;
+        let frames = FrameReaders::open(self.source, Ids::List(&inputs.ids), Attributes::all(), wanted)?;
         Ok(Box::new(MergedSequenceReader::new(self, Box::new(frames), inputs)))
     }
 
@@ -136,12 +136,12 @@ impl MergedMembers {
     }
 
     /// Returns the attributes of the members that must be read to compute the attributes `want`.
-    fn needed(&self, want: Columns) -> Columns {
+    fn needed(&self, want: Attributes) -> Attributes {
         if self.proxies.is_empty() || want.is_empty() { want } else { want | MIXED }
     }
 
     /// Writes the attributes `want` of the selected Gaussians, computed from the source states `state`, to `out`.
-    fn write(&self, state: &Gaussians, want: Columns, merge: &MergeParams, out: &mut Gaussians) {
+    fn write(&self, state: &Gaussians, want: Attributes, merge: &MergeParams, out: &mut Gaussians) {
         for column in want.iter() {
             let (from, to) = (state.column(column), out.column_mut(column));
             to.resize(self.rows.len());
@@ -170,19 +170,19 @@ struct MergedSequenceReader<'a> {
     reader: Box<dyn BlockReader + 'a>,
     state: Gaussians,
     /// Attributes in `state` that do not vary and were already read.
-    constant_read: Columns,
+    constant_read: Attributes,
     inputs: MergedMembers,
 }
 
 impl<'a> MergedSequenceReader<'a> {
     fn new(sequence: &'a MergedSequence<'a>, reader: Box<dyn BlockReader + 'a>, inputs: MergedMembers) -> Self {
         let state = Gaussians::zeros(inputs.ids.len(), sequence.info.sh_degree);
-        MergedSequenceReader { sequence, reader, state, constant_read: Columns::empty(), inputs }
+        MergedSequenceReader { sequence, reader, state, constant_read: Attributes::empty(), inputs }
     }
 }
 
 impl BlockReader for MergedSequenceReader<'_> {
-    fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
+    fn read(&mut self, frame: usize, want: Attributes, out: &mut Gaussians) -> Result<()> {
         let needed = self.inputs.needed(want);
         self.reader.read(frame, needed.difference(self.constant_read), &mut self.state)?;
         self.constant_read |= needed.difference(self.sequence.source.info().varying);

@@ -32,7 +32,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::model::hash_id;
-use crate::model::{Columns, Gaussians};
+use crate::model::{Attributes, Gaussians};
 use crate::recipe;
 use gates::{Appearance, Gates};
 pub use groups::MergeGroups;
@@ -353,7 +353,7 @@ fn each_candidate<E>(
 
 /// Returns whether every value of a row is finite.
 pub fn is_finite(states: &Gaussians, row: usize) -> bool {
-    let columns = Columns::all().iter().map(|column| states.column(column));
+    let columns = Attributes::all().iter().map(|column| states.column(column));
     columns.into_iter().all(|column| (0..column.width()).all(|c| column.plane(c)[row].is_finite()))
 }
 

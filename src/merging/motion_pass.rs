@@ -13,10 +13,10 @@ use rayon::prelude::*;
 
 use super::trajectories::{NEEDED, Trajectories};
 use crate::error::Result;
-use crate::merging::known::Likeness;
+use crate::merging::known::PairSimilarity;
 use crate::merging::motion::{MotionGate, NODE_BYTES, PAIR_BYTES, PairMotion};
 use crate::merging::voxels::voxel_order;
-use crate::model::{Column, opacity};
+use crate::model::{AttributeValues, opacity};
 use crate::outputs::container::FRAME_BLOCK;
 use crate::passes::FrameReaders;
 use crate::progress::Events;
@@ -48,11 +48,11 @@ pub struct PairMeter<'a> {
     /// Receiver of progress events.
     pub events: Events,
     /// Trajectories gathered so far; `None` at first.
-    pub gathered: Option<Gathered>,
+    pub gathered: Option<GatheredTrajectories>,
 }
 
 /// Trajectories in a scratch file, in voxel order.
-pub struct Gathered {
+pub struct GatheredTrajectories {
     trajectories: Trajectories,
     /// Row of the Gaussian at every place of the file.
     order: Vec<u32>,
@@ -81,15 +81,15 @@ impl PairMeter<'_> {
     pub fn measure(
         &mut self,
         ids: &[u32],
-        reference: &Column,
+        reference: &AttributeValues,
         mut pairs: Vec<(u32, u32)>,
         reach: f64,
         is_part: bool,
-    ) -> Result<Vec<Likeness>> {
+    ) -> Result<Vec<PairSimilarity>> {
         if is_part && self.gathered.is_none() {
             self.gathered = Some(self.gather(ids, reference, reach)?);
         }
-        let Some(Gathered { trajectories, order, place }) = &mut self.gathered else {
+        let Some(GatheredTrajectories { trajectories, order, place }) = &mut self.gathered else {
             let rows = members(&pairs);
             let places = rows.iter().map(|&row| reference.row(row as usize));
             let mut motion = PairMotion::new(local_indices(&pairs, &rows), places, self.scan.motion);
@@ -120,7 +120,7 @@ impl PairMeter<'_> {
     }
 
     /// Gathers the trajectories of all of `ids` in the order of voxels of side `reach`.
-    fn gather(&self, ids: &[u32], reference: &Column, reach: f64) -> Result<Gathered> {
+    fn gather(&self, ids: &[u32], reference: &AttributeValues, reach: f64) -> Result<GatheredTrajectories> {
         let rows: Vec<u32> = (0..ids.len() as u32).collect();
         let order = voxel_order(&rows, |row| reference.row(row as usize), reach);
         let ordered_ids: Vec<u32> = order.iter().map(|&row| ids[row as usize]).collect();
@@ -130,7 +130,7 @@ impl PairMeter<'_> {
         for (&row, k) in order.iter().zip(0u32..) {
             place[row as usize] = k;
         }
-        Ok(Gathered { trajectories, order, place })
+        Ok(GatheredTrajectories { trajectories, order, place })
     }
 
     /// Passes every frame of the Gaussians `ids` to `motion`; only the first frame if nothing varies.
@@ -174,7 +174,7 @@ mod tests {
     use super::*;
     use crate::diagnostics::demo_scene::Scene;
     use crate::error::Error;
-    use crate::model::{Columns, Gaussians, SequenceInfo};
+    use crate::model::{Attributes, Gaussians, SequenceInfo};
     use crate::passes::gather;
     use crate::recipe::Recipe;
     use crate::source::BlockReader;
@@ -187,7 +187,7 @@ mod tests {
         scene: Scene,
         recipe: Recipe,
         ids: Vec<u32>,
-        reference: Column,
+        reference: AttributeValues,
         pairs: Vec<(u32, u32)>,
     }
 
@@ -195,7 +195,7 @@ mod tests {
         fn new(reach: f64) -> Case {
             let scene = Scene::new(1500, 9);
             let ids: Vec<u32> = (0..1500).step_by(3).collect();
-            let reference = gather(&scene, &ids, REFERENCE, Columns::POSITION).unwrap().position;
+            let reference = gather(&scene, &ids, REFERENCE, Attributes::POSITION).unwrap().position;
             let at = |i: u32| glam::DVec3::from(reference.row::<3>(i as usize).map(f64::from));
             let count = ids.len() as u32;
             let pairs = (0..count).flat_map(|a| (a + 1..count).map(move |b| (a, b)));
@@ -219,7 +219,7 @@ mod tests {
             let starts = (0..self.pairs.len().max(1)).step_by(pairs_together);
             let parts =
                 starts.map(|start| &self.pairs[start..self.pairs.len().min(start.saturating_add(pairs_together))]);
-            let found: Result<Vec<Vec<Likeness>>> =
+            let found: Result<Vec<Vec<PairSimilarity>>> =
                 parts.map(|part| meter.measure(&self.ids, &self.reference, part.to_vec(), reach, is_part)).collect();
             drop(meter);
             assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0, "scratch files are left");
@@ -306,7 +306,7 @@ mod tests {
     }
 
     impl BlockReader for FailingReader<'_> {
-        fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
+        fn read(&mut self, frame: usize, want: Attributes, out: &mut Gaussians) -> Result<()> {
             if frame >= self.from {
                 return Err(Error::usage(format!("frame {frame} is gone")));
             }

@@ -10,7 +10,7 @@ use rayon::prelude::*;
 use super::MergeGroups;
 use super::gates::unit_rotation;
 use super::moments::{Ellipsoid, WeightedGaussian, align_axes, moments};
-use crate::model::{self, Columns, Gaussians};
+use crate::model::{self, Attributes, Gaussians};
 use crate::recipe::{self, Placement, ProxyOpacity, ShHigh};
 
 /// Number of clusters merged between two writes to the output planes.
@@ -39,13 +39,13 @@ pub struct ProxyState {
 
 impl ProxyState {
     /// Writes the attributes `want` to row `row` of `out`, rounded to f32.
-    pub fn write(&self, want: Columns, row: usize, out: &mut Gaussians) {
+    pub fn write(&self, want: Attributes, row: usize, out: &mut Gaussians) {
         for column in want.iter() {
             match column {
-                Columns::POSITION => out.position.set_row(row, self.position.to_array().map(|x| x as f32)),
-                Columns::ROTATION => out.rotation.set_row(row, self.rotation.map(|x| x as f32)),
-                Columns::LOG_SCALE => out.log_scale.set_row(row, self.log_scale.map(|x| x as f32)),
-                Columns::OPACITY => out.opacity_logit.set_row(row, [self.opacity_logit as f32]),
+                Attributes::POSITION => out.position.set_row(row, self.position.to_array().map(|x| x as f32)),
+                Attributes::ROTATION => out.rotation.set_row(row, self.rotation.map(|x| x as f32)),
+                Attributes::LOG_SCALE => out.log_scale.set_row(row, self.log_scale.map(|x| x as f32)),
+                Attributes::OPACITY => out.opacity_logit.set_row(row, [self.opacity_logit as f32]),
                 _ => {
                     for (plane, &value) in self.sh.iter().enumerate() {
                         out.sh.plane_mut(plane)[row] = value as f32;
@@ -109,7 +109,7 @@ pub fn merge_state(
     states: &Gaussians,
     leader: u32,
     merge: &recipe::MergeParams,
-    want: Columns,
+    want: Attributes,
 ) -> ProxyState {
     // All values are relative to the leader's frame: coordinates far from the origin cancel once, and the Jacobi
     // iteration starts from the leader's axes, so it rotates them only as far as the other members require.
@@ -137,7 +137,7 @@ pub fn merge_state(
         // An underflowed scale is replaced by the smallest positive one, whose logarithm is finite.
         log_scale: local.scales.to_array().map(|scale| scale.max(f64::MIN_POSITIVE).ln()),
         opacity_logit: logit(merged_opacity(members, states, &local, merge.opacity)),
-        sh: match want.contains(Columns::SH) {
+        sh: match want.contains(Attributes::SH) {
             true => merged_sh(members, states, leader, merge.sh_high),
             false => Vec::new(),
         },
@@ -162,11 +162,11 @@ pub fn merge_groups(
                 let rows = groups.members(group);
                 let weights = weights(rows, importance, states);
                 let members: Vec<(u32, f64)> = rows.iter().copied().zip(weights).collect();
-                merge_state(&members, states, groups.leaders()[group], merge, Columns::all())
+                merge_state(&members, states, groups.leaders()[group], merge, Attributes::all())
             })
             .collect();
         for (row, proxy) in (first..).zip(&proxies) {
-            proxy.write(Columns::all(), row, &mut out);
+            proxy.write(Attributes::all(), row, &mut out);
         }
     }
     out
@@ -279,7 +279,7 @@ mod tests {
                 for scale in [[-3.0, -5.0, -4.0], [-4.0, -4.0, -9.0], [0.0; 3]] {
                     let mut states = copies(3, scale, [0.9, -1.3, 0.2, 0.4]);
                     states.opacity_logit.plane_mut(0).fill(logit(0.2) as f32);
-                    let got = merge_state(&equal_weights(3), &states, 1, &recipe(placement, rule), Columns::all());
+                    let got = merge_state(&equal_weights(3), &states, 1, &recipe(placement, rule), Attributes::all());
                     assert_eq!(got.position.to_array().map(|x| x as f32), states.position.row(1));
                     assert_eq!(got.log_scale.map(|x| x as f32), scale);
                     assert_eq!(got.sh.iter().map(|&x| x as f32).collect::<Vec<_>>(), states.sh.row::<12>(1));
@@ -300,7 +300,7 @@ mod tests {
             for logit in [f32::MIN, -200.0, 0.0, 200.0, f32::MAX, f32::INFINITY, f32::NEG_INFINITY] {
                 let mut states = copies(2, [0.0, -1.0, -2.0], [1.0, 0.0, 0.0, 0.0]);
                 states.opacity_logit.plane_mut(0).fill(logit);
-                let got = merge_state(&equal_weights(2), &states, 0, &recipe(Placement::Mean, rule), Columns::all())
+                let got = merge_state(&equal_weights(2), &states, 0, &recipe(Placement::Mean, rule), Attributes::all())
                     .opacity_logit;
                 assert!(got.is_finite() && got.abs() < 17.0, "{rule:?} of {logit}: {got}");
             }
@@ -319,7 +319,7 @@ mod tests {
                 &states,
                 0,
                 &recipe(Placement::Mean, ProxyOpacity::Area),
-                Columns::all(),
+                Attributes::all(),
             );
             for (got, expected) in got.log_scale.iter().zip(scale.map(|x| f64::from(x).max(f64::MIN_POSITIVE.ln()))) {
                 assert!((got - expected).abs() < 1e-12, "got {got}, expected {expected}");
@@ -331,7 +331,7 @@ mod tests {
     fn a_zero_quaternion_is_the_identity() {
         let states = copies(2, [0.0, -1.0, -2.0], [0.0; 4]);
         let got =
-            merge_state(&equal_weights(2), &states, 0, &recipe(Placement::Mean, ProxyOpacity::Sum), Columns::all());
+            merge_state(&equal_weights(2), &states, 0, &recipe(Placement::Mean, ProxyOpacity::Sum), Attributes::all());
         assert_eq!(got.rotation, [1.0, 0.0, 0.0, 0.0]);
     }
 
@@ -345,7 +345,7 @@ mod tests {
             &states,
             0,
             &recipe(Placement::Leader, ProxyOpacity::Area),
-            Columns::all(),
+            Attributes::all(),
         );
         assert_eq!(got.position.to_array().map(|x| x as f32), states.position.row(0));
         let leader = unit_rotation(states.rotation.row(0));
@@ -357,7 +357,7 @@ mod tests {
             &states,
             0,
             &recipe(Placement::Mean, ProxyOpacity::Area),
-            Columns::all(),
+            Attributes::all(),
         );
         assert!((mean.position.x - (1000.25 * 0.3 + f64::from(1000.3f32) * 0.7)).abs() < 1e-9);
         assert!(mean.log_scale[1] < got.log_scale[1], "moments about the leader exceed those about the mean");
@@ -411,7 +411,7 @@ mod tests {
             let mut states = copies(2, [-2.0, -3.0, -5.0], [0.5, 0.5, -0.1, 0.7]);
             states.position.set_row(1, [1000.25 + offset[0], -7.125 + offset[1], 0.1 + offset[2]]);
             states.opacity_logit.plane_mut(0).copy_from_slice(&logits);
-            let got = merge_state(&equal_weights(2), &states, 0, &recipe(Placement::Mean, ProxyOpacity::Area), Columns::all());
+            let got = merge_state(&equal_weights(2), &states, 0, &recipe(Placement::Mean, ProxyOpacity::Area), Attributes::all());
             let before: f64 = (0..2).map(|i| opacity(&states, i) * mean_area(scales(&states, i))).sum();
             let after = mean_area(DVec3::from(got.log_scale.map(f64::exp))) / (1.0 + (-got.opacity_logit).exp());
             prop_assert!((after / before - 1.0).abs() < 1e-12, "before {before}, after {after}");

@@ -7,7 +7,7 @@ use xxhash_rust::xxh3::xxh3_64_with_seed;
 
 use super::motion::{MotionGate, PairMotion};
 use super::*;
-use crate::model::Column;
+use crate::model::AttributeValues;
 use crate::recipe::{MergeParams, MotionParams, Recipe};
 
 /// Returns a number in [0, 1) for Gaussian `i`, different for every `salt`.
@@ -61,13 +61,19 @@ impl TestScene {
     }
 
     /// Merges with all Gaussians alive at `frames`, the first of which is the reference frame.
-    fn merge_moving(&self, recipe: &MergeParams, limit: Option<usize>, frames: &[Column]) -> Merged {
+    fn merge_moving(&self, recipe: &MergeParams, limit: Option<usize>, frames: &[AttributeValues]) -> Merged {
         let rows: Vec<u32> = (0..self.states.len() as u32).collect();
         self.merge_rows(&rows, recipe, limit, frames)
     }
 
     /// Merges selected rows like [`TestScene::merge_moving`].
-    fn merge_rows(&self, rows: &[u32], recipe: &MergeParams, limit: Option<usize>, frames: &[Column]) -> Merged {
+    fn merge_rows(
+        &self,
+        rows: &[u32],
+        recipe: &MergeParams,
+        limit: Option<usize>,
+        frames: &[AttributeValues],
+    ) -> Merged {
         self.merge_in_batches(rows, recipe, limit, frames, usize::MAX).0
     }
 
@@ -78,7 +84,7 @@ impl TestScene {
         rows: &[u32],
         recipe: &MergeParams,
         limit: Option<usize>,
-        frames: &[Column],
+        frames: &[AttributeValues],
         max_pairs: usize,
     ) -> (Merged, Vec<usize>) {
         let TestScene { states, classes, extent, .. } = self;
@@ -188,7 +194,7 @@ fn moving_and_scaling_the_scene_changes_no_group() {
 #[test]
 fn exact_duplicates_merge_to_one() {
     let mut scene = TestScene::uniform_cube(60);
-    for column in Columns::all().iter() {
+    for column in Attributes::all().iter() {
         for c in 0..scene.states.column(column).width() {
             let plane = scene.states.column_mut(column).plane_mut(c);
             (0..60).for_each(|i| plane[i] = plane[i % 20]);
@@ -277,7 +283,7 @@ fn order_of_rows_changes_no_cluster() {
     let (scene, mut shuffled) = (TestScene::uniform_cube(n), TestScene::uniform_cube(n));
     let new_row = |row: usize| (row * 7 + 3) % n;
     for row in 0..n {
-        for column in Columns::all().iter() {
+        for column in Attributes::all().iter() {
             for c in 0..scene.states.column(column).width() {
                 shuffled.states.column_mut(column).plane_mut(c)[new_row(row)] =
                     scene.states.column(column).plane(c)[row];

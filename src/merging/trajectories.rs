@@ -20,7 +20,7 @@ use rayon::prelude::*;
 
 use crate::cache::{Spill, SpillWriter};
 use crate::error::Result;
-use crate::model::{Columns, Gaussians};
+use crate::model::{Attributes, Gaussians};
 use crate::outputs::container::FRAME_BLOCK;
 use crate::passes::BLOCK;
 use crate::progress::Events;
@@ -30,7 +30,7 @@ use crate::source::{FrameSource, Ids, ReadPlan};
 pub(crate) type TrajectorySample = [f32; 4];
 
 /// Attributes of a [`TrajectorySample`].
-pub(crate) const NEEDED: Columns = Columns::POSITION.union(Columns::OPACITY);
+pub(crate) const NEEDED: Attributes = Attributes::POSITION.union(Attributes::OPACITY);
 
 /// Maximum distance in the file between two requested Gaussians that are read together with the ones between them.
 const GAP: u32 = 32;
@@ -135,9 +135,9 @@ impl Trajectories {
 }
 
 /// Returns the range of the values in a [`TrajectorySample`] that belong to `columns`.
-fn value_range(columns: Columns) -> Range<usize> {
-    let start = if columns.contains(Columns::POSITION) { 0 } else { 3 };
-    start..if columns.contains(Columns::OPACITY) { 4 } else { 3 }
+fn value_range(columns: Attributes) -> Range<usize> {
+    let start = if columns.contains(Attributes::POSITION) { 0 } else { 3 };
+    start..if columns.contains(Attributes::OPACITY) { 4 } else { 3 }
 }
 
 /// Reads `frames` of `columns` of the Gaussians (id, place), sorted by id, into `values`: `[N, frames, W]` by place.
@@ -145,7 +145,7 @@ fn read_frames(
     source: &dyn FrameSource,
     places: &[(u32, u32)],
     frames: Range<usize>,
-    columns: Columns,
+    columns: Attributes,
     values: &mut Vec<f32>,
 ) -> Result<()> {
     let width = columns.width(0);
@@ -190,7 +190,7 @@ mod tests {
     struct PartlyStatic(Scene, SequenceInfo);
 
     impl PartlyStatic {
-        fn new(varying: Columns) -> PartlyStatic {
+        fn new(varying: Attributes) -> PartlyStatic {
             let scene = Scene::new(3000, 7);
             let info = SequenceInfo { varying, ..scene.info().clone() };
             PartlyStatic(scene, info)
@@ -209,11 +209,11 @@ mod tests {
 
     struct PartlyStaticReader<'a> {
         reader: Box<dyn BlockReader + 'a>,
-        varying: Columns,
+        varying: Attributes,
     }
 
     impl BlockReader for PartlyStaticReader<'_> {
-        fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
+        fn read(&mut self, frame: usize, want: Attributes, out: &mut Gaussians) -> Result<()> {
             self.reader.read(0, want, out)?;
             self.reader.read(frame, want & self.varying, out)
         }
@@ -236,7 +236,7 @@ mod tests {
         // Neighbors, narrow and wide gaps, both ends.
         let places: Vec<u32> = (0..5).chain([9, 40, 300]).chain(1000..2400).chain([2499]).collect();
         let ids_at_places: Vec<u32> = places.iter().map(|&place| ids[place as usize]).collect();
-        for varying in [NEEDED, Columns::POSITION, Columns::OPACITY, Columns::empty()] {
+        for varying in [NEEDED, Attributes::POSITION, Attributes::OPACITY, Attributes::empty()] {
             let source = PartlyStatic::new(varying);
             for frames_together in [1, 3, usize::MAX] {
                 let gathered =

@@ -3,7 +3,7 @@
 use gseq::{Encoding, Reader, TileId};
 
 use super::linked::LinkedFrames;
-use super::size::bytes_of;
+use super::size::bytes_read_for;
 use crate::error::{Error, Result, ShowPath};
 use crate::files::container::Container;
 use crate::models::input_model::{ColumnInfo, InputModel, MemoryProfile, ModelFormat, Timing};
@@ -15,7 +15,7 @@ pub(super) const ENTRY: ModelFormat = ModelFormat {
     open: |path, options| {
         let container = Container::open_within(path, options.memory)?;
         options.refuse_for(path)?;
-        if options.link.is_asked() && container.info().times.len() > 1 {
+        if options.link.always_links() && container.info().times.len() > 1 {
             let joins = options.link.joins();
             return Ok(Box::new(LinkedFrames::relink(&container, "linked gseq container", joins, &options.ply())?));
         }
@@ -37,7 +37,7 @@ impl InputModel for Container {
     }
 
     fn bytes(&self) -> Result<u64> {
-        bytes_of([self.path()])
+        bytes_read_for([self.path()])
     }
 
     fn may_be_linked(&self) -> bool {
@@ -55,7 +55,7 @@ impl InputModel for Container {
             gaussian_block: layout.gaussian_block.into(),
             columns: layout.columns.len() as u64,
             decoded: self.decoded_bytes(),
-            ..MemoryProfile::of_tiles(layout.frame_block.into())
+            ..MemoryProfile::for_tiles(layout.frame_block.into())
         }
     }
 
@@ -102,7 +102,7 @@ fn columns(reader: &Reader) -> Result<Vec<ColumnInfo>> {
                 let tile = reader.tile_info(TileId { column: column as u32, gaussian_block, frame_block })?;
                 found.tiles += 1;
                 found.constant_tiles += usize::from(tile.constant);
-                found.raw_tiles += usize::from(tile.encoding == Encoding::Raw);
+                found.raw_tiles += usize::from(tile.encoding == Encoding::StoredParams);
                 if last_offset != Some(tile.offset) {
                     found.stored_bytes += tile.stored_bytes;
                 }

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 
 use super::size::{Size, bytes_below};
-use super::trajectories::{NO_ARCHIVE, OWN_OUTPUT, check_output, reduced_trajectories, write_trajectories};
+use super::trajectories::{DEFAULT_OUTPUT, NO_ARCHIVE, check_output, reduced_trajectories, write_trajectories};
 use crate::archive::Content;
 use crate::compressed_model::{Cluster, CompressedModel, Proxies, Reference};
 use crate::error::{Error, Result, ShowPath};
@@ -13,7 +13,7 @@ use crate::files::cameras::Clock;
 use crate::files::ply::PlyOptions;
 use crate::files::splatv::rows::ZeroRotation;
 use crate::limits::{Limits, ReadLimit};
-use crate::model::{Columns, Gaussians};
+use crate::model::{Attributes, Gaussians};
 use crate::outputs::container::GAUSSIAN_BLOCK;
 use crate::outputs::kind::OutputKind;
 use crate::progress::Events;
@@ -136,7 +136,7 @@ pub trait InputModel: Send + Sync {
 
     /// Returns the kind of output to write if neither the user nor the output path specifies one.
     fn own_output(&self) -> OutputKind {
-        OWN_OUTPUT
+        DEFAULT_OUTPUT
     }
 
     /// Checks that this input can be written as `kind` to `path`.
@@ -145,7 +145,7 @@ pub trait InputModel: Send + Sync {
     /// Fails if it cannot; the message lists kinds that work.
     fn check_output(&self, kind: OutputKind, path: &Path) -> Result<()> {
         match kind {
-            OutputKind::Archive if self.archives_frames() => Ok(()),
+            OutputKind::Archive if self.archives_as_frames() => Ok(()),
             _ => check_output(self.source().info().times.len(), kind, path),
         }
     }
@@ -204,7 +204,7 @@ pub trait InputModel: Send + Sync {
     }
 
     /// Returns whether an archive of this input is a lossy container of its frames (`.gseq` within error bounds).
-    fn archives_frames(&self) -> bool {
+    fn archives_as_frames(&self) -> bool {
         self.has_explicit_frames()
     }
 
@@ -277,7 +277,7 @@ pub struct MemoryProfile {
 
 impl MemoryProfile {
     /// Returns the profile of a container whose tiles hold `frame_block` frames.
-    pub fn of_tiles(frame_block: u64) -> MemoryProfile {
+    pub fn for_tiles(frame_block: u64) -> MemoryProfile {
         MemoryProfile {
             per_gaussian: 0,
             opening: 0,
@@ -288,7 +288,7 @@ impl MemoryProfile {
             fixed: 0,
             frame_block,
             gaussian_block: GAUSSIAN_BLOCK as u64,
-            columns: Columns::all().iter().count() as u64,
+            columns: Attributes::all().iter().count() as u64,
             // Decoding time of tiles that are read whole (`benches/scan.rs`).
             seconds_per_state: 5e-8,
             decoded: 0,
@@ -404,7 +404,7 @@ pub enum Link {
 
 impl Link {
     /// Returns whether inputs that already identify Gaussians across frames are linked as well.
-    pub fn is_asked(self) -> bool {
+    pub fn always_links(self) -> bool {
         matches!(self, Link::Always | Link::Apart)
     }
 

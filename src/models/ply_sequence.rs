@@ -10,17 +10,17 @@ use rayon::prelude::*;
 
 use super::archive::files::add_cloud;
 use super::linked::LinkedFrames;
-use super::size::bytes_of;
+use super::size::bytes_read_for;
 use super::trajectories::{check_output, merged, state_bytes, write_trajectories};
 use crate::archive::Content;
 use crate::compressed_model::CompressedModel;
 use crate::error::Result;
 use crate::files::names::shown_name;
-use crate::files::ply::write::{out_rows, write_like};
+use crate::files::ply::write::{rows_of_model, write_like};
 use crate::files::ply_frames::PlyFrames;
 use crate::files::ply_sequence::PlySequence;
 use crate::limits::Limits;
-use crate::model::{Columns, Gaussians};
+use crate::model::{Attributes, Gaussians};
 use crate::models::input_model::{InputModel, Link, MemoryProfile, ModelFormat, OpenOptions, Timing};
 use crate::outputs::container::GAUSSIAN_BLOCK;
 use crate::outputs::kind::OutputKind;
@@ -56,7 +56,7 @@ fn open_frames(frames: PlyFrames, path: &Path, options: &OpenOptions) -> Result<
     options.refuse_for(path)?;
     let order = match options.link {
         _ if frames.paths().len() == 1 => FrameOrder::Assumed,
-        link if link.is_asked() => FrameOrder::Lost("as requested".to_owned()),
+        link if link.always_links() => FrameOrder::Lost("as requested".to_owned()),
         Link::Auto => measure_order(&frames)?,
         _ => FrameOrder::Assumed,
     };
@@ -97,7 +97,7 @@ fn measure_order(frames: &PlyFrames) -> Result<FrameOrder> {
         let first = k * pairs / pairs.min(MAX_MEASURED_PAIRS);
         let state = |frame: usize| -> Result<Gaussians> {
             let mut state = Gaussians::zeros(0, frames.sh_degree());
-            frames.frame(frame)?.gaussians(0..frames.counts()[frame] as usize, Columns::all(), &mut state)?;
+            frames.frame(frame)?.gaussians(0..frames.counts()[frame] as usize, Attributes::all(), &mut state)?;
             Ok(state)
         };
         found.push(identity(&state(first)?, &state(first + 1)?));
@@ -140,14 +140,14 @@ impl InputModel for PlySequence {
     }
 
     fn bytes(&self) -> Result<u64> {
-        bytes_of(self.paths().iter().map(PathBuf::as_path))
+        bytes_read_for(self.paths().iter().map(PathBuf::as_path))
     }
 
     fn has_explicit_frames(&self) -> bool {
         true
     }
 
-    fn archives_frames(&self) -> bool {
+    fn archives_as_frames(&self) -> bool {
         self.paths().len() > 1
     }
 
@@ -159,7 +159,7 @@ impl InputModel for PlySequence {
             reduced: 0,
             jacobian: 0,
             // Normals and other extra properties are stored beside the attributes.
-            file: state_bytes(self.info().sh_degree, Columns::all()) + 24,
+            file: state_bytes(self.info().sh_degree, Attributes::all()) + 24,
             fixed: 0,
             frame_block: 0,
             gaussian_block: GAUSSIAN_BLOCK as u64,
@@ -186,14 +186,14 @@ impl InputModel for PlySequence {
 
     fn content(&self, reduction: &CompressedModel) -> Result<Content> {
         let mut content = Content { times: [0.0, 1.0], ..Content::default() };
-        content.cloud = gather_all(&*self.reduced(reduction)?, 0, Columns::all())?;
+        content.cloud = gather_all(&*self.reduced(reduction)?, 0, Attributes::all())?;
         add_cloud(&mut content, &self.frame(0)?, reduction.kept.iter().copied())?;
         Ok(content)
     }
 
     fn decode_frames<'a>(&'a self, content: &Content) -> Result<Box<dyn FrameSource + 'a>> {
         let (count, degree) = (content.cloud.len(), content.cloud.sh_degree());
-        let mut frames = HeldFrames::new(count, degree, Columns::empty(), content.cloud.clone());
+        let mut frames = HeldFrames::new(count, degree, Attributes::empty(), content.cloud.clone());
         self.info().times.iter().for_each(|&time| frames.push(time, Gaussians::zeros(0, degree)));
         Ok(Box::new(frames))
     }
@@ -224,17 +224,17 @@ fn write_files(
 ) -> Result<()> {
     let result = merged(sequence, reduction);
     let places: Vec<u32> = reduction.clusters.iter().map(|cluster| cluster.output).collect();
-    let rows = out_rows(reduction);
+    let rows = rows_of_model(reduction);
     let progress = events.task("emit", "frames", sequence.paths().len() as u64);
     let write = |&frame: &usize| {
         let mut proxies = Gaussians::zeros(0, sequence.info().sh_degree);
-        result.open(Ids::List(&places))?.read(frame, Columns::all(), &mut proxies)?;
+        result.open(Ids::List(&places))?.read(frame, Attributes::all(), &mut proxies)?;
         let template = sequence.frame(frame)?;
         let target = match (kind, template.path().file_name()) {
             (OutputKind::PlySequence, Some(name)) => path.join(name),
             _ => path.to_owned(),
         };
-        let change = reduction.change_at(frame, sequence.paths().len());
+        let change = reduction.delta_at(frame, sequence.paths().len());
         write_like(&template, &rows, &proxies, &change, reduction.sh_degree, &target)?;
         progress.advance(1);
         Ok(())

@@ -51,7 +51,7 @@ impl Size {
 
     /// Formats the parts relative to the parts of `before` for messages: `cloud 248 of 2480 (10.0%)`. A part that
     /// exists on one side only is compared with `none`.
-    pub fn parts_of(&self, before: &Size) -> String {
+    pub fn format_relative_to(&self, before: &Size) -> String {
         let part = |((name, after), (_, before)): ((_, u64), (_, u64))| match (after, before) {
             (0, 0) => None,
             (0, before) => Some(format!("{name} none of {before}")),
@@ -82,7 +82,7 @@ pub fn compared(after: u64, before: u64) -> String {
 }
 
 /// Returns the sum of the sizes of files, bytes. Fails if one cannot be read.
-pub(super) fn bytes_of<'a>(paths: impl IntoIterator<Item = &'a Path>) -> Result<u64> {
+pub(super) fn bytes_read_for<'a>(paths: impl IntoIterator<Item = &'a Path>) -> Result<u64> {
     paths.into_iter().map(|path| Ok(fs::metadata(path).map_err(Error::io("read", path))?.len())).sum()
 }
 
@@ -117,11 +117,11 @@ mod tests {
         assert_eq!(small.whole(), 2110);
         assert_eq!(small.parts(), "cloud 100, field 2000, rest 10");
         assert_eq!(
-            small.parts_of(&model),
+            small.format_relative_to(&model),
             "cloud 100 of 1000 (10.0%), field 2000 of 4000 (50.0%), rest 10 of 10 (100.0%)"
         );
         assert_eq!(
-            Size::of_frames(9).parts_of(&model),
+            Size::of_frames(9).format_relative_to(&model),
             "cloud none of 1000, field none of 4000, frames 9 of none, rest none of 10"
         );
     }

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use super::files::copy;
 use super::four_d_gaussians::cfg_args;
 use super::iterations::find_iteration;
-use super::size::{Size, bytes_below, bytes_of};
+use super::size::{Size, bytes_below, bytes_read_for};
 use crate::archive::Content;
 use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result};
@@ -94,14 +94,14 @@ impl InputModel for StaticModel {
 
     fn size(&self) -> Result<Size> {
         let rest = self.copied_files().collect::<Vec<_>>();
-        let (cloud, rest) = (InputModel::bytes(&self.cloud)?, bytes_of(rest.iter().map(PathBuf::as_path))?);
+        let (cloud, rest) = (InputModel::bytes(&self.cloud)?, bytes_read_for(rest.iter().map(PathBuf::as_path))?);
         Ok(Size { cloud, rest, ..Size::default() })
     }
 
     fn size_written(&self, kind: OutputKind, path: &Path) -> Result<Size> {
         match kind {
             OutputKind::Model => {
-                let cloud = bytes_of([&*self.cloud_path(path)])?;
+                let cloud = bytes_read_for([&*self.cloud_path(path)])?;
                 Ok(Size { cloud, rest: bytes_below(path)?.saturating_sub(cloud), ..Size::default() })
             }
             _ => self.cloud.size_written(kind, path),
@@ -172,7 +172,7 @@ impl InputModel for StaticModel {
 mod tests {
     use super::*;
     use crate::files::ply::write::write_inria;
-    use crate::model::{Columns, Gaussians};
+    use crate::model::{Attributes, Gaussians};
     use crate::models;
     use crate::passes::gather_all;
     use crate::recipe::Recipe;
@@ -197,12 +197,12 @@ mod tests {
         let reduction = CompressedModel::pruned(vec![1, 3], &Recipe::preset("default").unwrap().merge);
         model.write(&reduction, OutputKind::Model, &result, &Limits::NONE, &Events::IGNORED).unwrap();
         let [all, left] =
-            [&root, &result].map(|path| gather_all(open(path, None).unwrap().source(), 0, Columns::all()).unwrap());
+            [&root, &result].map(|path| gather_all(open(path, None).unwrap().source(), 0, Attributes::all()).unwrap());
         assert_eq!(left, all.pick(&[1, 3]));
         assert_eq!(fs::read(result.join("cfg_args")).unwrap(), fs::read(root.join("cfg_args")).unwrap());
         assert!(result.join("point_cloud/iteration_30000/point_cloud.ply").is_file());
         assert_eq!(model.size_written(OutputKind::Model, &result).unwrap().whole(), bytes_below(&result).unwrap());
-        let first = gather_all(open(&root, Some(7000)).unwrap().source(), 0, Columns::POSITION).unwrap();
+        let first = gather_all(open(&root, Some(7000)).unwrap().source(), 0, Attributes::POSITION).unwrap();
         assert_eq!(first.position.row::<1>(0), [7000.0]);
         assert!(open(&root, Some(8)).err().unwrap().to_string().contains("iteration_7000, iteration_30000"));
         // A model whose deformation file is missing is not a static model.

@@ -27,12 +27,12 @@ use crate::source::FrameSource;
 /// Maximum bytes of frames that are held together; at least one frame is held.
 const HELD_BYTES: u64 = 64 << 20;
 /// Maximum number of frames in transit from the reading thread.
-pub const AHEAD: usize = 2;
+pub const PREFETCH_FRAMES: usize = 2;
 /// Compression of the scratch container. Equals that of `pack`, so that the digest of the input is the same.
 const COMPRESSION: Compression = Compression::Zstd(1);
 
 /// Received frame stream.
-pub struct Streamed {
+pub struct ReceivedStream {
     /// Container of the received frames.
     container: Container,
     /// Number of bytes received.
@@ -41,7 +41,7 @@ pub struct Streamed {
     _scratch: ScratchFile,
 }
 
-impl Streamed {
+impl ReceivedStream {
     /// Packs a stream into a scratch file in `folder`. Calls `take` with the frames of each frame block, in order.
     ///
     /// # Errors
@@ -51,15 +51,15 @@ impl Streamed {
         folder: &Path,
         events: &Events,
         take: impl FnMut(&HeldFrames) -> Result<()>,
-    ) -> Result<Streamed> {
+    ) -> Result<ReceivedStream> {
         let scratch = ScratchFile::new(folder)?;
         let received = pack_stream(stream, scratch.path(), COMPRESSION, events, take)?;
         let container = Container::open(scratch.path())?;
-        Ok(Streamed { container, received, _scratch: scratch })
+        Ok(ReceivedStream { container, received, _scratch: scratch })
     }
 }
 
-impl InputModel for Streamed {
+impl InputModel for ReceivedStream {
     fn kind(&self) -> &'static str {
         "frame stream"
     }
@@ -126,11 +126,11 @@ pub fn pack_stream(
     };
 
     // A fixed set of buffers circulates: empty ones go to the reader, filled ones to the packer.
-    let (to_fill, empty) = bounded(block + AHEAD);
-    for _ in 0..block + AHEAD {
+    let (to_fill, empty) = bounded(block + PREFETCH_FRAMES);
+    for _ in 0..block + PREFETCH_FRAMES {
         let _ = to_fill.send(Gaussians::zeros(0, sh_degree));
     }
-    let (filled, arrived) = bounded(AHEAD);
+    let (filled, arrived) = bounded(PREFETCH_FRAMES);
     // The thread is not joined on failure: it may be waiting for a program that writes no more. It ends at its next
     // frame.
     let reader = thread::spawn(move || {

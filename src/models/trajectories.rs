@@ -13,12 +13,12 @@ use crate::files::ply::write::write_inria;
 use crate::files::spz::write_spz;
 use crate::limits::Limits;
 use crate::merging::merged::MergedSequence;
-use crate::model::{Columns, Gaussians, SequenceInfo};
+use crate::model::{Attributes, Gaussians, SequenceInfo};
 use crate::outputs::container::{ContainerWriter, FRAME_BLOCK, GAUSSIAN_BLOCK, write_container};
 use crate::outputs::curves::write_curves;
 use crate::outputs::four_dgs::write_four_dgs;
 use crate::outputs::kind::OutputKind;
-use crate::passes::{Changed, HeldFrames, States, gather_all};
+use crate::passes::{HeldFrames, States, WithDelta, gather_all};
 use crate::progress::Events;
 use crate::source::{FrameSource, ReadPlan};
 
@@ -26,14 +26,14 @@ use crate::source::{FrameSource, ReadPlan};
 const ZSTD_LEVEL: i32 = 1;
 
 /// Default kind of output of explicit trajectories.
-pub const OWN_OUTPUT: OutputKind = OutputKind::PlySequence;
+pub const DEFAULT_OUTPUT: OutputKind = OutputKind::PlySequence;
 
 /// Message for inputs that cannot be written as an archive.
 pub(super) const NO_ARCHIVE: &str = "only a 4DGaussians or 3DGS model, a PLY, or frames can be written as an \
                                      archive\n  write a .gseq instead, or pack the input into a .gseq first";
 
 /// Returns the bytes of the `columns` of one Gaussian at one frame.
-pub fn state_bytes(sh_degree: usize, columns: Columns) -> u64 {
+pub fn state_bytes(sh_degree: usize, columns: Attributes) -> u64 {
     columns.iter().map(|column| 4 * column.width(sh_degree) as u64).sum()
 }
 
@@ -49,7 +49,7 @@ pub(super) fn reduced_trajectories<'a>(
     reduction: &'a CompressedModel,
 ) -> Box<dyn FrameSource + 'a> {
     let CompressedModel { change, course, sh_degree, .. } = reduction;
-    Box::new(Changed::new(Box::new(merged(source, reduction)), change, course, *sh_degree))
+    Box::new(WithDelta::new(Box::new(merged(source, reduction)), change, course, *sh_degree))
 }
 
 /// Checks that a sequence of `frames` frames can be written as `kind`.
@@ -105,7 +105,7 @@ fn write_merged(
             let mut frames = merged.together(part.clone(), &ReadPlan::new(of_block.clone()).holding(FRAME_BLOCK))?;
             let mut constant = Gaussians::zeros(0, *sh_degree);
             if start == 0 {
-                frames.read(start, Columns::all().difference(*varying), &mut constant)?;
+                frames.read(start, Attributes::all().difference(*varying), &mut constant)?;
             }
             let mut held = HeldFrames::new(part.len(), *sh_degree, *varying, constant);
             for frame in of_block.clone() {
@@ -118,7 +118,7 @@ fn write_merged(
             let change = reduction.change.pick(&places);
             // Models with proxies have no trajectory delta.
             let course = TrajectoryDelta::default();
-            let held = Changed::new(Box::new(held), &change, &course, reduction.sh_degree);
+            let held = WithDelta::new(Box::new(held), &change, &course, reduction.sh_degree);
             writer.add(&held, part.start, 0..of_block.len(), |done| progress.advance(done))?;
         }
     }
@@ -160,7 +160,7 @@ pub fn write_sequence(
         OutputKind::Splatv => return Ok(vec![write_curves(source, path, events)?]),
         OutputKind::FourDgs => return Ok(vec![write_four_dgs(source, path, events)?]),
         OutputKind::Spz => {
-            let off = write_spz(&gather_all(source, 0, Columns::all())?, path)?;
+            let off = write_spz(&gather_all(source, 0, Attributes::all())?, path)?;
             return Ok(vec![format!("maximum position error: {off:.2e} scene units")]);
         }
         OutputKind::Gseq => {

@@ -5,23 +5,23 @@ use std::str::FromStr;
 use serde::{Deserialize, Serialize};
 
 use crate::error::{Error, Result, quoted};
-use crate::model::Columns;
+use crate::model::Attributes;
 
-/// Maximum error of each attribute in its unit, in the order of [`Columns::all`]; 0 keeps every bit.
+/// Maximum error of each attribute in its unit, in the order of [`Attributes::all`]; 0 keeps every bit.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct Bounds([f64; 5]);
 
 /// Error bound of one attribute: `position=1e-3`, in the attribute's unit, or `position=0.01%` of the scene extent.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MaxError {
-    column: Columns,
+    column: Attributes,
     bound: f64,
     /// Whether the bound is a multiple of the scene extent.
     is_relative: bool,
 }
 
 impl Bounds {
-    /// Creates the bounds of all attributes, in the order of [`Columns::all`].
+    /// Creates the bounds of all attributes, in the order of [`Attributes::all`].
     pub fn new(bounds: [f64; 5]) -> Bounds {
         Bounds(bounds)
     }
@@ -44,7 +44,7 @@ impl Bounds {
     }
 
     /// Returns the bound of one attribute.
-    pub fn column(&self, column: Columns) -> f64 {
+    pub fn column(&self, column: Attributes) -> f64 {
         self.0[column.bits().trailing_zeros() as usize]
     }
 }
@@ -53,14 +53,14 @@ impl FromStr for MaxError {
     type Err = String;
 
     fn from_str(text: &str) -> std::result::Result<MaxError, String> {
-        let names: Vec<&str> = Columns::all().iter().map(Columns::name).collect();
+        let names: Vec<&str> = Attributes::all().iter().map(Attributes::name).collect();
         let (name, number) =
             text.split_once('=').ok_or_else(|| format!("expected COLUMN=BOUND, found {}", quoted(text)))?;
-        let column = Columns::all().iter().find(|column| column.name() == name);
+        let column = Attributes::all().iter().find(|column| column.name() == name);
         let column =
             column.ok_or_else(|| format!("expected a column of {}, found {}", names.join(", "), quoted(name)))?;
         let (number, is_relative) = number.strip_suffix('%').map_or((number, false), |percent| (percent, true));
-        if is_relative && column != Columns::POSITION {
+        if is_relative && column != Attributes::POSITION {
             return Err(format!(
                 "expected a bound in the unit of {name} (only of positions a percentage is possible), found {}",
                 quoted(text)
@@ -81,7 +81,7 @@ mod tests {
     fn bounds_are_read_by_attribute_or_as_a_percentage() {
         let requested = ["position=0.5%", "sh=1e-2"].map(|text| text.parse::<MaxError>().unwrap());
         let bounds = Bounds::from_errors(&requested, || Ok(20.0)).unwrap();
-        let found: Vec<f64> = Columns::all().iter().map(|column| bounds.column(column)).collect();
+        let found: Vec<f64> = Attributes::all().iter().map(|column| bounds.column(column)).collect();
         assert_eq!(found, [0.1, 0.0, 0.0, 0.0, 0.01]);
         assert!(Bounds::from_errors(&requested, || Err(Error::usage("no extent"))).is_err());
         let twice = [requested[1], requested[1]];

@@ -14,7 +14,7 @@ use rayon::prelude::*;
 use super::bounds::Bounds;
 use crate::cache::{CacheKey, Spill, SpillWriter};
 use crate::error::Result;
-use crate::model::{Columns, Gaussians};
+use crate::model::{Attributes, Gaussians};
 use crate::source::{FrameSource, Ids};
 
 /// Number of Gaussians per tile, which one task of a scan reads. Fixed, so that the bytes depend on nothing but the
@@ -64,16 +64,16 @@ impl Packing {
     /// Returns the cache key of this encoding; the values are not included.
     pub fn key(&self) -> CacheKey {
         let column_key = |column| match self.column(column) {
-            Compression::Raw => (0, 0.0, 0),
+            Compression::StoredParams => (0, 0.0, 0),
             Compression::Zstd(level) => (1, 0.0, level),
             Compression::Bounded { max_error, level } => (2, max_error, level),
         };
-        let columns: Vec<(u8, f64, i32)> = Columns::all().iter().map(column_key).collect();
+        let columns: Vec<(u8, f64, i32)> = Attributes::all().iter().map(column_key).collect();
         CacheKey::new(&(GAUSSIAN_BLOCK, self.frame_block(), columns))
     }
 
     /// Returns the encoding of one attribute.
-    fn column(&self, column: Columns) -> Compression {
+    fn column(&self, column: Attributes) -> Compression {
         match (self.compression, self.bounds.column(column)) {
             (Compression::Zstd(level), max_error) if max_error != 0.0 => Compression::Bounded { max_error, level },
             (compression, _) => compression,
@@ -139,7 +139,7 @@ pub fn join_container(
         for block in blocks.clone() {
             writer.begin(&info.times[packing.frames(source, block)])?;
             for gaussian_block in 0..info.count.div_ceil(GAUSSIAN_BLOCK) {
-                for column in 0..Columns::all().iter().count() {
+                for column in 0..Attributes::all().iter().count() {
                     at = spill.read_record(at, &mut bytes)?;
                     let tile = if bytes.is_empty() { None } else { Some(EncodedTile::from_bytes(&bytes)?) };
                     writer.write_tile(gaussian_block as u32, column as u32, tile.as_ref())?;
@@ -169,7 +169,7 @@ impl ContainerWriter {
         attributes: BTreeMap<String, String>,
     ) -> Result<ContainerWriter> {
         let packing = packing.into();
-        let column = |column: Columns| ColumnSpec {
+        let column = |column: Attributes| ColumnSpec {
             name: column.name().to_owned(),
             width: column.width(sh_degree) as u32,
             max_error: packing.bounds.column(column),
@@ -178,7 +178,7 @@ impl ContainerWriter {
             gaussians: count as u64,
             gaussian_block: GAUSSIAN_BLOCK as u32,
             frame_block: frame_block as u32,
-            columns: Columns::all().iter().map(column).collect(),
+            columns: Attributes::all().iter().map(column).collect(),
             attributes,
         };
         Ok(ContainerWriter { writer: Writer::create(path, layout)?, packing, frame_blocks: 0 })
@@ -233,12 +233,12 @@ impl ContainerWriter {
     /// Adds a frame block, `frames` of `source` at `times`, like [`ContainerWriter::append`]. `presence` says for every
     /// block of Gaussians whether it changes. A block that does not change is read and encoded once for all frames, or
     /// not at all.
-    pub fn append_lives(
+    pub fn append_with_presence(
         &mut self,
         source: &dyn FrameSource,
         frames: Range<usize>,
         times: &[f64],
-        presence: &[BlockPresence],
+        presence: &[BlockChange],
     ) -> Result<()> {
         self.begin(times)?;
         let packing = self.packing;
@@ -271,7 +271,7 @@ impl ContainerWriter {
 
 /// Change of a block of Gaussians within a block of frames.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum BlockPresence {
+pub enum BlockChange {
     /// Varying attributes change; the others are those of the frame block before.
     Varying,
     /// Varying attributes change; the others are written anew.
@@ -283,9 +283,9 @@ pub enum BlockPresence {
 }
 
 /// Returns the change of every block of Gaussians of `source`, in the first block of frames or a later one.
-fn uniform_presence(source: &dyn FrameSource, is_first: bool) -> Vec<BlockPresence> {
+fn uniform_presence(source: &dyn FrameSource, is_first: bool) -> Vec<BlockChange> {
     // An attribute that never varies is encoded for the first block only.
-    let presence = if is_first { BlockPresence::New } else { BlockPresence::Varying };
+    let presence = if is_first { BlockChange::New } else { BlockChange::Varying };
     vec![presence; source.info().count.div_ceil(GAUSSIAN_BLOCK)]
 }
 
@@ -301,7 +301,7 @@ pub fn of_block(count: usize, block: usize) -> Range<usize> {
 fn encode_frames(
     source: &dyn FrameSource,
     frames: Range<usize>,
-    presence: &[BlockPresence],
+    presence: &[BlockChange],
     packing: &Packing,
     advance: impl Fn(u64) + Sync,
     mut each: impl FnMut(u32, u32, Option<&EncodedTile>) -> Result<()>,
@@ -316,10 +316,10 @@ fn encode_frames(
                 let gaussians = of_block(info.count, block as usize);
                 let count = gaussians.len();
                 let (columns, frames) = match presence[block as usize] {
-                    BlockPresence::New => (Columns::all(), frames.clone()),
-                    BlockPresence::Varying => (info.varying, frames.clone()),
-                    BlockPresence::Still => (Columns::all(), frames.start..frames.start + 1),
-                    BlockPresence::Repeating => (Columns::empty(), 0..0),
+                    BlockChange::New => (Attributes::all(), frames.clone()),
+                    BlockChange::Varying => (info.varying, frames.clone()),
+                    BlockChange::Still => (Attributes::all(), frames.start..frames.start + 1),
+                    BlockChange::Repeating => (Attributes::empty(), 0..0),
                 };
                 let tiles = encode_block(source, gaussians, frames.clone(), columns, packing);
                 advance((count * frames.len()) as u64);
@@ -348,8 +348,8 @@ pub fn column_bytes(
 ) -> Result<Vec<usize>> {
     let count = source.info().count;
     let encode_tiles =
-        |&block: &usize| encode_block(source, of_block(count, block), frames.clone(), Columns::all(), packing);
-    let mut bytes = vec![0; Columns::all().iter().count()];
+        |&block: &usize| encode_block(source, of_block(count, block), frames.clone(), Attributes::all(), packing);
+    let mut bytes = vec![0; Attributes::all().iter().count()];
     for tiles in blocks.par_iter().map(encode_tiles).collect::<Result<Vec<_>>>()? {
         bytes.iter_mut().zip(tiles).for_each(|(bytes, tile)| *bytes += tile.map_or(0, |tile| tile.to_bytes().len()));
     }
@@ -362,28 +362,28 @@ fn encode_block(
     source: &dyn FrameSource,
     gaussians: Range<usize>,
     frames: Range<usize>,
-    columns: Columns,
+    columns: Attributes,
     packing: &Packing,
 ) -> Result<Vec<Option<EncodedTile>>> {
     let info = source.info();
     if columns.is_empty() {
-        return Ok(Columns::all().iter().map(|_| None).collect());
+        return Ok(Attributes::all().iter().map(|_| None).collect());
     }
     let len = gaussians.len();
     let mut reader = source.open(Ids::Range(gaussians))?;
     let mut state = Gaussians::zeros(len, info.sh_degree);
-    let mut values: Vec<Vec<f32>> = Columns::all().iter().map(|_| Vec::new()).collect();
+    let mut values: Vec<Vec<f32>> = Attributes::all().iter().map(|_| Vec::new()).collect();
     for frame in frames.clone() {
         // An attribute that never varies is encoded from one frame; the container stores it once.
         let want = if frame == frames.start { columns } else { info.varying };
         reader.read(frame, want, &mut state)?;
         for (values, column) in
-            values.iter_mut().zip(Columns::all().iter()).filter(|(_, column)| want.contains(*column))
+            values.iter_mut().zip(Attributes::all().iter()).filter(|(_, column)| want.contains(*column))
         {
             values.extend_from_slice(state.column(column).planes());
         }
     }
-    let encode_column = |(values, column): (&Vec<f32>, Columns)| {
+    let encode_column = |(values, column): (&Vec<f32>, Attributes)| {
         if !columns.contains(column) {
             return Ok(None);
         }
@@ -391,5 +391,5 @@ fn encode_block(
         let stored = if info.varying.contains(column) { frames.len() } else { 1 };
         Ok(Some(encode_tile(values, stored as u32, width, len as u32, packing.column(column))?))
     };
-    values.iter().zip(Columns::all().iter()).map(encode_column).collect()
+    values.iter().zip(Attributes::all().iter()).map(encode_column).collect()
 }

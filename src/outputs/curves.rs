@@ -8,9 +8,9 @@ use std::path::Path;
 use crate::error::Result;
 use crate::files::accuracy::Accuracy;
 use crate::files::splatv::SplatvGaussian;
-use crate::files::splatv::write::{measure, seen_whole, words, write};
+use crate::files::splatv::write::{default_cameras, measure, words, write};
 use crate::fit::{CubicTrack, Misfit, Tolerance, curved};
-use crate::model::{Columns, color};
+use crate::model::{Attributes, color};
 use crate::passes::{gather_all, tracks};
 use crate::progress::Events;
 use crate::source::FrameSource;
@@ -30,13 +30,13 @@ pub fn write_curves(source: &dyn FrameSource, path: &Path, events: &Events) -> R
     })?;
     let misfit = found.iter().map(|(_, misfit)| *misfit).fold(Misfit::default(), Misfit::and);
     let rows: Vec<SplatvGaussian> = found.iter().flat_map(|(curves, _)| curves).map(splatv_gaussian).collect();
-    let first = gather_all(source, 0, Columns::POSITION)?;
+    let first = gather_all(source, 0, Attributes::POSITION)?;
     let mut accuracy = Accuracy::new(&first.position);
     let row_ids = found.iter().enumerate().flat_map(|(id, (curves, _))| curves.iter().map(move |_| id));
     row_ids.zip(&rows).for_each(|(id, row)| measure(row, id, &mut accuracy));
     accuracy.check("a .splatv")?;
     let rows: Vec<_> = rows.iter().map(words).collect();
-    write(path, rows.len(), rows.iter().copied(), &seen_whole(&first.position))?;
+    write(path, rows.len(), rows.iter().copied(), &default_cameras(&first.position))?;
     let sh_loss = if info.sh_degree > 0 { ", in colors that do not change with direction" } else { "" };
     Ok(format!(
         "{} Gaussians became {} curves{sh_loss}; error of positions, as a fraction of the Gaussian's middle scale: {:.3} \
@@ -99,12 +99,12 @@ mod tests {
         let message = write_curves(&scene, &path, &Events::IGNORED).unwrap();
         assert!(message.starts_with("300 Gaussians became"), "{message}");
         let file = Splatv::open(&path).unwrap();
-        let rows: Vec<SplatvGaussian> = (0..file.count()).map(|k| SplatvGaussian::of_words(&file.words(k))).collect();
+        let rows: Vec<SplatvGaussian> = (0..file.count()).map(|k| SplatvGaussian::from_words(&file.words(k))).collect();
         let (mut missing, mut too_faint) = (0.0, 0.0);
         let mut seen = 0;
         for frame in 0..30 {
             let time = scene.info().times[frame];
-            let state = gather_all(&scene, frame, Columns::all()).unwrap();
+            let state = gather_all(&scene, frame, Attributes::all()).unwrap();
             // States that the viewer draws, by its own formulas.
             let shown: Vec<([f64; 3], f64)> = rows
                 .iter()

@@ -12,9 +12,9 @@ use fourdgs::{GaussianSet, SceneExtras, WriteOptions, write_to_vec};
 
 use crate::TOOL;
 use crate::error::{Error, Result, ShowPath};
-use crate::files::accuracy::{Accuracy, Drawn};
+use crate::files::accuracy::{Accuracy, RenderedAttributes};
 use crate::fit::{LinearPiece, Misfit, Tolerance, straight};
-use crate::model::{Column, color};
+use crate::model::{AttributeValues, color};
 use crate::passes::tracks;
 use crate::progress::Events;
 use crate::source::FrameSource;
@@ -94,12 +94,16 @@ fn snap_to_grid(set: &mut GaussianSet, options: &WriteOptions) {
 /// Checks that the grid leaves the Gaussians `ids`, piece by piece, close to the positions `wanted`.
 fn check_positions(set: &GaussianSet, wanted: &[f32], ids: impl Iterator<Item = usize>) -> Result<()> {
     let planes = (0..3).flat_map(|axis| wanted.iter().skip(axis).step_by(3).copied()).collect();
-    let mut accuracy = Accuracy::new(&Column::from_planes(3, planes));
+    let mut accuracy = Accuracy::new(&AttributeValues::from_planes(3, planes));
     for (k, id) in ids.enumerate() {
         let triple = |values: &[f32]| [0, 1, 2].map(|axis| f64::from(values[3 * k + axis]));
         let opacity = f64::from(set.colors[4 * k + 3]);
-        let drawn =
-            |place: &[f32]| Drawn { position: triple(place), scale: triple(&set.scales), opacity, color: [0.0; 3] };
+        let drawn = |place: &[f32]| RenderedAttributes {
+            position: triple(place),
+            scale: triple(&set.scales),
+            opacity,
+            color: [0.0; 3],
+        };
         accuracy.add(id, &drawn(wanted), &drawn(&set.positions));
     }
     accuracy.check("a .4dgs")
@@ -133,7 +137,7 @@ fn add_piece(set: &mut GaussianSet, piece: &LinearPiece, starts: &[f64]) {
 mod tests {
     use super::*;
     use crate::diagnostics::demo_scene::Scene;
-    use crate::model::{Columns, opacity};
+    use crate::model::{Attributes, opacity};
     use crate::passes::gather_all;
 
     #[test]
@@ -149,15 +153,16 @@ mod tests {
         let median = scales[scales.len() / 2];
         let (mut missing, mut apart, mut seen) = (0, 0.0f64, 0);
         for frame in 0..24 {
-            let expected = gather_all(&scene, frame, Columns::all()).unwrap();
+            let expected = gather_all(&scene, frame, Attributes::all()).unwrap();
             // Evaluates just after the start of the frame; pieces are straight, so positions are off by a fraction of a
             // step.
             let state = read.gaussians.state_at(frame as f64 / FRAME_RATE + 1e-4, read.header.cutoff);
-            let seen_now = (0..400).filter(|&id| opacity(expected.opacity_logit.row::<1>(id)[0]) >= crate::fit::SEEN);
+            let seen_now = (0..400)
+                .filter(|&id| opacity(expected.opacity_logit.row::<1>(id)[0]) >= crate::fit::MIN_VISIBLE_OPACITY);
             assert_eq!(state.indices.len(), seen_now.count(), "one piece of each at a time");
             for id in 0..400 {
                 let visible = opacity(expected.opacity_logit.row::<1>(id)[0]);
-                if visible < crate::fit::SEEN {
+                if visible < crate::fit::MIN_VISIBLE_OPACITY {
                     continue;
                 }
                 let at = expected.position.row::<3>(id);

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use crate::error::{Error, Result};
 use crate::files::frame_stream::{FrameMark, StreamHeader};
-use crate::model::{Column, Columns, Gaussians};
+use crate::model::{AttributeValues, Attributes, Gaussians};
 
 /// Writer of a frame stream. The stream is incomplete until [`StreamWriter::finish`].
 #[derive(Debug)]
@@ -26,7 +26,7 @@ impl<W: Write> StreamWriter<W> {
     pub fn new(to: W, name: &Path, header: StreamHeader, constant: &Gaussians) -> Result<StreamWriter<W>> {
         let mut stream = StreamWriter { to, name: name.to_owned(), header, frames: 0, last_time: None };
         stream.write_bytes(&header.to_bytes())?;
-        stream.write_columns(Columns::all().difference(header.varying), constant)?;
+        stream.write_columns(Attributes::all().difference(header.varying), constant)?;
         Ok(stream)
     }
 
@@ -57,9 +57,9 @@ impl<W: Write> StreamWriter<W> {
         self.to.flush().map_err(Error::io("write", &self.name))
     }
 
-    fn write_columns(&mut self, columns: Columns, state: &Gaussians) -> Result<()> {
+    fn write_columns(&mut self, columns: Attributes, state: &Gaussians) -> Result<()> {
         for column in columns.iter() {
-            let values: &Column = state.column(column);
+            let values: &AttributeValues = state.column(column);
             let (len, width) = (self.header.count, column.width(self.header.sh_degree));
             if (values.len(), values.width()) != (len, width) {
                 let (name, found) = (column.name(), (values.len(), values.width()));

@@ -83,8 +83,8 @@ impl RowTable<'_> {
     /// Returns the columns in order, with their names in both formats.
     fn columns(&self) -> Vec<(&'static str, TableColumn<'_>)> {
         let column = |statistic: Statistic| match statistic.values() {
-            model::Values::F64(values, _) => (statistic.column(), TableColumn::F64(values(self.rows))),
-            model::Values::U32(values, _) => (statistic.column(), TableColumn::U32(values(self.rows))),
+            model::StatisticAccess::F64(values, _) => (statistic.column(), TableColumn::F64(values(self.rows))),
+            model::StatisticAccess::U32(values, _) => (statistic.column(), TableColumn::U32(values(self.rows))),
         };
         let mut columns: Vec<_> =
             Statistic::ALL.into_iter().filter(|&statistic| statistic != Statistic::W).map(column).collect();

@@ -2,18 +2,18 @@
 
 use crate::compressed_model::{ParamDelta, TrajectoryDelta};
 use crate::error::Result;
-use crate::model::{Column, Columns, Gaussians, SequenceInfo};
+use crate::model::{AttributeValues, Attributes, Gaussians, SequenceInfo};
 use crate::source::{BlockReader, FrameSource, Ids, ReadPlan, Reads};
 
 /// Source whose parameters are changed by a delta that is constant in time and by a trajectory delta.
-pub struct Changed<'a> {
+pub struct WithDelta<'a> {
     source: Box<dyn FrameSource + 'a>,
     delta: &'a ParamDelta,
     trajectory: &'a TrajectoryDelta,
     info: SequenceInfo,
 }
 
-impl<'a> Changed<'a> {
+impl<'a> WithDelta<'a> {
     /// Returns `source` with `delta` and `trajectory` added to its Gaussians, and SH up to `sh_degree` only. If both
     /// deltas are empty and no SH degree is above `sh_degree`, the frames equal those of `source`.
     pub fn new(
@@ -21,11 +21,11 @@ impl<'a> Changed<'a> {
         delta: &'a ParamDelta,
         trajectory: &'a TrajectoryDelta,
         sh_degree: usize,
-    ) -> Changed<'a> {
+    ) -> WithDelta<'a> {
         let mut info = source.info().clone();
         info.sh_degree = info.sh_degree.min(sh_degree);
         info.varying |= trajectory.columns();
-        Changed { source, delta, trajectory, info }
+        WithDelta { source, delta, trajectory, info }
     }
 
     fn is_unchanged(&self) -> bool {
@@ -42,13 +42,13 @@ impl<'a> Changed<'a> {
     }
 
     /// Returns a buffer for all SH coefficients of `source` if some of them are dropped.
-    fn dropped_sh_buffer(&self) -> Option<Column> {
+    fn dropped_sh_buffer(&self) -> Option<AttributeValues> {
         let degree = self.source.info().sh_degree;
         (degree > self.info.sh_degree).then(|| Gaussians::zeros(0, degree).sh)
     }
 }
 
-impl FrameSource for Changed<'_> {
+impl FrameSource for WithDelta<'_> {
     fn info(&self) -> &SequenceInfo {
         &self.info
     }
@@ -88,12 +88,12 @@ struct ChangedReader<'a> {
     /// Number of frames of the sequence.
     frames: usize,
     /// Buffer into which all SH coefficients are read if some of them are dropped.
-    all_sh: Option<Column>,
+    all_sh: Option<AttributeValues>,
 }
 
 impl BlockReader for ChangedReader<'_> {
-    fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
-        match self.all_sh.as_mut().filter(|_| want.contains(Columns::SH)) {
+    fn read(&mut self, frame: usize, want: Attributes, out: &mut Gaussians) -> Result<()> {
+        match self.all_sh.as_mut().filter(|_| want.contains(Attributes::SH)) {
             None => self.reader.read(frame, want, out)?,
             Some(all) => {
                 std::mem::swap(&mut out.sh, all);
@@ -122,7 +122,7 @@ impl BlockReader for ChangedReader<'_> {
 mod tests {
     use super::*;
     use crate::diagnostics::demo_scene::Scene;
-    use crate::model::ALL_HARMONICS;
+    use crate::model::NO_SH_LIMIT;
 
     #[test]
     fn each_gaussian_gets_its_own_delta_in_every_column() {
@@ -136,11 +136,11 @@ mod tests {
         }
         let delta = ParamDelta(by);
         let no_trajectory = TrajectoryDelta::default();
-        let changed = Changed::new(Box::new(Scene::new(40, 3)), &delta, &no_trajectory, ALL_HARMONICS);
+        let changed = WithDelta::new(Box::new(Scene::new(40, 3)), &delta, &no_trajectory, NO_SH_LIMIT);
         for ids in [Ids::List(&[39, 5, 0]), Ids::Range(7..12)] {
             let read = |source: &dyn FrameSource| {
                 let mut state = Gaussians::zeros(ids.len(), plain.info().sh_degree);
-                source.open(ids.clone()).unwrap().read(2, Columns::all(), &mut state).unwrap();
+                source.open(ids.clone()).unwrap().read(2, Attributes::all(), &mut state).unwrap();
                 state
             };
             let (mut expected, got) = (read(&plain), read(&changed));
@@ -154,21 +154,21 @@ mod tests {
         }
         for ids in [Ids::List(&[39, 5, 0]), Ids::Range(0..40)] {
             // Without SH degree 1, whose change is dropped with it.
-            let fewer = Changed::new(Box::new(Scene::new(40, 3)), &delta, &no_trajectory, 0);
+            let fewer = WithDelta::new(Box::new(Scene::new(40, 3)), &delta, &no_trajectory, 0);
             assert_eq!((fewer.info().sh_degree, plain.info().sh_degree), (0, 1));
             let mut expected = Gaussians::zeros(ids.len(), 1);
-            changed.open(ids.clone()).unwrap().read(1, Columns::all(), &mut expected).unwrap();
-            expected.drop_bands(0);
+            changed.open(ids.clone()).unwrap().read(1, Attributes::all(), &mut expected).unwrap();
+            expected.truncate_sh(0);
             let mut got = Gaussians::zeros(0, 0);
-            fewer.open(ids.clone()).unwrap().read(1, Columns::all(), &mut got).unwrap();
+            fewer.open(ids.clone()).unwrap().read(1, Attributes::all(), &mut got).unwrap();
             assert!(got == expected, "{ids:?}");
         }
         let none = ParamDelta::default();
         let mut untouched = Gaussians::zeros(40, plain.info().sh_degree);
-        let unchanged = Changed::new(Box::new(Scene::new(40, 3)), &none, &no_trajectory, ALL_HARMONICS);
-        unchanged.open(Ids::Range(0..40)).unwrap().read(1, Columns::all(), &mut untouched).unwrap();
+        let unchanged = WithDelta::new(Box::new(Scene::new(40, 3)), &none, &no_trajectory, NO_SH_LIMIT);
+        unchanged.open(Ids::Range(0..40)).unwrap().read(1, Attributes::all(), &mut untouched).unwrap();
         let mut expected = untouched.clone();
-        plain.open(Ids::Range(0..40)).unwrap().read(1, Columns::all(), &mut expected).unwrap();
+        plain.open(Ids::Range(0..40)).unwrap().read(1, Attributes::all(), &mut expected).unwrap();
         assert!(untouched == expected);
     }
 
@@ -177,21 +177,21 @@ mod tests {
         let plain = Scene::new(30, 5);
         let keyframe = |scale: f32| {
             let mut by = Gaussians::zeros(0, 0);
-            by.log_scale = Column::from_planes(3, (0..90).map(|k| scale * k as f32).collect());
+            by.log_scale = AttributeValues::from_planes(3, (0..90).map(|k| scale * k as f32).collect());
             ParamDelta(by)
         };
         let (delta, trajectory) = (keyframe(0.5), TrajectoryDelta(vec![keyframe(0.0), keyframe(1.0), keyframe(-1.0)]));
-        assert!(!plain.info().varying.contains(Columns::LOG_SCALE));
-        let changed = Changed::new(Box::new(Scene::new(30, 5)), &delta, &trajectory, ALL_HARMONICS);
-        assert_eq!(changed.info().varying, plain.info().varying | Columns::LOG_SCALE);
+        assert!(!plain.info().varying.contains(Attributes::LOG_SCALE));
+        let changed = WithDelta::new(Box::new(Scene::new(30, 5)), &delta, &trajectory, NO_SH_LIMIT);
+        assert_eq!(changed.info().varying, plain.info().varying | Attributes::LOG_SCALE);
         let ids = [4, 29, 0];
         let mut reader = changed.open(Ids::List(&ids)).unwrap();
         for (frame, scale) in [(0, 0.5), (1, 1.0), (2, 1.5), (3, 0.5), (4, -0.5)] {
             let mut expected = Gaussians::zeros(3, plain.info().sh_degree);
-            plain.open(Ids::List(&ids)).unwrap().read(frame, Columns::all(), &mut expected).unwrap();
-            keyframe(scale).pick(&ids).add_to(&mut expected, Columns::all());
+            plain.open(Ids::List(&ids)).unwrap().read(frame, Attributes::all(), &mut expected).unwrap();
+            keyframe(scale).pick(&ids).add_to(&mut expected, Attributes::all());
             let mut got = Gaussians::zeros(3, plain.info().sh_degree);
-            reader.read(frame, Columns::all(), &mut got).unwrap();
+            reader.read(frame, Attributes::all(), &mut got).unwrap();
             assert!(got == expected, "frame {frame}");
         }
     }

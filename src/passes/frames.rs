@@ -5,7 +5,7 @@ use rayon::prelude::*;
 use super::BLOCK;
 use super::parts::BlockSlices;
 use crate::error::Result;
-use crate::model::{Columns, Gaussians, SequenceInfo};
+use crate::model::{Attributes, Gaussians, SequenceInfo};
 use crate::source::{BlockReader, FrameSource, Ids, ReadPlan};
 
 /// Readers over blocks of Gaussians, kept open for all frames to be read.
@@ -13,7 +13,7 @@ use crate::source::{BlockReader, FrameSource, Ids, ReadPlan};
 /// Memory: the reader of every Gaussian; per thread one block's state at one frame.
 pub struct FrameReaders<'a> {
     info: &'a SequenceInfo,
-    columns: Columns,
+    columns: Attributes,
     count: usize,
     readers: Vec<Box<dyn BlockReader + 'a>>,
 }
@@ -26,7 +26,7 @@ impl<'a> FrameReaders<'a> {
     pub fn open(
         source: &'a dyn FrameSource,
         ids: Ids<'_>,
-        columns: Columns,
+        columns: Attributes,
         wanted: &ReadPlan,
     ) -> Result<FrameReaders<'a>> {
         let count = ids.len();
@@ -53,13 +53,13 @@ impl<'a> FrameReaders<'a> {
 
     /// Returns the SH degree of the state: 0 if SH is not read, which avoids its memory.
     fn sh_degree(&self) -> usize {
-        if self.columns.contains(Columns::SH) { self.info.sh_degree } else { 0 }
+        if self.columns.contains(Attributes::SH) { self.info.sh_degree } else { 0 }
     }
 }
 
 impl BlockReader for FrameReaders<'_> {
     /// Reads the columns of `want` for which the readers were opened.
-    fn read(&mut self, frame: usize, want: Columns, state: &mut Gaussians) -> Result<()> {
+    fn read(&mut self, frame: usize, want: Attributes, state: &mut Gaussians) -> Result<()> {
         let want = want & self.columns;
         if want.is_empty() {
             return Ok(());
@@ -86,7 +86,7 @@ impl BlockReader for FrameReaders<'_> {
 /// Memory: that of [`FrameReaders`], or of the source's own reader ([`FrameSource::open_all`]).
 pub(super) fn open_all<'a>(
     source: &'a dyn FrameSource,
-    columns: Columns,
+    columns: Attributes,
     wanted: &ReadPlan,
 ) -> Result<Box<dyn BlockReader + 'a>> {
     match source.open_all(wanted) {

@@ -7,7 +7,7 @@ use super::BLOCK;
 use super::frames::open_all;
 use super::parts::BlockSlices;
 use crate::error::{Error, Result};
-use crate::model::{Column, Columns, Gaussians};
+use crate::model::{AttributeValues, Attributes, Gaussians};
 use crate::source::{BlockReader, FrameSource, Ids, ReadPlan};
 
 /// Reads the columns `want` of the Gaussians `ids` at `frame`; all other columns are empty.
@@ -16,7 +16,7 @@ use crate::source::{BlockReader, FrameSource, Ids, ReadPlan};
 ///
 /// # Errors
 /// A frame that cannot be read.
-pub fn gather(source: &dyn FrameSource, ids: &[u32], frame: usize, want: Columns) -> Result<Gaussians> {
+pub fn gather(source: &dyn FrameSource, ids: &[u32], frame: usize, want: Attributes) -> Result<Gaussians> {
     let sh_degree = source.info().sh_degree;
     let mut all = Gaussians::zeros(0, sh_degree);
     let parts = BlockSlices::split(&mut all, want, ids.len());
@@ -38,7 +38,7 @@ pub fn gather(source: &dyn FrameSource, ids: &[u32], frame: usize, want: Columns
 ///
 /// # Errors
 /// A frame that cannot be read.
-pub fn gather_all(source: &dyn FrameSource, frame: usize, want: Columns) -> Result<Gaussians> {
+pub fn gather_all(source: &dyn FrameSource, frame: usize, want: Attributes) -> Result<Gaussians> {
     let mut all = Gaussians::zeros(0, source.info().sh_degree);
     open_all(source, want, &ReadPlan::new([frame]))?.read(frame, want, &mut all)?;
     Ok(all)
@@ -46,22 +46,22 @@ pub fn gather_all(source: &dyn FrameSource, frame: usize, want: Columns) -> Resu
 
 /// Reader of all Gaussians of a source that does not decode frames together. It opens a reader per block and frame,
 /// because readers kept open would take memory and save nothing.
-pub struct InBlocks<'a> {
+pub struct BlockwiseReader<'a> {
     source: &'a dyn FrameSource,
     ids: Vec<u32>,
 }
 
-impl<'a> InBlocks<'a> {
+impl<'a> BlockwiseReader<'a> {
     /// Creates a reader of all Gaussians of `source`. Memory: 4 bytes per Gaussian.
-    pub fn new(source: &'a dyn FrameSource) -> InBlocks<'a> {
-        InBlocks { source, ids: (0..source.info().count as u32).collect() }
+    pub fn new(source: &'a dyn FrameSource) -> BlockwiseReader<'a> {
+        BlockwiseReader { source, ids: (0..source.info().count as u32).collect() }
     }
 }
 
-impl BlockReader for InBlocks<'_> {
-    fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
+impl BlockReader for BlockwiseReader<'_> {
+    fn read(&mut self, frame: usize, want: Attributes, out: &mut Gaussians) -> Result<()> {
         // Free the old columns before the new ones are read.
-        out.columns_mut(want).for_each(|column| *column = Column::default());
+        out.columns_mut(want).for_each(|column| *column = AttributeValues::default());
         let mut found = gather(self.source, &self.ids, frame, want)?;
         out.columns_mut(want).zip(found.columns_mut(want)).for_each(|(old, new)| std::mem::swap(old, new));
         Ok(())

@@ -4,7 +4,7 @@
 use std::ops::Range;
 
 use crate::error::Result;
-use crate::model::{Column, Columns, Gaussians, SequenceInfo};
+use crate::model::{AttributeValues, Attributes, Gaussians, SequenceInfo};
 use crate::source::{BlockReader, FrameSource, Ids};
 
 /// Source of frames held in memory with all columns. Its frame 0 is the first frame held.
@@ -16,7 +16,7 @@ pub struct HeldFrames {
 
 impl HeldFrames {
     /// Creates a source of `count` Gaussians without frames. `constant` holds the columns outside `varying`.
-    pub fn new(count: usize, sh_degree: usize, varying: Columns, constant: Gaussians) -> Self {
+    pub fn new(count: usize, sh_degree: usize, varying: Attributes, constant: Gaussians) -> Self {
         let info = SequenceInfo { count, times: Vec::new(), sh_degree, varying };
         HeldFrames { info, constant, frames: Vec::new() }
     }
@@ -34,8 +34,8 @@ impl HeldFrames {
     }
 
     /// Returns the positions of all Gaussians at a held frame.
-    pub fn position(&self, frame: usize) -> &Column {
-        let varies = self.info.varying.contains(Columns::POSITION);
+    pub fn position(&self, frame: usize) -> &AttributeValues {
+        let varies = self.info.varying.contains(Attributes::POSITION);
         if varies { &self.frames[frame].position } else { &self.constant.position }
     }
 
@@ -75,7 +75,7 @@ struct HeldReader<'a> {
 }
 
 impl BlockReader for HeldReader<'_> {
-    fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
+    fn read(&mut self, frame: usize, want: Attributes, out: &mut Gaussians) -> Result<()> {
         for column in want.iter() {
             let varies = self.held.info.varying.contains(column);
             let from = if varies { &self.held.frames[frame] } else { &self.held.constant }.column(column);

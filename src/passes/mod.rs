@@ -10,15 +10,15 @@ mod sample;
 mod states;
 mod tracks;
 
-pub use changed::Changed;
+pub use changed::WithDelta;
 pub use frames::FrameReaders;
-pub use gather::{InBlocks, gather, gather_all};
+pub use gather::{BlockwiseReader, gather, gather_all};
 pub use held::HeldFrames;
 pub use parts::BlockSlices;
-pub use pictures::{Batch, Subject, VIEWS_PER_THREAD, ViewStates, show};
-pub use sample::{Sampler, VIEWS_AT_ONCE, frames_to_see, looked_at, spread, spread_over};
+pub use pictures::{Batch, RenderedSource, VIEWS_PER_THREAD, ViewStates, show};
+pub use sample::{Sampler, VIEWS_PER_FRAME, frames_to_see, looked_at, spread, spread_over};
 pub use states::States;
-pub use tracks::{TRACKED, tracks};
+pub use tracks::{TRACK_BLOCK, tracks};
 
 /// Number of Gaussians per unit of parallel work: their state at a frame and their accumulators fit into the caches. No
 /// result depends on it.

@@ -1,7 +1,7 @@
 //! Division of a state into slices that blocks of Gaussians are written to, each from its own thread.
 
 use super::BLOCK;
-use crate::model::{Columns, Gaussians};
+use crate::model::{Attributes, Gaussians};
 
 /// Destination of one block: a slice for every component of every column, in order.
 pub struct BlockSlices<'a>(Vec<&'a mut [f32]>);
@@ -9,7 +9,7 @@ pub struct BlockSlices<'a>(Vec<&'a mut [f32]>);
 impl<'a> BlockSlices<'a> {
     /// Resizes the columns `want` of `state` to `count` Gaussians and divides them, one part for each [`BLOCK`] of
     /// Gaussians.
-    pub fn split(state: &'a mut Gaussians, want: Columns, count: usize) -> Vec<BlockSlices<'a>> {
+    pub fn split(state: &'a mut Gaussians, want: Attributes, count: usize) -> Vec<BlockSlices<'a>> {
         let mut parts: Vec<BlockSlices<'a>> = (0..count.div_ceil(BLOCK)).map(|_| BlockSlices(Vec::new())).collect();
         for column in state.columns_mut(want) {
             column.resize(count);
@@ -21,7 +21,7 @@ impl<'a> BlockSlices<'a> {
     }
 
     /// Copies the columns `want` of `block` to the slices.
-    pub fn write(self, block: &Gaussians, want: Columns) {
+    pub fn write(self, block: &Gaussians, want: Attributes) {
         let columns = want.iter().map(|column| block.column(column));
         let planes = columns.flat_map(|column| (0..column.width()).map(|c| column.plane(c)));
         self.0.into_iter().zip(planes).for_each(|(part, plane)| part.copy_from_slice(plane));

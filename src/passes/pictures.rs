@@ -13,7 +13,7 @@ use super::FrameReaders;
 use super::frames::open_all;
 use crate::error::Result;
 use crate::limits::Limits;
-use crate::model::{Camera, Column, Columns, Gaussians, Picture};
+use crate::model::{AttributeValues, Attributes, Camera, FrameView, Gaussians};
 use crate::render::{Image, blend_features, render};
 use crate::source::{BlockReader, FeatureDecoder, FrameSource, Ids, ReadPlan};
 
@@ -21,20 +21,20 @@ use crate::source::{BlockReader, FeatureDecoder, FrameSource, Ids, ReadPlan};
 pub const VIEWS_PER_THREAD: usize = 4;
 
 /// Gaussians that views show.
-pub struct Subject<'a> {
+pub struct RenderedSource<'a> {
     /// Source of the states.
     pub source: &'a dyn FrameSource,
     /// Gaussians for which readers are kept open over all frames. `None`: all Gaussians, read in the way that is
     /// cheapest for the source ([`FrameSource::open_all`]).
     pub ids: Option<Ids<'a>>,
     /// Columns that are read; the others are empty.
-    pub columns: Columns,
+    pub columns: Attributes,
 }
 
-impl<'a> Subject<'a> {
+impl<'a> RenderedSource<'a> {
     /// Returns the subject of all Gaussians of `source` with all columns.
-    pub fn all(source: &'a dyn FrameSource) -> Subject<'a> {
-        Subject { source, ids: None, columns: Columns::all() }
+    pub fn all(source: &'a dyn FrameSource) -> RenderedSource<'a> {
+        RenderedSource { source, ids: None, columns: Attributes::all() }
     }
 
     /// Returns the decoder of the source's features, if all Gaussians are shown and have features.
@@ -76,9 +76,9 @@ impl Batch {
     }
 
     /// Returns how many of the first `pictures` form a batch.
-    fn batch_length(&self, pictures: &[Picture]) -> usize {
+    fn batch_length(&self, pictures: &[FrameView]) -> usize {
         let (mut frames, mut last) = (0, None);
-        let fits = |picture: &&Picture| {
+        let fits = |picture: &&FrameView| {
             frames += usize::from(last != Some(picture.frame));
             last = Some(picture.frame);
             frames <= self.frames.max(1)
@@ -91,13 +91,13 @@ impl Batch {
 #[derive(Clone, Copy)]
 pub struct ViewStates<'a, const S: usize> {
     /// Frame, view number and camera index.
-    pub picture: Picture,
+    pub picture: FrameView,
     /// Camera of the view.
     pub camera: &'a Camera,
     /// States of the subjects at the view's frame.
     pub states: [&'a Gaussians; S],
     /// Decoder and features of each subject that has features in place of colors.
-    decoded: [Option<(&'a dyn FeatureDecoder, &'a Column)>; S],
+    decoded: [Option<(&'a dyn FeatureDecoder, &'a AttributeValues)>; S],
 }
 
 impl<const S: usize> ViewStates<'_, S> {
@@ -108,7 +108,7 @@ impl<const S: usize> ViewStates<'_, S> {
     }
 
     /// Returns the features of the subject with index `subject`, if its renders use features.
-    pub fn features(&self, subject: usize) -> Option<&Column> {
+    pub fn features(&self, subject: usize) -> Option<&AttributeValues> {
         self.decoded[subject].map(|(_, features)| features)
     }
 
@@ -118,7 +118,7 @@ impl<const S: usize> ViewStates<'_, S> {
         &self,
         subject: usize,
         state: &Gaussians,
-        features: Option<&Column>,
+        features: Option<&AttributeValues>,
         background: [f32; 3],
     ) -> Image {
         let camera = self.camera;
@@ -144,7 +144,7 @@ struct StateSlot<const S: usize> {
     frame: usize,
     states: [Gaussians; S],
     /// Features of each subject that has some.
-    features: [Column; S],
+    features: [AttributeValues; S],
 }
 
 /// Calls `visit` with batches of `pictures`, in order. `pictures` must be in the order of their frames, with cameras as
@@ -156,9 +156,9 @@ struct StateSlot<const S: usize> {
 /// # Errors
 /// Frames that cannot be read; errors of `visit`.
 pub fn show<const S: usize>(
-    subjects: [Subject<'_>; S],
+    subjects: [RenderedSource<'_>; S],
     cameras: &[Camera],
-    pictures: &[Picture],
+    pictures: &[FrameView],
     max_batch: Batch,
     mut visit: impl FnMut(&[ViewStates<'_, S>]) -> Result<()>,
 ) -> Result<()> {
@@ -181,7 +181,7 @@ pub fn show<const S: usize>(
             let is_new = index == slots.len();
             if is_new {
                 let states = std::array::from_fn(|k| Gaussians::zeros(0, subjects[k].source.info().sh_degree));
-                slots.push(StateSlot { frame, states, features: std::array::from_fn(|_| Column::default()) });
+                slots.push(StateSlot { frame, states, features: std::array::from_fn(|_| AttributeValues::default()) });
             } else if slots[index].frame == frame {
                 continue;
             }
@@ -237,9 +237,9 @@ impl<W: Send> Workers<W> {
     /// Frames that cannot be read.
     pub(crate) fn show(
         &mut self,
-        subject: Subject<'_>,
+        subject: RenderedSource<'_>,
         cameras: &[Camera],
-        pictures: &[Picture],
+        pictures: &[FrameView],
         new_worker: impl Fn() -> W + Sync,
         visit: impl Fn(&mut W, &Gaussians, &Camera) + Sync,
     ) -> Result<()> {
@@ -274,8 +274,8 @@ mod tests {
     use crate::passes::gather_all;
 
     /// Returns `views` views of every frame of `frames`.
-    fn pictures(frames: &[usize], views: u32) -> Vec<Picture> {
-        let of_frame = |&frame: &usize| (0..views).map(move |view| Picture { frame, view, camera: view });
+    fn pictures(frames: &[usize], views: u32) -> Vec<FrameView> {
+        let of_frame = |&frame: &usize| (0..views).map(move |view| FrameView { frame, view, camera: view });
         frames.iter().flat_map(of_frame).collect()
     }
 
@@ -284,12 +284,13 @@ mod tests {
         let scene = Scene::new(1500, 9);
         let rig = scene.rig();
         let all = pictures(&[0, 2, 3, 7, 8], 3);
-        let expected: Vec<Gaussians> = (0..9).map(|frame| gather_all(&scene, frame, Columns::all()).unwrap()).collect();
+        let expected: Vec<Gaussians> =
+            (0..9).map(|frame| gather_all(&scene, frame, Attributes::all()).unwrap()).collect();
         for (frames, max_batch) in [(1, 1), (1, 2), (1, 9), (2, 4), (3, 7), (9, 99), (0, 0)] {
             let mut seen = Vec::new();
             let batch = Batch { frames, pictures: max_batch, held: 4 };
-            let position = Subject { source: &scene, ids: None, columns: Columns::POSITION };
-            show([Subject::all(&scene), position], &rig.cameras, &all, batch, |views| {
+            let position = RenderedSource { source: &scene, ids: None, columns: Attributes::POSITION };
+            show([RenderedSource::all(&scene), position], &rig.cameras, &all, batch, |views| {
                 assert!(views.len() <= max_batch.max(1), "{} pictures of at most {max_batch}", views.len());
                 let of_frames = views.chunk_by(|a, b| a.picture.frame == b.picture.frame).count();
                 assert!(of_frames <= frames.max(1), "{of_frames} frames of at most {frames}");
@@ -324,8 +325,8 @@ mod tests {
     }
 
     impl FeatureDecoder for RayScene {
-        fn features(&self, frame: usize, out: &mut Column) -> Result<()> {
-            *out = Column::zeros(2, self.info().count);
+        fn features(&self, frame: usize, out: &mut AttributeValues) -> Result<()> {
+            *out = AttributeValues::zeros(2, self.info().count);
             out.plane_mut(1).fill(frame as f32);
             Ok(())
         }
@@ -342,8 +343,8 @@ mod tests {
         let rig = scene.0.rig();
         let some: Vec<u32> = (0..200).collect();
         let batch = Batch { frames: 2, pictures: 4, held: 4 };
-        let few = Subject { source: &scene, ids: Some(Ids::List(&some)), columns: Columns::all() };
-        show([Subject::all(&scene), few], &rig.cameras, &pictures(&[0, 2], 2), batch, |views| {
+        let few = RenderedSource { source: &scene, ids: Some(Ids::List(&some)), columns: Attributes::all() };
+        show([RenderedSource::all(&scene), few], &rig.cameras, &pictures(&[0, 2], 2), batch, |views| {
             for view in views {
                 let (image, camera) = (view.render(0, [1.0; 3]), view.camera);
                 assert_eq!(image.data.len(), 3 * (camera.width * camera.height) as usize);
@@ -375,7 +376,8 @@ mod tests {
         let reads = |views: u32| {
             let before = container.reads();
             let batch = Batch { frames: 1, pictures: 2, held: usize::MAX };
-            show([Subject::all(&container)], &rig.cameras, &pictures(&[1, 4], views), batch, |_| Ok(())).unwrap();
+            show([RenderedSource::all(&container)], &rig.cameras, &pictures(&[1, 4], views), batch, |_| Ok(()))
+                .unwrap();
             container.reads() - before
         };
         assert_eq!(reads(5), reads(1));

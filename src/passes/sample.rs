@@ -1,11 +1,11 @@
 //! Selection of the views of a schedule that a pass renders.
 
-use crate::model::{Picture, Schedule};
+use crate::model::{FrameView, ViewSchedule};
 use crate::recipe;
 
 /// Number of views per frame for which a frame is worth reading. A selection of few views takes this many of each
 /// frame.
-pub const VIEWS_AT_ONCE: usize = 3;
+pub const VIEWS_PER_FRAME: usize = 3;
 
 /// Selection of views frame by frame.
 #[derive(Debug, Clone)]
@@ -30,18 +30,18 @@ impl Sampler {
 
     /// Returns the selected views of the next frame. `frame` is its number and `views` are its (view number, camera)
     /// pairs.
-    pub fn next<'a>(&mut self, frame: usize, views: &'a [(u32, u32)]) -> impl Iterator<Item = Picture> + use<'a> {
+    pub fn next<'a>(&mut self, frame: usize, views: &'a [(u32, u32)]) -> impl Iterator<Item = FrameView> + use<'a> {
         let first_view = self.frames_with_views / self.frame_stride;
         let is_taken = self.frames_with_views.is_multiple_of(self.frame_stride);
         self.frames_with_views += usize::from(!views.is_empty());
         let views = if is_taken { views } else { &[] };
         let taken = views.iter().skip(first_view % self.view_stride).step_by(self.view_stride);
-        taken.map(move |&(view, camera)| Picture { frame, view, camera })
+        taken.map(move |&(view, camera)| FrameView { frame, view, camera })
     }
 
     /// Returns the selected part of `schedule`.
-    fn thin(mut self, schedule: &Schedule) -> Schedule {
-        let mut left = Schedule::default();
+    fn thin(mut self, schedule: &ViewSchedule) -> ViewSchedule {
+        let mut left = ViewSchedule::default();
         for (frame, views) in schedule.iter().enumerate() {
             let taken: Vec<(u32, u32)> =
                 self.next(frame, views).map(|picture| (picture.view, picture.camera)).collect();
@@ -54,11 +54,11 @@ impl Sampler {
 /// Returns the views of `schedule` that `scan` renders: those that its strides select (see [`Sampler`]). If they exceed
 /// the maximum of `scan`, they are thinned to it, spread over at least `frames` frames if possible (see
 /// [`spread_over`]).
-pub fn looked_at(schedule: &Schedule, scan: &recipe::ScanParams, frames: usize) -> Vec<Picture> {
+pub fn looked_at(schedule: &ViewSchedule, scan: &recipe::ScanParams, frames: usize) -> Vec<FrameView> {
     let left = Sampler::new(scan).thin(schedule);
     if scan.look_pictures == 0 || left.pairs() <= scan.look_pictures {
-        let of_frame = |(frame, views): (usize, &[(u32, u32)])| -> Vec<Picture> {
-            views.iter().map(|&(view, camera)| Picture { frame, view, camera }).collect()
+        let of_frame = |(frame, views): (usize, &[(u32, u32)])| -> Vec<FrameView> {
+            views.iter().map(|&(view, camera)| FrameView { frame, view, camera }).collect()
         };
         return left.iter().enumerate().flat_map(of_frame).collect();
     }
@@ -79,14 +79,14 @@ pub fn frames_to_see(life: &[u32], frames: usize) -> usize {
 }
 
 /// Selects at most `pictures` views as [`spread`] does, over at least `frames` frames if there are as many views; else
-/// over as few frames as [`VIEWS_AT_ONCE`] allows.
-pub fn spread_over(schedule: &Schedule, pictures: usize, frames: usize) -> Vec<Picture> {
-    spread(schedule, pictures, (pictures / frames.max(1)).clamp(1, VIEWS_AT_ONCE))
+/// over as few frames as [`VIEWS_PER_FRAME`] allows.
+pub fn spread_over(schedule: &ViewSchedule, pictures: usize, frames: usize) -> Vec<FrameView> {
+    spread(schedule, pictures, (pictures / frames.max(1)).clamp(1, VIEWS_PER_FRAME))
 }
 
 /// Selects at most `pictures` views, spread evenly over all frames and views. Uses no more frames than are needed with
-/// `views` views of each (see [`VIEWS_AT_ONCE`]). Selects all views if there are no more than `pictures`.
-pub fn spread(schedule: &Schedule, pictures: usize, views: usize) -> Vec<Picture> {
+/// `views` views of each (see [`VIEWS_PER_FRAME`]). Selects all views if there are no more than `pictures`.
+pub fn spread(schedule: &ViewSchedule, pictures: usize, views: usize) -> Vec<FrameView> {
     let seen = schedule.iter().filter(|views| !views.is_empty()).count();
     let pictures = pictures.min(schedule.pairs());
     let of_frame = schedule.pairs().div_ceil(seen.max(1)).clamp(1, views.max(1));
@@ -101,7 +101,7 @@ pub fn spread(schedule: &Schedule, pictures: usize, views: usize) -> Vec<Picture
         let first = selected.len();
         let mut places: Vec<usize> = (0..wanted).map(|j| (first + j * views.len() / wanted) % views.len()).collect();
         places.sort_unstable();
-        selected.extend(places.into_iter().map(|place| Picture {
+        selected.extend(places.into_iter().map(|place| FrameView {
             frame,
             view: views[place].0,
             camera: views[place].1,
@@ -116,15 +116,15 @@ mod tests {
     use crate::model::Camera;
 
     /// Returns a schedule of `frames` frames with `views` views each.
-    fn schedule(frames: usize, views: u32) -> Schedule {
+    fn schedule(frames: usize, views: u32) -> ViewSchedule {
         let camera = Camera::look_at(glam::DVec3::X, glam::DVec3::ZERO, 1.0, (8, 8));
         let of_frame: Vec<(u32, u32)> = (0..views).map(|view| (view, view)).collect();
-        let mut schedule = Schedule::new(vec![camera; views as usize]);
+        let mut schedule = ViewSchedule::new(vec![camera; views as usize]);
         schedule.push(frames, &of_frame);
         schedule
     }
 
-    fn frames(pictures: &[Picture]) -> usize {
+    fn frames(pictures: &[FrameView]) -> usize {
         pictures.chunk_by(|a, b| a.frame == b.frame).count()
     }
 
@@ -142,7 +142,7 @@ mod tests {
             let selected = spread(&schedule(frame_count, views), pictures, at_once);
             assert_eq!(frames(&selected), expected.0, "{frame_count} frames of {views} views");
             assert_eq!(selected.len(), expected.1, "{frame_count} frames of {views} views");
-            let order = |picture: &Picture| (picture.frame, picture.view);
+            let order = |picture: &FrameView| (picture.frame, picture.view);
             assert!(
                 selected.windows(2).all(|pair| order(&pair[0]) < order(&pair[1])),
                 "{frame_count} frames of {views} views"
@@ -161,7 +161,7 @@ mod tests {
     #[test]
     fn frames_lie_in_the_middle_of_equal_parts() {
         // Every third frame has no views.
-        let mut gaps = Schedule::default();
+        let mut gaps = ViewSchedule::default();
         (0..50).for_each(|frame| gaps.push(1, if frame % 3 == 0 { &[] } else { &[(0, 0), (1, 1)] }));
         let seen: Vec<usize> = (0..50).filter(|frame| frame % 3 > 0).collect();
         for count in [1, 2, 7, 16, 32, 33, 40] {

@@ -2,7 +2,7 @@
 
 use super::frames::open_all;
 use crate::error::Result;
-use crate::model::{Columns, Gaussians};
+use crate::model::{Attributes, Gaussians};
 use crate::source::{BlockReader, FrameSource, ReadPlan};
 
 /// Reader of all columns of all Gaussians at one frame after the other. Columns that do not vary are read once.
@@ -10,9 +10,9 @@ use crate::source::{BlockReader, FrameSource, ReadPlan};
 /// Memory: one state, and that of [`open_all`].
 pub struct States<'a> {
     reader: Box<dyn BlockReader + 'a>,
-    varying: Columns,
+    varying: Attributes,
     /// Columns to read next.
-    unread: Columns,
+    unread: Attributes,
     current: Gaussians,
 }
 
@@ -24,9 +24,9 @@ impl<'a> States<'a> {
     pub fn open(source: &'a dyn FrameSource, wanted: &ReadPlan) -> Result<States<'a>> {
         let info = source.info();
         Ok(States {
-            reader: open_all(source, Columns::all(), wanted)?,
+            reader: open_all(source, Attributes::all(), wanted)?,
             varying: info.varying,
-            unread: Columns::all(),
+            unread: Attributes::all(),
             current: Gaussians::zeros(0, info.sh_degree),
         })
     }
@@ -58,13 +58,13 @@ mod tests {
         let scene = crate::diagnostics::demo_scene::Scene::new(1500, 40);
         write_container(&scene, &path, gseq::Compression::Zstd(1), Default::default(), |_| ()).unwrap();
         let container = Container::open(&path).unwrap();
-        let constant = Columns::all().difference(container.info().varying);
+        let constant = Attributes::all().difference(container.info().varying);
         assert!(!constant.is_empty(), "the scene has no constant column to tell by");
         let frames = [0, 3, 31, 32, 39];
         let mut states = States::open(&container, &ReadPlan::new(frames)).unwrap();
         assert!(states.current().is_empty());
         for frame in frames {
-            let expected = gather_all(&scene, frame, Columns::all()).unwrap();
+            let expected = gather_all(&scene, frame, Attributes::all()).unwrap();
             assert!(*states.at(frame).unwrap() == expected && *states.current() == expected, "frame {frame}");
         }
         // The file has two blocks of Gaussians, and each varying column has one tile per block of Gaussians and block

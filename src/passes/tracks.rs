@@ -6,17 +6,17 @@ use rayon::prelude::*;
 
 use crate::error::Result;
 use crate::fit::FittedTrack;
-use crate::model::{Columns, Gaussians};
+use crate::model::{Attributes, Gaussians};
 use crate::progress::Progress;
 use crate::source::{FrameSource, Ids};
 
 /// Number of Gaussians of which a thread holds all frames.
-pub const TRACKED: usize = 64;
+pub const TRACK_BLOCK: usize = 64;
 
 /// Calls `make` with the track of every Gaussian and returns the results in order. The frames of a track are at
 /// `times`, in any unit of time.
 ///
-/// Memory: the results, and for every thread a reader and all states of [`TRACKED`] Gaussians.
+/// Memory: the results, and for every thread a reader and all states of [`TRACK_BLOCK`] Gaussians.
 pub fn tracks<R: Send>(
     source: &dyn FrameSource,
     times: &[f64],
@@ -27,7 +27,7 @@ pub fn tracks<R: Send>(
     let tracks_of_block = |ids: Range<usize>| -> Result<Vec<R>> {
         let mut reader = source.open(Ids::Range(ids.clone()))?;
         let mut states: Vec<Gaussians> = Vec::with_capacity(info.times.len());
-        let mut want = Columns::all();
+        let mut want = Attributes::all();
         for frame in 0..info.times.len() {
             // Columns that do not vary keep the values of the previous frame.
             let mut state = states.last().cloned().unwrap_or_else(|| Gaussians::zeros(0, info.sh_degree));
@@ -38,9 +38,9 @@ pub fn tracks<R: Send>(
         progress.advance((ids.len() * states.len()) as u64);
         Ok((0..ids.len()).map(|row| make(&FittedTrack::from_states(times, &states, row))).collect())
     };
-    let blocks: Vec<Vec<R>> = (0..info.count.div_ceil(TRACKED))
+    let blocks: Vec<Vec<R>> = (0..info.count.div_ceil(TRACK_BLOCK))
         .into_par_iter()
-        .map(|block| tracks_of_block(block * TRACKED..info.count.min((block + 1) * TRACKED)))
+        .map(|block| tracks_of_block(block * TRACK_BLOCK..info.count.min((block + 1) * TRACK_BLOCK)))
         .collect::<Result<_>>()?;
     Ok(blocks.into_iter().flatten().collect())
 }
@@ -54,7 +54,7 @@ mod tests {
 
     #[test]
     fn tracks_equal_the_frames_for_any_thread_count() {
-        let scene = Scene::new(3 * TRACKED + 5, 7);
+        let scene = Scene::new(3 * TRACK_BLOCK + 5, 7);
         let progress = Progress::IGNORED;
         let all = |threads: usize| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
@@ -63,7 +63,7 @@ mod tests {
         let (one, three) = (all(1), all(3));
         assert_eq!(one.len(), scene.info().count);
         for frame in 0..7 {
-            let state = gather_all(&scene, frame, Columns::all()).unwrap();
+            let state = gather_all(&scene, frame, Attributes::all()).unwrap();
             for (row, (a, b)) in one.iter().zip(&three).enumerate() {
                 assert_eq!(a.position[frame], state.position.row::<3>(row).map(f64::from));
                 assert_eq!(a.opacity[frame], opacity(state.opacity_logit.row::<1>(row)[0]));

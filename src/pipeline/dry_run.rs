@@ -23,7 +23,7 @@ use crate::scene::{InputOptions, open_scene};
 
 /// Report of a dry run.
 #[derive(Debug, Clone, Serialize, Deserialize)]
-pub struct Foreseen {
+pub struct DryRunReport {
     /// Program and version.
     pub tool: String,
     /// Always true; tells this report from the summary of a run.
@@ -67,7 +67,7 @@ pub struct Foreseen {
 /// # Errors
 /// Fails where a run would fail before its first stage. Also fails for a stream, whose size is unknown before it has
 /// arrived completely.
-pub fn foresee(request: &Request) -> Result<Foreseen> {
+pub fn foresee(request: &Request) -> Result<DryRunReport> {
     if request.input.is_stream() {
         return Err(Error::usage(
             "--dry-run: the cost of a stream is known only after it has ended\n  give a file or folder; --explain says \
@@ -90,7 +90,7 @@ pub fn foresee(request: &Request) -> Result<Foreseen> {
     let gaussians = request.target.map(|target| target.count(outlook.gaussians)).transpose()?;
     let output = request.output.to_string_lossy().into_owned();
     let output_kind = run.output.as_ref().map_or(outlook.own_output, |output| output.kind);
-    Ok(Foreseen {
+    Ok(DryRunReport {
         tool: TOOL.to_owned(),
         dry_run: true,
         path: scene.path.to_string_lossy().into_owned(),
@@ -127,7 +127,7 @@ fn size_by(request: &Request) -> String {
     }
 }
 
-impl Foreseen {
+impl DryRunReport {
     /// Returns the report as JSON, for programs.
     pub fn json(&self) -> String {
         let mut text = serde_json::to_string_pretty(self).expect("plain data");

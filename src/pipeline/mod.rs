@@ -30,9 +30,9 @@ use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result};
 use crate::journal::Journal;
 use crate::memory_plan::{Budget, Verbosity, Workload, seconds};
-use crate::model::ALL_HARMONICS;
+use crate::model::NO_SH_LIMIT;
 use crate::pruning::score::{Scored, UserOverrides};
-use crate::recipe::{Recipe, WhichBands};
+use crate::recipe::{Recipe, ShDegreeRule};
 use crate::scene::{InputOptions, Scene};
 use planning::InputMeta;
 use stage::{Measured, Phase, RunState};
@@ -85,7 +85,7 @@ pub fn divided_stages(request: &Request) -> Result<Vec<String>> {
 ///
 /// # Errors
 /// Fails if the budget is too small, and where [`RunPlan::new`] fails.
-pub fn keep_to_budget(scene: &mut Scene, request: &Request) -> Result<()> {
+pub fn set_limits_within_budget(scene: &mut Scene, request: &Request) -> Result<()> {
     let plan = RunPlan::within_memory(request, InputMeta::from_scene(scene), &scene.workload())?;
     scene.keep_to(request.input.memory, |work, limits| plan.estimates(work, limits))
 }
@@ -115,8 +115,8 @@ fn run_stages(
     let input = InputSummary::from_scene(scene)?.without_folders();
     let recipe = recipe_text(&input.digest, plan, request, &mut journal);
     let sh_degree = match request.recipe.bands.bands {
-        WhichBands::UpTo(degree) => stages::bands::highest(scene, degree, &mut journal),
-        WhichBands::All | WhichBands::Needed => ALL_HARMONICS,
+        ShDegreeRule::UpTo(degree) => stages::bands::highest(scene, degree, &mut journal),
+        ShDegreeRule::All | ShDegreeRule::Needed => NO_SH_LIMIT,
     };
     let template = CompressedModel { sh_degree, ..CompressedModel::pruned(Vec::new(), &request.recipe.merge) };
     let mut run = RunState::new(scene, request, &plan.stages, template);
@@ -146,7 +146,7 @@ fn recipe_text(own: &str, plan: &RunPlan, request: &Request, journal: &mut Journ
     if let Some(other) = request.made_for.as_ref().filter(|digest| *digest != own) {
         journal.notes.push(format!("the recipe was made for another input, with digest {other}; this one has {own}"));
     }
-    let folder = plan.output.as_ref().map(stages::write::Emit::recipe_folder).unwrap_or_default();
+    let folder = plan.output.as_ref().map(stages::write::WriteStage::recipe_folder).unwrap_or_default();
     RecipeRecord::new(request, &plan.measure.score.user, own.to_owned()).text(request, &folder)
 }
 
@@ -167,7 +167,7 @@ pub(crate) mod tests {
     use super::*;
     use crate::diagnostics::demo_scene;
     use crate::files::container::Container;
-    use crate::model::{Columns, SequenceInfo, Split};
+    use crate::model::{Attributes, SequenceInfo, Split};
     use crate::models::MemoryProfile;
     use crate::outputs::container::{FRAME_BLOCK, write_container};
 
@@ -175,7 +175,7 @@ pub(crate) mod tests {
     pub(crate) fn scene(folder: &std::path::Path) -> Scene {
         let made = demo_scene::Scene::new(1500, 6);
         let path = folder.join("scene.gseq");
-        write_container(&made, &path, gseq::Compression::Raw, Default::default(), |_| ()).unwrap();
+        write_container(&made, &path, gseq::Compression::StoredParams, Default::default(), |_| ()).unwrap();
         let input = Box::new(Container::open(&path).unwrap());
         let rig = made.rig();
         Scene::new(path, input, rig, Some(Split::Train)).unwrap()
@@ -191,7 +191,7 @@ pub(crate) mod tests {
             count: gaussians as usize,
             times: Vec::new(),
             sh_degree: 3,
-            varying: Columns::all().difference(Columns::SH),
+            varying: Attributes::all().difference(Attributes::SH),
         };
         Workload {
             frames: 600,
@@ -201,7 +201,7 @@ pub(crate) mod tests {
             pictures: 1200,
             rig: 560,
             threads: 2,
-            ..Workload::new(&info, MemoryProfile::of_tiles(FRAME_BLOCK as u64))
+            ..Workload::new(&info, MemoryProfile::for_tiles(FRAME_BLOCK as u64))
         }
     }
 }

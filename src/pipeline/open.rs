@@ -18,9 +18,9 @@ use crate::files::frame_stream::FrameStream;
 use crate::journal::{Clock, Journal};
 use crate::memory_plan::{Budget, Plan, Verbosity, Workload, size};
 use crate::model::RobustBox;
-use crate::model::{Camera, Picture, Rig, Schedule, Split};
-use crate::models::stream::{AHEAD, Streamed, frame_block};
-use crate::models::trajectories::OWN_OUTPUT;
+use crate::model::{Camera, FrameView, Rig, Split, ViewSchedule};
+use crate::models::stream::{PREFETCH_FRAMES, ReceivedStream, frame_block};
+use crate::models::trajectories::DEFAULT_OUTPUT;
 use crate::passes::{HeldFrames, Sampler};
 use crate::pipeline::plan::RunPlan;
 use crate::pipeline::planning::InputMeta;
@@ -31,8 +31,8 @@ use crate::progress::Message;
 use crate::pruning::contribution::RunningContribution;
 use crate::recipe;
 use crate::scene::{
-    FrameQuota, InputOptions, Opened, Scene, is_linked, link_stream, load_cameras, open_scene, open_stream, receiving,
-    scene_of,
+    FrameQuota, InputOptions, OpenedInput, Scene, from_input, is_linked, link_stream, load_cameras, open_scene,
+    open_stream, receiving,
 };
 use crate::source::{FrameSource, Reads};
 use crate::statistics::ScanPlan;
@@ -60,7 +60,7 @@ pub fn open_to_measure(
             journal.opened("receive", start, found.0.source().info().count, Reads::default());
             return Ok(found);
         }
-        scene_of(link_stream(stream, options, rig)?, options)?
+        from_input(link_stream(stream, options, rig)?, options)?
     } else {
         open_scene(options)?
     };
@@ -112,12 +112,12 @@ fn receive_measured(
     let assumed_rig = loaded.clone().unwrap_or_else(|| cameras::virtual_rig(DVec3::ZERO, 1.0));
     let block = frame_block(stream.header());
     let header = *stream.header();
-    let counting = |frames| Workload::of_stream(&header, block, &assumed_rig, frames);
+    let counting = |frames| Workload::from_stream_header(&header, block, &assumed_rig, frames);
     let work = counting(0);
-    let stages = plan(InputMeta { gaussians: count, has_cameras, own_output: OWN_OUTPUT }, &work)?;
+    let stages = plan(InputMeta { gaussians: count, has_cameras, own_output: DEFAULT_OUTPUT }, &work)?;
     let Measure { scan, visible, .. } = &stages.measure;
-    let visible = visible.as_ref().filter(|visible| visible.can_look_on_arrival());
-    let held = (block + AHEAD) as u64;
+    let visible = visible.as_ref().filter(|visible| visible.can_render_on_arrival());
+    let held = (block + PREFETCH_FRAMES) as u64;
     let fit = |tell: Verbosity, measuring: Option<bool>| {
         Plan::fit(work, Budget { tell, ..options.memory }, &options.events, |work, limits| {
             let mut all = vec![receiving(work, limits, held, measuring, 0)];
@@ -144,7 +144,7 @@ fn receive_measured(
         let _ = rig.set(loaded);
     }
     let mut measuring: Option<Measuring<'_>> = None;
-    let streamed = Streamed::receive(stream, &options.scratch_folder(), &options.events, |held| {
+    let streamed = ReceivedStream::receive(stream, &options.scratch_folder(), &options.events, |held| {
         quota.admit(held.len())?;
         if quota.arrived() > to_measure {
             measuring = None;
@@ -163,8 +163,8 @@ fn receive_measured(
         measuring.add(held)
     })?;
     let rig_given = has_cameras.then(|| rig.get().cloned()).flatten();
-    let opened = Opened { rig: rig_given, input: Box::new(streamed), notes: Vec::new() };
-    let mut scene = scene_of(opened, options)?;
+    let opened = OpenedInput { rig: rig_given, input: Box::new(streamed), notes: Vec::new() };
+    let mut scene = from_input(opened, options)?;
     // The number of frames is known now.
     let counted = Budget { tell: Verbosity::Nothing, ..options.memory };
     let later = Plan::fit(scene.workload(), counted, &options.events, |work, limits| stages.estimates(work, limits))?;
@@ -237,7 +237,7 @@ struct Measuring<'a> {
     cameras: &'a [Camera],
     assumed: AssumedTimes<'a>,
     /// Assignment of cameras to the frames so far, as assumed.
-    schedule: Schedule,
+    schedule: ViewSchedule,
     scan: RunningScan<'a>,
     seen: Option<(Sampler, RunningContribution)>,
 }
@@ -255,7 +255,7 @@ impl<'a> Measuring<'a> {
             plan,
             cameras: &rig.cameras,
             assumed: AssumedTimes::new(rig, split),
-            schedule: Schedule::new(rig.cameras.clone()),
+            schedule: ViewSchedule::new(rig.cameras.clone()),
             scan: RunningScan::new(count, plan),
             seen: seen.map(|seen| (Sampler::new(scan), seen)),
         }
@@ -269,7 +269,7 @@ impl<'a> Measuring<'a> {
         self.scan.add(held, &cameras)?;
         if let Some((sampler, seen)) = &mut self.seen {
             let new = new.iter().enumerate();
-            let pictures: Vec<Picture> = new.flat_map(|(frame, views)| sampler.next(frame, views)).collect();
+            let pictures: Vec<FrameView> = new.flat_map(|(frame, views)| sampler.next(frame, views)).collect();
             seen.add(held, self.cameras, &pictures, || ())?;
         }
         Ok(())

@@ -10,7 +10,7 @@ use super::search::SearchStage;
 use super::stage::{CountPlan, EstimateInput, MeasuredOnArrival, Phase, Stage, StageList};
 use super::stages::STAGES;
 use super::stages::measure::Measure;
-use super::stages::write::Emit;
+use super::stages::write::WriteStage;
 use crate::error::{Error, Result};
 use crate::limits::Limits;
 use crate::memory_plan::{Plan, ResourceEstimate, Workload};
@@ -27,7 +27,7 @@ pub struct RunPlan {
     /// Stages that measure; a stream is measured by them while it arrives.
     pub measure: Measure,
     /// Stage that writes the result; `None` if only statistics are wanted.
-    pub output: Option<Emit>,
+    pub output: Option<WriteStage>,
     /// Search that repeats the stages of [`Phase::Reduce`] until a quality is reached.
     pub search: Option<SearchStage>,
     /// Exact number of Gaussians in the output, if requested.
@@ -143,8 +143,8 @@ impl RunPlan {
         let refine = RefineStage::from_recipe(recipe, planning.part(), planning.prunes_by_views());
         planning.refine = refine.and_then(|refine| match fallback {
             MemoryFallback::Nothing => Some(refine),
-            MemoryFallback::ConstantInTime { .. } => Some(refine.without_course()),
-            MemoryFallback::WithoutHarmonics { .. } => Some(refine.without_course().without_bands()),
+            MemoryFallback::ConstantInTime { .. } => Some(refine.with_constant_deltas()),
+            MemoryFallback::WithoutHarmonics { .. } => Some(refine.with_constant_deltas().with_fixed_higher_sh()),
             MemoryFallback::WithoutRefinement { .. } => None,
         });
         // At the same count refinement gains more quality than merging. Prune steps rank anew, so the order does not
@@ -154,7 +154,7 @@ impl RunPlan {
 
         let mut plan = RunPlan::empty(Measure::from_planning(&planning), input.gaussians);
         plan.search = SearchStage::from_planning(&planning);
-        plan.output = Some(Emit::from_planning(&planning));
+        plan.output = Some(WriteStage::from_planning(&planning));
         plan.target = target;
         plan.stages.counts = CountPlan {
             refinement_starts_at: planning.refine.as_ref().and_then(RefineStage::starts_at),
@@ -288,9 +288,9 @@ fn checked_output(request: &Request, own: OutputKind) -> Result<OutputKind> {
             "--max-loss cannot be used for an archive\n  \
              give --ratio, --count, --min-psnr or --size, or write a model folder",
         )),
-        Some(Goal::Bytes(_)) if archive_psnr.is_some() => Err(Error::usage(
-            "--archive-psnr and --size both determine the quantization: expected only one of them",
-        )),
+        Some(Goal::Bytes(_)) if archive_psnr.is_some() => {
+            Err(Error::usage("--archive-psnr and --size both determine the quantization: expected only one of them"))
+        }
         _ => Ok(kind),
     }
 }
@@ -300,7 +300,7 @@ mod tests {
     use super::*;
     use crate::journal::Journal;
     use crate::memory_plan::Budget;
-    use crate::model::ALL_HARMONICS;
+    use crate::model::NO_SH_LIMIT;
     use crate::pipeline::request::Target;
     use crate::pipeline::tests::work;
     use crate::progress::Events;
@@ -372,7 +372,7 @@ mod tests {
         let (spared, degree, named, none) = within(full_bytes - 1);
         assert_eq!(
             (spared, degree, none),
-            (MemoryFallback::ConstantInTime { required_bytes: full_bytes }, Some(ALL_HARMONICS), None)
+            (MemoryFallback::ConstantInTime { required_bytes: full_bytes }, Some(NO_SH_LIMIT), None)
         );
         assert!(named.unwrap().contains(&format!("{}MiB", full_bytes.div_ceil(1 << 20))));
         let (spared, ..) = (1..).map(|k| within(full_bytes - k * (1 << 20))).find(|found| found.1 == Some(0)).unwrap();

@@ -3,7 +3,7 @@
 use super::request::{Goal, Request};
 use crate::outputs::kind::OutputKind;
 use crate::pruning::score::UserOverrides;
-use crate::recipe::WhichBands;
+use crate::recipe::ShDegreeRule;
 use crate::refinement::RefineStage;
 use crate::scene::Scene;
 
@@ -65,7 +65,7 @@ impl Planning<'_> {
     /// one with the best quality is taken.
     pub fn chooses_degree(&self) -> bool {
         let has_byte_limit = matches!(self.request.goal, Some(Goal::Bytes(_)));
-        has_byte_limit && self.refine.is_some() && self.request.recipe.bands.bands == WhichBands::Needed
+        has_byte_limit && self.refine.is_some() && self.request.recipe.bands.bands == ShDegreeRule::Needed
     }
 
     /// Returns whether Gaussians are ranked by rendered views and removed.

@@ -4,8 +4,8 @@ use rayon::prelude::*;
 
 use crate::error::{Error, Result};
 use crate::metrics::{decibels, psnr};
-use crate::model::{Camera, Picture};
-use crate::passes::{Batch, Subject, ViewStates, show};
+use crate::model::{Camera, FrameView};
+use crate::passes::{Batch, RenderedSource, ViewStates, show};
 use crate::refinement::targets::{Targets, mean_square};
 use crate::render::render;
 use crate::scene::Scene;
@@ -25,7 +25,7 @@ pub(super) struct QualityMeter<'a> {
     scene: &'a Scene,
     cameras: &'a [Camera],
     /// Views in order of frames; the flag tells whether a view is held back.
-    pictures: Vec<(Picture, bool)>,
+    pictures: Vec<(FrameView, bool)>,
     comparison: Comparison<'a>,
 }
 
@@ -37,7 +37,7 @@ impl<'a> QualityMeter<'a> {
     pub(super) fn new(
         scene: &'a Scene,
         cameras: &'a [Camera],
-        pictures: Vec<(Picture, bool)>,
+        pictures: Vec<(FrameView, bool)>,
         comparison: Comparison<'a>,
     ) -> Result<QualityMeter<'a>> {
         let held = pictures.iter().filter(|picture| picture.1).count();
@@ -59,9 +59,9 @@ impl<'a> QualityMeter<'a> {
     pub(super) fn measure(&self, source: &dyn FrameSource, held: bool) -> Result<f64> {
         let background = self.scene.background;
         let places: Vec<usize> = (0..self.pictures.len()).filter(|&k| self.pictures[k].1 == held).collect();
-        let pictures: Vec<Picture> = places.iter().map(|&k| self.pictures[k].0).collect();
+        let pictures: Vec<FrameView> = places.iter().map(|&k| self.pictures[k].0).collect();
         let mut found = Vec::with_capacity(pictures.len());
-        show([Subject::all(source)], self.cameras, &pictures, Batch::of_frame(&self.scene.limits), |views| {
+        show([RenderedSource::all(source)], self.cameras, &pictures, Batch::of_frame(&self.scene.limits), |views| {
             let first = found.len();
             let view_psnr = |(place, view): (usize, &ViewStates<'_, 1>)| {
                 match &self.comparison {
@@ -91,7 +91,7 @@ impl<'a> QualityMeter<'a> {
     /// Returns the names of the views held back, made of frame and view. A view between the cameras of the scene is
     /// named by its frame.
     pub(super) fn held_back_names(&self) -> Vec<String> {
-        let name = |picture: &Picture| match picture.view {
+        let name = |picture: &FrameView| match picture.view {
             u32::MAX => format!("t{:03}_between", picture.frame),
             _ => picture.name(),
         };

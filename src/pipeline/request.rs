@@ -131,18 +131,16 @@ impl Target {
             Target::Count(wanted) => wanted,
             Target::Ratio(ratio) if ratio > 0.0 && ratio <= 1.0 => ((ratio * count as f64).round() as u64).max(1),
             Target::Ratio(ratio) => {
-                return Err(Error::usage(format!(
-                    "--ratio: expected a number above 0 and at most 1, found {ratio}"
-                )));
+                return Err(Error::usage(format!("--ratio: expected a number above 0 and at most 1, found {ratio}")));
             }
         };
         match usize::try_from(wanted) {
             Ok(wanted @ 1..) if wanted <= count => Ok(wanted),
             // An empty scene has only the size 0.
             _ if count == 0 => Ok(0),
-            _ => Err(Error::usage(format!(
-                "--count: expected 1 to {count}, the Gaussians of the input, found {wanted}"
-            ))),
+            _ => {
+                Err(Error::usage(format!("--count: expected 1 to {count}, the Gaussians of the input, found {wanted}")))
+            }
         }
     }
 }

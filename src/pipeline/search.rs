@@ -19,18 +19,18 @@ use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result, ShowPath};
 use crate::journal::Journal;
 use crate::journal::as_toml::AsToml;
-use crate::memory_plan::{PICTURE_ON_ALL_THREADS, RENDER, ResourceEstimate};
-use crate::model::{Columns, Picture};
+use crate::memory_plan::{RENDER, ResourceEstimate, SHARED_VIEW_BYTES_PER_GAUSSIAN};
+use crate::model::{Attributes, FrameView};
 use crate::outputs::kind::OutputKind;
 use crate::pruning::Ranking;
 use crate::pruning::score::{Scored, scored_memory};
 use crate::refinement::prune_steps::PruneSteps;
-use crate::refinement::targets::{Parted, Targets};
+use crate::refinement::targets::{Targets, ViewSplit};
 use crate::refinement::{RefineRun, RefineStage};
 use crate::render;
 use crate::scene::Scene;
 use crate::scene::photographs::Photographs;
-use crate::scene::pictures::{PictureSet, pictures};
+use crate::scene::pictures::{ViewSet, pictures};
 use crate::scene::stamps;
 use crate::source::FrameSource;
 
@@ -107,17 +107,22 @@ impl SearchStage {
     /// each size.
     pub fn estimate(&self, input: EstimateInput<'_>, repeated: &[ResourceEstimate]) -> ResourceEstimate {
         let EstimateInput { work, limits, .. } = input;
-        let whole = work.state(Columns::all());
-        let (reader, held) = (work.input.reader, work.held(limits, Columns::all()));
+        let whole = work.state(Attributes::all());
+        let (reader, held) = (work.input.reader, work.held(limits, Attributes::all()));
         let frames = work.frames.min(128);
         let measured = ResourceEstimate {
             stage: NAME,
             reads: work.scattered_reads(frames, limits),
             seconds: work.reading(work.count(), frames as f64)
-                + work.picturing(self.pictures as f64, work.count(), RENDER),
+                + work.render_seconds(self.pictures as f64, work.count(), RENDER),
             per_gaussian: [
                 scored_memory(limits),
-                vec![("states", whole), ("readers", reader), ("held", held), ("pictures", PICTURE_ON_ALL_THREADS)],
+                vec![
+                    ("states", whole),
+                    ("readers", reader),
+                    ("held", held),
+                    ("pictures", SHARED_VIEW_BYTES_PER_GAUSSIAN),
+                ],
             ]
             .concat(),
             fixed: vec![work.arriving()],
@@ -144,7 +149,7 @@ impl SearchStage {
         let (scene, scored, ranking) = (run.scene, run.scored()?, run.ranking()?);
         let key = self.key(scene, &scored, &ranking, &run.template)?;
         let (request, stages, template) = (run.request, run.stages, &run.template);
-        let found = run.journal.kept_stage(NAME, ranking.order().len(), scene, key, |journal| {
+        let found = run.journal.run_cached_stage(NAME, ranking.order().len(), scene, key, |journal| {
             let photographs = self.photographs(scene)?;
             let targets = Targets::new(scene, self.pictures)?;
             let parts = targets.parted(photographs.is_none());
@@ -187,8 +192,8 @@ impl SearchStage {
         &self,
         scene: &'a Scene,
         targets: &'a Targets,
-        parts: &Parted,
-        photographs: Option<(Vec<Picture>, Photographs)>,
+        parts: &ViewSplit,
+        photographs: Option<(Vec<FrameView>, Photographs)>,
         journal: &mut Journal,
     ) -> Result<QualityMeter<'a>> {
         match photographs {
@@ -237,10 +242,10 @@ impl SearchStage {
 
     /// Returns the test views that have a photograph, with their photographs; `None` unless a maximum loss is
     /// requested.
-    fn photographs(&self, scene: &Scene) -> Result<Option<(Vec<Picture>, Photographs)>> {
+    fn photographs(&self, scene: &Scene) -> Result<Option<(Vec<FrameView>, Photographs)>> {
         let Quality::Loss { photographs, .. } = &self.searched else { return Ok(None) };
         let times = &scene.source().info().times;
-        let views = pictures(&scene.rig, times, PictureSet::HeldOut)?;
+        let views = pictures(&scene.rig, times, ViewSet::HeldOut)?;
         let found = Photographs::of_some(photographs, &scene.rig, times, views)?;
         if found.0.len() < HELD_EVERY {
             let (folder, found) = (photographs.shown(), found.0.len());

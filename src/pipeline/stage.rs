@@ -25,7 +25,7 @@ use crate::pruning::score::Scored;
 use crate::refinement::prune_steps::PruneSteps;
 use crate::refinement::start_count;
 use crate::scene::Scene;
-use crate::statistics::pass::Scanned;
+use crate::statistics::pass::ScanResult;
 
 /// Fraction of the Gaussians that ranking leaves in a search without refinement.
 const SEARCH_RANK_FRACTION: f64 = 0.02;
@@ -107,7 +107,7 @@ pub struct MeasuredOnArrival {
 /// Statistics of the frames before scoring.
 pub struct Measured {
     /// Statistics of every Gaussian from the scan.
-    pub scanned: Scanned,
+    pub scanned: ScanResult,
     /// Visible contribution of every Gaussian, if views were rendered.
     pub seen: Option<VisibleContribution>,
 }

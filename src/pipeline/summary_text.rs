@@ -73,7 +73,7 @@ impl Summary {
         if let Some(bands) = self.bands.as_ref().filter(|bands| bands.sh_degree < input.sh_degree) {
             writeln!(out, "SH degree: {} of {}: {}", bands.sh_degree, input.sh_degree, bands.why())?;
         }
-        writeln!(out, "bytes: {}", self.output_size.parts_of(&input.size))?;
+        writeln!(out, "bytes: {}", self.output_size.format_relative_to(&input.size))?;
         for left in &self.left_out {
             writeln!(out, "  left out: {} ({})", left.what, left.reason())?;
         }

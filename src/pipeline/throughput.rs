@@ -13,7 +13,7 @@ use crate::error::Result;
 use crate::journal::Clock;
 use crate::journal::records::Forecast;
 use crate::memory_plan::{LOOK, Plan, REMOVE, RENDER, Throughput, Workload};
-use crate::model::{Camera, Columns, Gaussians};
+use crate::model::{Attributes, Camera, Gaussians};
 use crate::passes::{BLOCK, gather_all};
 use crate::pipeline::plan::RunPlan;
 use crate::pipeline::stage::MeasuredOnArrival;
@@ -31,7 +31,7 @@ const FRAMES_PER_BLOCK: u64 = 16;
 /// Number of views that each thread renders in each way (contribution, removal error, image).
 const VIEWS_PER_THREAD: usize = 2;
 /// PSNR, dB, above which the loss by pruning alone may leave nothing to refine
-/// ([`crate::refinement::CLOSE_ENOUGH`]).
+/// ([`crate::refinement::MAX_USEFUL_PSNR`]).
 const CLOSE_PSNR: f64 = 60.0;
 
 /// Minimum expected time of a run that is calibrated, seconds.
@@ -88,7 +88,7 @@ impl Calibration {
         let machine = Throughput { states, look: states, remove: states, render: states, processors: None };
         let work = Workload { pace: machine, ..work };
         let views_per_way = VIEWS_PER_THREAD as f64 * work.threads as f64;
-        let pictures = [LOOK, REMOVE, RENDER].map(|way| work.picturing(views_per_way, work.count(), way));
+        let pictures = [LOOK, REMOVE, RENDER].map(|way| work.render_seconds(views_per_way, work.count(), way));
         let needed_seconds = work.reading(work.count(), work.input.frame_block.max(1) as f64)
             + pictures.iter().sum::<f64>()
             + pictures[2];
@@ -107,7 +107,7 @@ impl Calibration {
         let middle = schedule.iter().count() / 2;
         let seen = schedule.iter().enumerate().filter(|(_, views)| !views.is_empty());
         let Some((frame, views)) = seen.min_by_key(|(frame, _)| frame.abs_diff(middle)) else { return Ok(()) };
-        let state = gather_all(scene.source(), frame, Columns::all())?;
+        let state = gather_all(scene.source(), frame, Attributes::all())?;
         let threads = rayon::current_num_threads();
         let camera = |k: usize| {
             &schedule.cameras[views[k * views.len() / (VIEWS_PER_THREAD * threads) % views.len()].1 as usize]
@@ -175,7 +175,7 @@ fn measure_states(scene: &Scene, work: &Workload, budget: f64, spent: &mut Measu
     let blocks = ((0.3 * budget / block_seconds) as usize).clamp(1, 4 * work.threads as usize).min(all);
     // Most stages read every attribute but SH. Readers are opened before the clock starts because stages open them once
     // for many frames.
-    let columns = Columns::all().difference(Columns::SH);
+    let columns = Attributes::all().difference(Attributes::SH);
     let open = |k: usize| -> Result<_> {
         let start = k * all / blocks * BLOCK;
         let mut reader = source.open(Ids::Range(start..source.info().count.min(start + BLOCK)))?;

@@ -8,8 +8,8 @@ use std::ops::Range;
 use serde::Serialize;
 
 use crate::error::Result;
-use crate::files::accuracy::{Accuracy, Drawn};
-use crate::model::{Column, Columns, Gaussians, opacity, sh_coefficients};
+use crate::files::accuracy::{Accuracy, RenderedAttributes};
+use crate::model::{AttributeValues, Attributes, Gaussians, opacity, sh_coefficients};
 
 /// Distances between lattice points; a value is off by half of its own at most.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
@@ -53,9 +53,9 @@ impl Steps {
 }
 
 /// Components of a column, among those of all columns in the order position, rotation, log scale, opacity, harmonics.
-pub fn components(column: Columns, sh_degree: usize) -> Range<usize> {
-    let width = |column: Columns| column.width(sh_degree);
-    let before = Columns::all().iter().take_while(|&other| other != column).map(width).sum();
+pub fn components(column: Attributes, sh_degree: usize) -> Range<usize> {
+    let width = |column: Attributes| column.width(sh_degree);
+    let before = Attributes::all().iter().take_while(|&other| other != column).map(width).sum();
     before..before + width(column)
 }
 
@@ -71,34 +71,34 @@ pub fn width(sh_degree: usize) -> usize {
 ///
 /// # Panics
 /// If `points` is not that large.
-pub fn write_points(state: &Gaussians, which: Columns, steps: &Steps, points: &mut [i32]) -> usize {
+pub fn write_points(state: &Gaussians, which: Attributes, steps: &Steps, points: &mut [i32]) -> usize {
     let (count, degree) = (state.len(), state.sh_degree());
-    let of = |column: Columns| {
+    let of = |column: Attributes| {
         let range = components(column, degree);
         range.start * count..range.end * count
     };
-    let plain = |column: &Column, points: &mut [i32], point: &dyn Fn(f32) -> i32| {
+    let plain = |column: &AttributeValues, points: &mut [i32], point: &dyn Fn(f32) -> i32| {
         points.iter_mut().zip(column.planes()).for_each(|(to, &value)| *to = point(value));
     };
-    if which.contains(Columns::POSITION) {
-        plain(&state.position, &mut points[of(Columns::POSITION)], &|x| nearest(x.into(), steps.position));
+    if which.contains(Attributes::POSITION) {
+        plain(&state.position, &mut points[of(Attributes::POSITION)], &|x| nearest(x.into(), steps.position));
     }
-    if which.contains(Columns::ROTATION) {
-        turn(&state.rotation, steps.rotation, &mut points[of(Columns::ROTATION)]);
+    if which.contains(Attributes::ROTATION) {
+        turn(&state.rotation, steps.rotation, &mut points[of(Attributes::ROTATION)]);
     }
-    if which.contains(Columns::LOG_SCALE) {
+    if which.contains(Attributes::LOG_SCALE) {
         let point = |x: f32| nearest(x.clamp(-LOGARITHM_LIMIT, LOGARITHM_LIMIT).into(), steps.log_scale);
-        plain(&state.log_scale, &mut points[of(Columns::LOG_SCALE)], &point);
+        plain(&state.log_scale, &mut points[of(Attributes::LOG_SCALE)], &point);
     }
-    if which.contains(Columns::SH) {
+    if which.contains(Attributes::SH) {
         let limit = SH_LIMIT * steps.sh;
         let point = |x: f32| nearest(f64::from(x).clamp(-limit, limit), steps.sh);
-        plain(&state.sh, &mut points[of(Columns::SH)], &point);
+        plain(&state.sh, &mut points[of(Attributes::SH)], &point);
     }
     let mut unseen = 0;
-    if which.intersects(Columns::POSITION | Columns::OPACITY) {
+    if which.intersects(Attributes::POSITION | Attributes::OPACITY) {
         let far = POSITION_LIMIT * steps.position;
-        for (i, to) in points[of(Columns::OPACITY)].iter_mut().enumerate() {
+        for (i, to) in points[of(Attributes::OPACITY)].iter_mut().enumerate() {
             let [logit] = state.opacity_logit.row(i);
             let position: [f32; 3] = state.position.row(i);
             let shape = [&state.rotation, &state.log_scale, &state.sh];
@@ -118,11 +118,11 @@ pub fn write_points(state: &Gaussians, which: Columns, steps: &Steps, points: &m
 pub fn check_positions(state: &Gaussians, sh_degree: usize, steps: &Steps, points: &[i32]) -> Result<()> {
     let count = state.len();
     let mut accuracy = Accuracy::new(&state.position);
-    let opacities = components(Columns::OPACITY, sh_degree).start * count;
+    let opacities = components(Attributes::OPACITY, sh_degree).start * count;
     for row in (0..count).filter(|row| points[opacities + row] > 0) {
-        let wanted = Drawn { color: [0.0; 3], ..Drawn::of_state(state, row) };
+        let wanted = RenderedAttributes { color: [0.0; 3], ..RenderedAttributes::of_state(state, row) };
         let position = [0, 1, 2].map(|axis| f64::from(points[axis * count + row]) * steps.position);
-        accuracy.add(row, &wanted, &Drawn { position, ..wanted });
+        accuracy.add(row, &wanted, &RenderedAttributes { position, ..wanted });
     }
     accuracy.check("a page")
 }
@@ -134,7 +134,7 @@ fn nearest(value: f64, step: f64) -> i32 {
 
 /// Unit quaternions: of both that are the same rotation the one nearer to what was there, so that what turns evenly moves
 /// evenly.
-fn turn(rotation: &Column, step: f64, points: &mut [i32]) {
+fn turn(rotation: &AttributeValues, step: f64, points: &mut [i32]) {
     let count = rotation.len();
     for i in 0..count {
         let q: [f32; 4] = rotation.row(i);
@@ -156,7 +156,7 @@ mod tests {
     use proptest::prelude::*;
 
     use super::*;
-    use crate::model::Column;
+    use crate::model::AttributeValues;
 
     /// What a point stands for, by the words of [`Steps`].
     fn step_of(component: usize, steps: &Steps) -> f64 {
@@ -172,11 +172,11 @@ mod tests {
     fn of_values(values: [Vec<f32>; 5]) -> Gaussians {
         let [position, rotation, log_scale, opacity_logit, sh] = values;
         Gaussians {
-            position: Column::from_planes(3, position),
-            rotation: Column::from_planes(4, rotation),
-            log_scale: Column::from_planes(3, log_scale),
-            opacity_logit: Column::from_planes(1, opacity_logit),
-            sh: Column::from_planes(12, sh),
+            position: AttributeValues::from_planes(3, position),
+            rotation: AttributeValues::from_planes(4, rotation),
+            log_scale: AttributeValues::from_planes(3, log_scale),
+            opacity_logit: AttributeValues::from_planes(1, opacity_logit),
+            sh: AttributeValues::from_planes(12, sh),
         }
     }
 
@@ -191,7 +191,7 @@ mod tests {
             let steps = Steps::of_extent(extent);
             prop_assert!(steps.position <= extent / 16384.0 && steps.position > extent / 32768.0);
             let mut points = vec![0; 2 * width(1)];
-            prop_assert_eq!(write_points(&state, Columns::all(), &steps, &mut points), 0);
+            prop_assert_eq!(write_points(&state, Attributes::all(), &steps, &mut points), 0);
             for i in 0..2 {
                 let q: [f64; 4] = std::array::from_fn(|c| f64::from(rotation[2 * c + i]));
                 let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
@@ -218,18 +218,18 @@ mod tests {
         let mut state = Gaussians::zeros(4, 0);
         let mut points = vec![0; 4 * width(0)];
         (0..4).for_each(|i| state.rotation.set_row(i, [-0.1, 0.995, 0.0, 0.0]));
-        write_points(&state, Columns::all(), &steps, &mut points);
+        write_points(&state, Attributes::all(), &steps, &mut points);
         assert!(points[3 * 4] > 0 && points[4 * 4] < 0, "{points:?}");
         // Past the equator the same rotation with the other sign would be a jump.
         state.rotation.set_row(0, [-0.1, -0.995, 0.0, 0.0]);
         state.rotation.set_row(1, [0.0; 4]);
-        write_points(&state, Columns::ROTATION, &steps, &mut points);
+        write_points(&state, Attributes::ROTATION, &steps, &mut points);
         assert!(points[3 * 4] < 0 && points[4 * 4] < 0);
         assert_eq!([points[13], points[17]], [2048, 0]);
         state.position.set_row(1, [f32::NAN, 0.0, 0.0]);
         state.position.set_row(2, [1e30, 0.0, 0.0]);
         state.log_scale.set_row(3, [0.0, f32::NAN, 0.0]);
-        assert_eq!(write_points(&state, Columns::all(), &steps, &mut points), 3);
+        assert_eq!(write_points(&state, Attributes::all(), &steps, &mut points), 3);
         assert_eq!(points[40..44], [512, 0, 0, 0]);
     }
 }

@@ -20,7 +20,7 @@ use serde::Serialize;
 
 use super::lattice::{Steps, check_positions, components, width, write_points};
 use crate::error::{Error, Result};
-use crate::model::{Columns, Gaussians};
+use crate::model::{Attributes, Gaussians};
 use crate::passes::States;
 use crate::progress::Events;
 use crate::source::{FrameSource, ReadPlan};
@@ -65,7 +65,7 @@ impl PageSequence {
         let together = (GROUP_VALUES / of_frame).clamp(1, GROUP_FRAMES);
         // All alike in length, for each costs about the same to begin.
         let groups = (frames.len().saturating_sub(1)).div_ceil(together);
-        let varying = if groups == 0 { Columns::empty() } else { changing(info.varying) };
+        let varying = if groups == 0 { Attributes::empty() } else { changing(info.varying) };
         PageSequence {
             count: info.count,
             sh_degree,
@@ -84,8 +84,8 @@ impl PageSequence {
 }
 
 /// Columns to follow where `varying` change: a Gaussian that is not finite for a while is not seen meanwhile.
-fn changing(varying: Columns) -> Columns {
-    if varying.is_empty() { varying } else { varying | Columns::OPACITY }
+fn changing(varying: Attributes) -> Attributes {
+    if varying.is_empty() { varying } else { varying | Attributes::OPACITY }
 }
 
 /// Hands the chunks of `track`, which was planned for `frames` of `source`, to `sink`, in order; of frames decoded together
@@ -107,24 +107,24 @@ pub fn encode(
     let mut shown = Gaussians::default();
     let (count, degree) = (track.count, track.sh_degree);
     let mut points = vec![0; width(degree) * count];
-    let mut read = |frame: usize, which: Columns, points: &mut [i32], states: &mut States| -> Result<()> {
+    let mut read = |frame: usize, which: Attributes, points: &mut [i32], states: &mut States| -> Result<()> {
         let state = states.at(frame)?;
         let mut unseen = 0;
         if degree < state.sh_degree() {
             shown.clone_from(state);
-            shown.drop_bands(degree);
+            shown.truncate_sh(degree);
             unseen += write_points(&shown, which, &track.steps, points);
         } else {
             unseen += write_points(state, which, &track.steps, points);
         }
-        if which == Columns::all() {
+        if which == Attributes::all() {
             check_positions(state, degree, &track.steps, points)?;
         }
         track.unseen = track.unseen.max(unseen);
         progress.advance(1);
         Ok(())
     };
-    read(first, Columns::all(), &mut points, &mut states)?;
+    read(first, Attributes::all(), &mut points, &mut states)?;
     let zeros = vec![0; count];
     let planes: Vec<&[i32]> = points.chunks_exact(count.max(1)).collect();
     sink(0, pack(planes.iter().map(|plane| (&zeros[..], vec![*plane])).collect())?)?;
@@ -267,7 +267,7 @@ mod tests {
         assert_eq!(found.len(), frames.len());
         let steps = track.steps;
         for (&frame, found) in frames.iter().zip(&found) {
-            let state = gather_all(&scene, frame, Columns::all()).unwrap();
+            let state = gather_all(&scene, frame, Attributes::all()).unwrap();
             let near = |component: usize, i: usize, value: f64, step: f64| {
                 let off = (found[component][i] as f64 * step - value).abs();
                 assert!(off <= 0.5 * step * (1.0 + 1e-9), "frame {frame}, component {component}: {off} of {step}");

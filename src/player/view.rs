@@ -8,7 +8,7 @@ use crate::error::{Error, Result};
 use crate::files::atomic::{Kind, MARKER, Replace, StagedFile, StagedFolder, check_target};
 use crate::limits::Limits;
 use crate::memory_plan::{Plan, ResourceEstimate, Workload};
-use crate::model::{ALL_HARMONICS, Columns, SequenceInfo};
+use crate::model::{Attributes, NO_SH_LIMIT, SequenceInfo};
 use crate::models::InputModel;
 use crate::player::lattice::{Steps, width};
 use crate::player::page::{Chunks, INDEX, PageModel, PageScene, looks, upwards};
@@ -104,15 +104,15 @@ pub fn view(options: &ViewOptions) -> Result<Viewed> {
 
     let all = options.max_frames.max(1);
     let (frames, degree) = match compressed {
-        Some(_) => (options.original_frames.unwrap_or(all), options.original_degree.unwrap_or(ALL_HARMONICS)),
-        None => (all, ALL_HARMONICS),
+        Some(_) => (options.original_frames.unwrap_or(all), options.original_degree.unwrap_or(NO_SH_LIMIT)),
+        None => (all, NO_SH_LIMIT),
     };
     let scratch = scratch_beside(&options.output).unwrap_or_else(|| scene.scratch.clone());
     let (mut chunks, mut notes) = (Chunks::new(&scratch)?, std::mem::take(&mut scene.notes));
     let asked = ModelView { role: "original", path: &scene.path, frames, degree };
     let mut models = vec![show(&*scene.input, 0, &asked, steps, &limits, &mut chunks, &scene.events)?];
     if let Some((path, model)) = options.compressed.as_deref().zip(compressed.as_deref()) {
-        let asked = ModelView { role: "compressed", path, frames: all, degree: ALL_HARMONICS };
+        let asked = ModelView { role: "compressed", path, frames: all, degree: NO_SH_LIMIT };
         models.push(show(model, 1, &asked, steps, &limits, &mut chunks, &scene.events)?);
     }
     for model in models.iter().filter(|model| model.track.unseen > 0) {
@@ -207,9 +207,9 @@ fn need(work: &Workload, limits: &Limits) -> ResourceEstimate {
         reads: 1.0,
         seconds: work.reading(work.count(), work.frames as f64),
         per_gaussian: vec![
-            ("states", 2 * work.state(Columns::all())),
+            ("states", 2 * work.state(Attributes::all())),
             ("readers", work.input.reader),
-            ("held", work.held(limits, Columns::all())),
+            ("held", work.held(limits, Attributes::all())),
             ("points", 3 * points),
         ],
         // The group, and eight of its components as differences and as bytes, and what comes of all.

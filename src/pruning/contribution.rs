@@ -10,14 +10,14 @@ use serde::{Deserialize, Serialize};
 
 use crate::error::Result;
 use crate::limits::Limits;
-use crate::model::{Camera, Columns, Picture};
-use crate::passes::pictures::{Subject, Workers};
+use crate::model::{Attributes, Camera, FrameView};
+use crate::passes::pictures::{RenderedSource, Workers};
 use crate::progress::Events;
 use crate::render::{Contribution, Renderer};
 use crate::source::{FrameSource, Ids};
 
 /// Attributes that contributions depend on: all but color.
-const GEOMETRY: Columns = Columns::all().difference(Columns::SH);
+const GEOMETRY: Attributes = Attributes::all().difference(Attributes::SH);
 
 /// Contributions of N Gaussians to the scored views.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -46,7 +46,7 @@ impl VisibleContribution {
 /// Memory per Gaussian: its reader, and that of [`RunningContribution`]. Nothing grows with frames or views.
 pub fn visible_contribution(
     source: &dyn FrameSource,
-    (cameras, pictures): (&[Camera], &[Picture]),
+    (cameras, pictures): (&[Camera], &[FrameView]),
     pixel_stride: NonZeroU32,
     limits: Limits,
     events: &Events,
@@ -79,13 +79,13 @@ impl RunningContribution {
         &mut self,
         source: &dyn FrameSource,
         cameras: &[Camera],
-        pictures: &[Picture],
+        pictures: &[FrameView],
         advance: impl Fn() + Sync,
     ) -> Result<()> {
         let (count, pixel_stride) = (self.count, self.pixel_stride);
         self.pictures += pictures.len();
         self.workers.show(
-            Subject { source, ids: Some(Ids::Range(0..count)), columns: GEOMETRY },
+            RenderedSource { source, ids: Some(Ids::Range(0..count)), columns: GEOMETRY },
             cameras,
             pictures,
             || (Renderer::new(), Contribution::new(count)),
@@ -113,7 +113,7 @@ impl RunningContribution {
 mod tests {
     use super::*;
     use crate::diagnostics::demo_scene::Scene;
-    use crate::model::{Flags, Gaussians, Rig, Rows, Schedule, SequenceInfo, Split};
+    use crate::model::{Flags, Gaussians, Rig, Rows, SequenceInfo, Split, ViewSchedule};
     use crate::passes::looked_at;
     use crate::pruning::{Overrides, select};
     use crate::recipe::{self, Recipe};
@@ -146,7 +146,7 @@ mod tests {
             let mut pictures = 0;
             for (frame_index, t) in (0..7).step_by(frame as usize).enumerate() {
                 let mut state = Gaussians::zeros(2500, scene.info().sh_degree);
-                scene.open(Ids::Range(0..2500)).unwrap().read(t, Columns::all(), &mut state).unwrap();
+                scene.open(Ids::Range(0..2500)).unwrap().read(t, Attributes::all(), &mut state).unwrap();
                 for &(_, camera) in schedule.views(t).iter().skip(frame_index % view as usize).step_by(view as usize) {
                     let camera = &schedule.cameras[camera as usize];
                     render::contribution(&state, camera, scan.pixel_stride, &mut plain);
@@ -198,7 +198,7 @@ mod tests {
         let camera = Camera::look_at(glam::DVec3::X, glam::DVec3::ZERO, 1.0, (8, 8));
         let views = |from: u32, to: u32| (from..to).map(|view| (view, view)).collect::<Vec<_>>();
         // The first frame has no view in this split.
-        let mut schedule = Schedule::new((0..3).map(|_| camera.clone()).collect());
+        let mut schedule = ViewSchedule::new((0..3).map(|_| camera.clone()).collect());
         for (count, seen) in [(1, views(0, 0)), (2, views(0, 3)), (1, views(0, 0)), (2, views(0, 3))] {
             schedule.push(count, &seen);
         }
@@ -226,7 +226,7 @@ mod tests {
     struct Picked(Gaussians);
 
     impl BlockReader for Picked {
-        fn read(&mut self, _: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
+        fn read(&mut self, _: usize, want: Attributes, out: &mut Gaussians) -> Result<()> {
             want.iter().for_each(|column| *out.column_mut(column) = self.0.column(column).clone());
             Ok(())
         }
@@ -251,7 +251,7 @@ mod tests {
             state.log_scale.set_row(i, [size, if size > 0.0 { -5.0 } else { size }, size]);
             state.opacity_logit.set_row(i, [logit]);
         }
-        let info = SequenceInfo { count, times: vec![0.0, 1.0], sh_degree: 0, varying: Columns::empty() };
+        let info = SequenceInfo { count, times: vec![0.0, 1.0], sh_degree: 0, varying: Attributes::empty() };
         let rig = Rig {
             cameras: vec![Camera::look_at(glam::DVec3::new(0.0, -4.0, 0.0), glam::DVec3::ZERO, 1.0, (64, 48))],
             shots: vec![crate::model::Shot { view: 0, camera: 0, time: None, split: Split::Train, image: None }],
@@ -294,9 +294,9 @@ mod tests {
     #[test]
     fn without_views_or_gaussians_results_are_zero() {
         let scene = Scene::new(300, 2);
-        let mut schedule = Schedule::default();
+        let mut schedule = ViewSchedule::default();
         schedule.push(2, &[]);
-        let look = |source: &dyn FrameSource, schedule: &Schedule| {
+        let look = |source: &dyn FrameSource, schedule: &ViewSchedule| {
             let sample = looked_at(schedule, &strides(1, 1, 1), 1);
             let sample = (&schedule.cameras[..], &sample[..]);
             let found = visible_contribution(source, sample, NonZeroU32::MIN, Limits::NONE, &Events::IGNORED).unwrap();

@@ -15,7 +15,7 @@ pub use ranking::Ranking;
 use serde::{Deserialize, Serialize};
 
 use crate::error::{Error, Result};
-use crate::recipe::{LowPriority, Select};
+use crate::recipe::{LowPriority, SelectParams};
 use crate::statistics::score::Scores;
 
 /// Ids that the user keeps or drops whatever their scores, in any order.
@@ -76,7 +76,7 @@ pub const WORKING_BYTES_PER_GAUSSIAN: usize =
 ///
 /// # Errors
 /// Returns [`Error::Usage`] for an id beyond N, and for an id that is to be both kept and dropped.
-pub fn select(scores: &Scores, recipe: &Select, overrides: &Overrides) -> Result<Selection> {
+pub fn select(scores: &Scores, recipe: &SelectParams, overrides: &Overrides) -> Result<Selection> {
     let n = scores.score.len();
     let forced = user_decisions(n, overrides)?;
     let candidates = (recipe.keep_fraction * n as f64).round() as usize;
@@ -118,7 +118,7 @@ pub fn select(scores: &Scores, recipe: &Select, overrides: &Overrides) -> Result
 }
 
 /// Returns whether each Gaussian passes stage 2.
-fn passes(scores: &Scores, recipe: &Select) -> Vec<bool> {
+fn passes(scores: &Scores, recipe: &SelectParams) -> Vec<bool> {
     let Scores { static_norm, dynamic_norm, .. } = scores;
     let norms = || static_norm.iter().zip(dynamic_norm);
     let indistinguishable = norms().all(|(&static_score, &dynamic_score)| static_score == 0.0 && dynamic_score == 0.0);

@@ -5,7 +5,7 @@ use rayon::slice::ParallelSliceMut;
 use serde::{Deserialize, Serialize};
 
 use crate::model::hash_id;
-use crate::recipe::{LowPriority, Select};
+use crate::recipe::{LowPriority, SelectParams};
 use crate::statistics::score::Scores;
 
 /// Gaussians in the order in which they are kept, best first.
@@ -47,7 +47,7 @@ pub(super) struct Orders {
 }
 
 /// Ranks all Gaussians in both orders; `passes` says whether each passes stage 2.
-pub(super) fn orders(scores: &Scores, recipe: &Select, candidates: usize, passes: &[bool]) -> Orders {
+pub(super) fn orders(scores: &Scores, recipe: &SelectParams, candidates: usize, passes: &[bool]) -> Orders {
     let n = scores.score.len();
     let mut by_score: Vec<u32> = (0..n as u32).collect();
     // Adding 0 makes −0 equal to 0 under a total order.

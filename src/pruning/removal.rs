@@ -2,8 +2,8 @@
 
 use crate::error::Result;
 use crate::limits::Limits;
-use crate::model::{Camera, Columns, Picture};
-use crate::passes::pictures::{Subject, Workers};
+use crate::model::{Attributes, Camera, FrameView};
+use crate::passes::pictures::{RenderedSource, Workers};
 use crate::render::{RemovalError, Renderer};
 use crate::source::{FrameSource, Ids};
 
@@ -16,7 +16,7 @@ use crate::source::{FrameSource, Ids};
 pub fn removal_error(
     source: &dyn FrameSource,
     ids: &[u32],
-    (cameras, pictures): (&[Camera], &[Picture]),
+    (cameras, pictures): (&[Camera], &[FrameView]),
     background: [f32; 3],
     contrast_floor: f32,
     limits: Limits,
@@ -24,7 +24,7 @@ pub fn removal_error(
 ) -> Result<RemovalError> {
     let mut workers = Workers::new(limits);
     workers.show(
-        Subject { source, ids: Some(Ids::List(ids)), columns: Columns::all() },
+        RenderedSource { source, ids: Some(Ids::List(ids)), columns: Attributes::all() },
         cameras,
         pictures,
         || (Renderer::new(), RemovalError::new(ids.len(), contrast_floor)),
@@ -43,7 +43,7 @@ mod tests {
     use super::*;
     use crate::diagnostics::demo_scene::Scene;
     use crate::model::Split;
-    use crate::passes::{VIEWS_AT_ONCE, gather, spread};
+    use crate::passes::{VIEWS_PER_FRAME, gather, spread};
 
     #[test]
     fn errors_equal_a_plain_loop_on_any_thread_count() {
@@ -53,13 +53,13 @@ mod tests {
         let background = [0.1, 0.2, 0.3];
         let mut plain = RemovalError::new(ids.len(), 0.1);
         for (t, views) in schedule.iter().enumerate() {
-            let state = gather(&scene, &ids, t, Columns::all()).unwrap();
+            let state = gather(&scene, &ids, t, Attributes::all()).unwrap();
             for &(_, camera) in views {
                 Renderer::new().removal_error(&state, &schedule.cameras[camera as usize], background, &mut plain);
             }
         }
         assert!(plain.sum.iter().filter(|&&sum| sum > 0).count() > 1000);
-        let sample = spread(&schedule, usize::MAX, VIEWS_AT_ONCE);
+        let sample = spread(&schedule, usize::MAX, VIEWS_PER_FRAME);
         assert_eq!(sample.len(), schedule.pairs());
         let two = Limits { frames_held: 2, frames_together: 2, pictures_together: 2, ..Limits::NONE };
         for (threads, limits) in [(1, Limits::NONE), (3, Limits::NONE), (3, two)] {

@@ -12,7 +12,7 @@ use crate::journal::records::{FlagSummary, Saved, TermSummary};
 use crate::limits::Limits;
 use crate::memory_plan::{MemoryPart, ResourceEstimate, Workload};
 use crate::model::RobustBox;
-use crate::model::{Columns, Flags, Gaussians, Rows};
+use crate::model::{Attributes, Flags, Gaussians, Rows};
 use crate::models::trajectories::state_bytes;
 use crate::passes::{frames_to_see, gather};
 use crate::pruning;
@@ -21,7 +21,7 @@ use crate::pruning::{Overrides, Ranking, Selection, select};
 use crate::recipe::{self, NonFinite};
 use crate::scene::Scene;
 use crate::statistics::aside::StatisticsRows;
-use crate::statistics::pass::Scanned;
+use crate::statistics::pass::ScanResult;
 use crate::statistics::score::{Scores, Term, score};
 use crate::statistics::{fill_anisotropy, snap, ulp};
 
@@ -29,7 +29,8 @@ use crate::statistics::{fill_anisotropy, snap, ulp};
 pub(crate) const NAME: &str = "score";
 
 /// Memory of statistics, scores and a selection while scoring, in bytes per Gaussian.
-pub const SCORED: u64 = (Rows::BYTES_PER_GAUSSIAN + Scores::BYTES_PER_GAUSSIAN + pruning::BYTES_PER_GAUSSIAN) as u64;
+pub const SCORED_BYTES: u64 =
+    (Rows::BYTES_PER_GAUSSIAN + Scores::BYTES_PER_GAUSSIAN + pruning::BYTES_PER_GAUSSIAN) as u64;
 
 /// Returns the memory kept after scoring: the selection, and the statistics unless they are written to a scratch file.
 pub fn scored_memory(limits: &Limits) -> Vec<MemoryPart> {
@@ -47,7 +48,7 @@ pub struct ScoreStage {
     /// Normalization and weights of the scores.
     pub score: recipe::ScoreParams,
     /// Parameters of stages 1 and 2 of the selection.
-    pub select: recipe::Select,
+    pub select: recipe::SelectParams,
     /// Gaussians that the user keeps or drops.
     pub user: UserOverrides,
 }
@@ -101,9 +102,9 @@ impl ScoreStage {
             reads: work.reads(1, limits),
             seconds: 2e-6 * work.count(),
             per_gaussian: vec![
-                ("rows", SCORED),
+                ("rows", SCORED_BYTES),
                 ("sorting", pruning::WORKING_BYTES_PER_GAUSSIAN as u64),
-                ("states", work.state(Columns::POSITION | Columns::LOG_SCALE)),
+                ("states", work.state(Attributes::POSITION | Attributes::LOG_SCALE)),
             ],
             fixed: vec![work.arriving()],
         }
@@ -122,7 +123,7 @@ impl ScoreStage {
     pub fn run(
         &self,
         scene: &Scene,
-        scanned: Scanned,
+        scanned: ScanResult,
         seen: Option<VisibleContribution>,
         journal: &mut Journal,
     ) -> Result<Scored> {
@@ -145,7 +146,7 @@ impl ScoreStage {
             let all: Vec<u32> = (0..info.count as u32).collect();
             let state = match info.times.is_empty() {
                 true => Gaussians::zeros(info.count, info.sh_degree),
-                false => gather(source, &all, reference_frame, Columns::POSITION | Columns::LOG_SCALE)?,
+                false => gather(source, &all, reference_frame, Attributes::POSITION | Attributes::LOG_SCALE)?,
             };
             let extent = RobustBox::from_positions(&state.position).extent();
             let canonical = scene.input.canonical().unwrap_or(&state);
@@ -336,11 +337,11 @@ impl Scored {
             let why = format!("{} frame{}", info.times.len(), if info.times.len() == 1 { "" } else { "s" });
             journal.leave_out("motion, curvature, opacity variance", why);
         } else {
-            for column in Columns::all().difference(info.varying).iter() {
+            for column in Attributes::all().difference(info.varying).iter() {
                 let why = format!("{} is the same in every frame", column.name());
                 let again = (info.times.len() - 1) as u64 * info.count as u64;
                 let bytes = again * state_bytes(info.sh_degree, column);
-                journal.spare(saved_reads(column), why, Saved::Values { bytes });
+                journal.spare(saved_reads(column), why, Saved::StatisticAccess { bytes });
             }
         }
         if info.sh_degree == 0 {
@@ -371,12 +372,12 @@ fn median_life(life: &[u32]) -> u32 {
     if lives.is_empty() { 0 } else { *lives.select_nth_unstable(middle).1 }
 }
 
-fn saved_reads(column: Columns) -> &'static str {
+fn saved_reads(column: Attributes) -> &'static str {
     match column {
-        Columns::POSITION => "re-reading positions per frame",
-        Columns::ROTATION => "re-reading rotations per frame",
-        Columns::LOG_SCALE => "re-reading scales per frame",
-        Columns::OPACITY => "re-reading opacities per frame",
+        Attributes::POSITION => "re-reading positions per frame",
+        Attributes::ROTATION => "re-reading rotations per frame",
+        Attributes::LOG_SCALE => "re-reading scales per frame",
+        Attributes::OPACITY => "re-reading opacities per frame",
         _ => "re-reading colors per frame",
     }
 }

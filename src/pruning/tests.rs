@@ -20,17 +20,17 @@ fn scores(parts: &[(f64, f64)]) -> Scores {
     }
 }
 
-fn rule(low_priority: LowPriority, keep_fraction: f64, tau_static: f64, tau_dynamic: f64) -> Select {
+fn rule(low_priority: LowPriority, keep_fraction: f64, tau_static: f64, tau_dynamic: f64) -> SelectParams {
     let paper = Recipe::preset("paper").unwrap().select;
-    Select { keep_fraction, tau_static, tau_dynamic, low_priority, ..paper }
+    SelectParams { keep_fraction, tau_static, tau_dynamic, low_priority, ..paper }
 }
 
-fn without_overrides(scores: &Scores, recipe: &Select) -> Selection {
+fn without_overrides(scores: &Scores, recipe: &SelectParams) -> Selection {
     select(scores, recipe, &Overrides::default()).unwrap()
 }
 
 /// Computes the kept set by the definition: full sort, then the OR rule, unless all norms are 0.
-fn kept_by_definition(scores: &Scores, recipe: &Select) -> Vec<bool> {
+fn kept_by_definition(scores: &Scores, recipe: &SelectParams) -> Vec<bool> {
     let n = scores.score.len();
     let mut order: Vec<usize> = (0..n).collect();
     order.sort_by(|&a, &b| {
@@ -65,7 +65,7 @@ fn sign_of_zero_changes_no_ranking() {
     }
 }
 
-fn any_rule() -> impl Strategy<Value = Select> {
+fn any_rule() -> impl Strategy<Value = SelectParams> {
     let tau = || prop_oneof![Just(0.0), Just(0.05), Just(0.5), Just(1.25)];
     let fraction = prop_oneof![Just(0.0), Just(1.0), 0.0..=1.0f64];
     (any::<bool>(), fraction, tau(), tau()).prop_map(|(rescue, fraction, tau_static, tau_dynamic)| {

@@ -6,7 +6,7 @@ use crate::error::Result;
 use crate::journal::Journal;
 use crate::limits::Limits;
 use crate::memory_plan::{LOOK, ResourceEstimate, Workload};
-use crate::model::{Columns, Rows, Statistic};
+use crate::model::{Attributes, Rows, Statistic};
 use crate::passes::{frames_to_see, looked_at};
 use crate::pruning::contribution::{VisibleContribution, visible_contribution};
 use crate::recipe::{self, Coverage};
@@ -38,7 +38,7 @@ impl Visible {
     /// Estimates the memory and time of the stage: the statistics scanned so far, C and W, and the views being
     /// rendered.
     pub fn need(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
-        let (mut per_gaussian, mut fixed) = work.looking(limits, Columns::all().difference(Columns::SH), 12);
+        let (mut per_gaussian, mut fixed) = work.looking(limits, Attributes::all().difference(Attributes::SH), 12);
         let every = (self.recipe.frame_stride.get() * self.recipe.view_stride.get()) as f64;
         let strided = work.pictures as f64 / every;
         let max_views = match self.recipe.look_pictures {
@@ -55,13 +55,13 @@ impl Visible {
             fixed.push(("schedule", 2 * (16 * work.frames + 8 * strided as u64)));
         }
         let seconds =
-            work.reading(work.count(), frames as f64) + work.picturing(strided.min(max_views), work.count(), LOOK);
+            work.reading(work.count(), frames as f64) + work.render_seconds(strided.min(max_views), work.count(), LOOK);
         ResourceEstimate { stage: NAME, reads: work.reads(frames, limits), seconds, per_gaussian, fixed }
     }
 
     /// Returns whether the views of a frame can be chosen when the frame arrives. With a maximum number of views they
     /// can only be chosen after the last frame.
-    pub fn can_look_on_arrival(&self) -> bool {
+    pub fn can_render_on_arrival(&self) -> bool {
         self.recipe.look_pictures == 0
     }
 

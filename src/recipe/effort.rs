@@ -60,7 +60,7 @@ impl Effort {
 impl Recipe {
     /// Returns this recipe at `effort`: with more or fewer scored views, rounds and optimization steps. Parts that the
     /// recipe does not use stay unused. A recipe that scores all views keeps scoring all.
-    pub fn at_effort(&self, effort: Effort) -> Recipe {
+    pub fn with_effort(&self, effort: Effort) -> Recipe {
         let Some(settings) = effort.settings() else { return self.clone() };
         let steps = settings.steps * f64::from(self.refine.refine_steps);
         let mut recipe = self.refining_by((steps.ceil() as u32).min(MOST_STEPS));
@@ -89,7 +89,7 @@ mod tests {
     #[test]
     fn effort_increases_work_and_adds_no_unused_parts() {
         let default = Recipe::preset("default").unwrap();
-        let at = Effort::ALL.map(|effort| default.at_effort(effort));
+        let at = Effort::ALL.map(|effort| default.with_effort(effort));
         assert_eq!(at[1], default);
         let rising = |value: fn(&Recipe) -> f64| at.iter().map(value).is_sorted_by(|a, b| a < b);
         assert!(rising(|recipe| recipe.scan.look_pictures as f64));
@@ -99,7 +99,7 @@ mod tests {
         at.iter().for_each(|recipe| recipe.validate().unwrap());
         let paper = Recipe::preset("paper").unwrap();
         for effort in Effort::ALL {
-            let other = paper.at_effort(effort);
+            let other = paper.with_effort(effort);
             assert_eq!((&other.scan, &other.select), (&paper.scan, &paper.select), "{}", effort.name());
         }
     }

@@ -10,14 +10,14 @@ mod sections;
 use serde::{Deserialize, Serialize};
 
 use crate::error::{Error, Result, quoted};
-use crate::model::Columns;
+use crate::model::Attributes;
 
 pub use effort::Effort;
 pub use parameters::{Parameter, parameters};
 pub use sections::{
     Anisotropy, AttributeGroups, Coverage, FieldParams, LengthUnit, LowPriority, MergeParams, MergePass, MotionParams,
-    NonFinite, Placement, Precision, ProxyOpacity, RefineParams, ScanParams, ScoreParams, Select, ShDegreeParams,
-    ShHigh, StaticTerm, Trajectory, WhichBands,
+    NonFinite, Placement, Precision, ProxyOpacity, RefineParams, ScanParams, ScoreParams, SelectParams, ShDegreeParams,
+    ShDegreeRule, ShHigh, StaticTerm, Trajectory,
 };
 
 /// Text of preset `paper`, with a comment on every parameter.
@@ -33,7 +33,7 @@ pub const PRESETS: [(&str, &str); 4] = [
 
 /// Maximum fraction of the Gaussians that a pruning round may leave. With it, 10 million Gaussians take 1300 rounds
 /// down to a few.
-pub const MOST_LEFT_BY_ROUND: f64 = 0.99;
+pub const MAX_ROUND_FRACTION: f64 = 0.99;
 /// Maximum number of optimization steps of refinement; a run of one day.
 const MOST_STEPS: u32 = 1_000_000;
 /// Maximum number of merge passes. Every pass reads all frames.
@@ -48,7 +48,7 @@ pub struct Recipe {
     /// Parameters of the scores: normalization and weights.
     pub score: ScoreParams,
     /// Parameters of selection (stages 1 and 2 of the paper).
-    pub select: Select,
+    pub select: SelectParams,
     /// Parameters of merging (stage 3 of the paper).
     pub merge: MergeParams,
     /// Parameters of refinement, which fits the stored values of the survivors.
@@ -100,7 +100,7 @@ impl Recipe {
     /// Returns this recipe without refinement.
     pub fn unrefined(&self) -> Recipe {
         let mut recipe = self.clone();
-        recipe.refine.refine = AttributeGroups(Columns::empty());
+        recipe.refine.refine = AttributeGroups(Attributes::empty());
         recipe
     }
 
@@ -144,7 +144,7 @@ impl Recipe {
             (
                 "select.round_fraction",
                 self.select.round_fraction,
-                (0.1..=MOST_LEFT_BY_ROUND).contains(&self.select.round_fraction) || self.select.round_fraction == 1.0,
+                (0.1..=MAX_ROUND_FRACTION).contains(&self.select.round_fraction) || self.select.round_fraction == 1.0,
                 "0.1 to 0.99, or 1 for no rounds",
             ),
             ("select.round_pictures", self.select.round_pictures as f64, self.select.round_pictures > 0, "1 or more"),

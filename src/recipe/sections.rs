@@ -5,7 +5,7 @@ use std::num::NonZeroU32;
 use serde::{Deserialize, Serialize};
 
 use crate::error::quoted;
-use crate::model::{Columns, HIGHEST_DEGREE};
+use crate::model::{Attributes, MAX_SH_DEGREE};
 
 /// Parameters of the scan over all frames.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -102,7 +102,7 @@ pub enum Anisotropy {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 #[expect(missing_docs, reason = "paper.toml documents each parameter beside its value")]
-pub struct Select {
+pub struct SelectParams {
     pub keep_fraction: f64,
     pub tau_static: f64,
     pub tau_dynamic: f64,
@@ -170,14 +170,14 @@ pub struct FieldParams {
 #[serde(deny_unknown_fields)]
 #[expect(missing_docs, reason = "paper.toml documents each parameter beside its value")]
 pub struct ShDegreeParams {
-    pub bands: WhichBands,
+    pub bands: ShDegreeRule,
     pub bands_margin: f64,
 }
 
 /// Rule for the SH degree of the result.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
-pub enum WhichBands {
+pub enum ShDegreeRule {
     /// SH degree of the input, unchanged.
     All,
     /// Lowest degree at which renders hardly change.
@@ -186,27 +186,27 @@ pub enum WhichBands {
     UpTo(usize),
 }
 
-impl TryFrom<String> for WhichBands {
+impl TryFrom<String> for ShDegreeRule {
     type Error = String;
 
-    fn try_from(text: String) -> std::result::Result<WhichBands, String> {
+    fn try_from(text: String) -> std::result::Result<ShDegreeRule, String> {
         match text.as_str() {
-            "all" => Ok(WhichBands::All),
-            "needed" => Ok(WhichBands::Needed),
+            "all" => Ok(ShDegreeRule::All),
+            "needed" => Ok(ShDegreeRule::Needed),
             degree => match degree.parse() {
-                Ok(degree) if degree <= HIGHEST_DEGREE => Ok(WhichBands::UpTo(degree)),
-                _ => Err(format!("{}: expected all, needed, or a degree from 0 to {HIGHEST_DEGREE}", quoted(degree))),
+                Ok(degree) if degree <= MAX_SH_DEGREE => Ok(ShDegreeRule::UpTo(degree)),
+                _ => Err(format!("{}: expected all, needed, or a degree from 0 to {MAX_SH_DEGREE}", quoted(degree))),
             },
         }
     }
 }
 
-impl From<WhichBands> for String {
-    fn from(bands: WhichBands) -> String {
+impl From<ShDegreeRule> for String {
+    fn from(bands: ShDegreeRule) -> String {
         match bands {
-            WhichBands::All => "all".to_owned(),
-            WhichBands::Needed => "needed".to_owned(),
-            WhichBands::UpTo(degree) => degree.to_string(),
+            ShDegreeRule::All => "all".to_owned(),
+            ShDegreeRule::Needed => "needed".to_owned(),
+            ShDegreeRule::UpTo(degree) => degree.to_string(),
         }
     }
 }
@@ -225,22 +225,22 @@ pub enum Precision {
 /// Set of attributes, written as names separated by commas: any of `color,opacity,scale,rotation,position`, or `none`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
-pub struct AttributeGroups(pub Columns);
+pub struct AttributeGroups(pub Attributes);
 
 /// Name and attribute of every group.
-const GROUPS: [(&str, Columns); 5] = [
-    ("color", Columns::SH),
-    ("opacity", Columns::OPACITY),
-    ("scale", Columns::LOG_SCALE),
-    ("rotation", Columns::ROTATION),
-    ("position", Columns::POSITION),
+const GROUPS: [(&str, Attributes); 5] = [
+    ("color", Attributes::SH),
+    ("opacity", Attributes::OPACITY),
+    ("scale", Attributes::LOG_SCALE),
+    ("rotation", Attributes::ROTATION),
+    ("position", Attributes::POSITION),
 ];
 
 impl TryFrom<String> for AttributeGroups {
     type Error = String;
 
     fn try_from(text: String) -> std::result::Result<AttributeGroups, String> {
-        let mut columns = Columns::empty();
+        let mut columns = Attributes::empty();
         for name in text.split([',', ' ']).filter(|&name| text != "none" && !name.is_empty()) {
             let group = GROUPS.iter().find(|group| group.0 == name).ok_or_else(|| {
                 let names = GROUPS.map(|group| group.0).join(",");

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use crate::cache::{Spill, SpillWriter};
 use crate::error::Result;
-use crate::model::{Column, Columns, Gaussians, Jacobian};
+use crate::model::{AttributeValues, Attributes, Gaussians, Jacobian};
 
 /// Opacity logit below which no delta makes a Gaussian visible: an opacity below 10⁻¹³.
 const ABSENT_LOGIT: f32 = -30.0;
@@ -50,7 +50,7 @@ impl LinearizedState {
     }
 
     /// Returns the columns stored for every frame: the attributes `varying` of the state, and the Jacobian.
-    fn stored_columns(&mut self, varying: Columns) -> impl Iterator<Item = &mut Column> {
+    fn stored_columns(&mut self, varying: Attributes) -> impl Iterator<Item = &mut AttributeValues> {
         self.state.columns_mut(varying).chain(self.jacobian.columns_mut())
     }
 }
@@ -59,7 +59,7 @@ impl LinearizedState {
 #[derive(Debug)]
 pub(super) struct LinearizedFrames {
     file: Spill,
-    varying: Columns,
+    varying: Attributes,
     /// State of all Gaussians at the first frame: attributes that do not vary, and the shape of those that do.
     first: Option<LinearizedState>,
     frames: Vec<StoredFrame>,
@@ -75,7 +75,7 @@ struct StoredFrame {
 /// Writer of the states of all frames.
 pub(super) struct LinearizedFramesWriter {
     file: SpillWriter,
-    varying: Columns,
+    varying: Attributes,
     first: Option<LinearizedState>,
     frames: Vec<StoredFrame>,
     end: u64,
@@ -86,7 +86,7 @@ impl LinearizedFramesWriter {
     ///
     /// # Errors
     /// Fails if no scratch file can be created in `scratch`.
-    pub(super) fn new(scratch: &Path, varying: Columns) -> Result<LinearizedFramesWriter> {
+    pub(super) fn new(scratch: &Path, varying: Attributes) -> Result<LinearizedFramesWriter> {
         Ok(LinearizedFramesWriter {
             file: SpillWriter::new(scratch)?,
             varying,
@@ -157,14 +157,14 @@ impl LinearizedFrames {
         };
         to.present = present.map(|count| vec![0; count]);
         read(bytemuck::cast_slice_mut(to.present.as_deref_mut().unwrap_or_default()))?;
-        let constant = Columns::all().difference(self.varying);
-        let shape = |to: &mut Column, of: &Column| {
+        let constant = Attributes::all().difference(self.varying);
+        let shape = |to: &mut AttributeValues, of: &AttributeValues| {
             if to.width() != of.width() {
-                *to = Column::zeros(of.width(), 0);
+                *to = AttributeValues::zeros(of.width(), 0);
             }
             to.resize(if of.is_empty() { 0 } else { present.unwrap_or(of.len()) });
         };
-        for column in Columns::all().iter() {
+        for column in Attributes::all().iter() {
             let (of, is_constant) = (first.state.column(column), constant.contains(column));
             let state = to.state.column_mut(column);
             match &to.present {
@@ -191,15 +191,15 @@ mod tests {
         linearized_state.state.position.planes_mut().iter_mut().zip(0..).for_each(|(x, k)| *x = k as f32);
         linearized_state.state.opacity_logit.planes_mut().fill(-40.0);
         present.iter().for_each(|&row| linearized_state.state.opacity_logit.plane_mut(0)[row] = 1.0);
-        *linearized_state.jacobian.column_mut(Columns::OPACITY) =
-            Column::from_planes(1, (0..len).map(|k| k as f32).collect());
+        *linearized_state.jacobian.column_mut(Attributes::OPACITY) =
+            AttributeValues::from_planes(1, (0..len).map(|k| k as f32).collect());
         linearized_state
     }
 
     #[test]
     fn frames_after_the_first_are_stored_sparsely() {
         let folder = tempfile::tempdir().unwrap();
-        let varying = Columns::POSITION | Columns::OPACITY;
+        let varying = Attributes::POSITION | Attributes::OPACITY;
         let mut keeping = LinearizedFramesWriter::new(folder.path(), varying).unwrap();
         let mut pushed = [
             linearized_state(6, &[1]),

@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::targets::{mean_square, wide};
-use crate::metrics::{BYTES_PER_PIXEL, BYTES_PER_PIXEL_OF_SLOPE, decibels, ssim, ssim_slope};
+use crate::metrics::{BYTES_PER_PIXEL, SSIM_SLOPE_BYTES_PER_PIXEL, decibels, ssim, ssim_gradient};
 use crate::render::Image;
 
 /// Weight of the squared error relative to 1 − SSIM: with equal fractions, both contribute about equally at 35 dB.
@@ -39,7 +39,7 @@ impl Loss {
         if self.ssim > 0.0 {
             let count = target.len() as f64;
             let factors = [(1.0 - self.ssim) * SQUARED_WEIGHT, self.ssim * count].map(|factor| factor as f32);
-            let like = ssim_slope(picture, &image(picture, target));
+            let like = ssim_gradient(picture, &image(picture, target));
             slope.data.iter_mut().zip(&like.data).for_each(|(to, like)| *to = factors[0] * *to - factors[1] * like);
         }
         slope
@@ -54,7 +54,7 @@ impl Loss {
     /// Returns the memory per pixel of comparing `threads` views at once, beside the views and their targets, in bytes.
     pub(super) fn bytes_per_pixel(&self, threads: u64) -> u64 {
         let compared = threads * (12 + BYTES_PER_PIXEL) as u64;
-        if self.ssim > 0.0 { compared.max((12 + BYTES_PER_PIXEL_OF_SLOPE) as u64) } else { 0 }
+        if self.ssim > 0.0 { compared.max((12 + SSIM_SLOPE_BYTES_PER_PIXEL) as u64) } else { 0 }
     }
 
     /// Returns whether `now` is better than `best`: by mean PSNR, or by the loss if SSIM is part of it.

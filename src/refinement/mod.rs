@@ -7,7 +7,7 @@
 //! kept for validation; of the states during the last phase, the start included, the one with the best validation
 //! quality is written. A deformation field is not changed.
 //!
-//! Memory: an [`optimizer::Descent`] and one view with its gradient, three states, and the best delta so far. The
+//! Memory: an [`optimizer::Adam`] and one view with its gradient, three states, and the best delta so far. The
 //! target views, and the states at their frames, are in scratch files.
 
 mod local;
@@ -22,8 +22,10 @@ pub(crate) use run::RefineRun;
 
 use crate::cache::CacheKey;
 use crate::limits::Limits;
-use crate::memory_plan::{MemoryPart, PICTURE_ON_ALL_THREADS, REMOVE, RENDER, ResourceEstimate, Workload, of_left};
-use crate::model::{ALL_HARMONICS, Columns};
+use crate::memory_plan::{
+    MemoryPart, REMOVE, RENDER, ResourceEstimate, SHARED_VIEW_BYTES_PER_GAUSSIAN, Workload, bytes_of_survivors,
+};
+use crate::model::{Attributes, NO_SH_LIMIT};
 use crate::pruning::score::scored_memory;
 use crate::recipe;
 use crate::refinement::optimizer_state::{REEVALUATE_EVERY, StepParams, keyframe_count};
@@ -38,7 +40,7 @@ const STEP_RENDERS: f64 = 3.0;
 
 /// PSNR in dB above which refinement has nothing to gain: the rms error is about a quarter of an 8-bit
 /// step.
-pub(crate) const CLOSE_ENOUGH: f64 = 60.0;
+pub(crate) const MAX_USEFUL_PSNR: f64 = 60.0;
 /// Fraction of the Gaussians that ranking alone leaves before the first optimization steps of a stronger compression.
 const MIN_START_FRACTION: f64 = 0.4;
 /// Minimum fraction of the Gaussians that a prune step leaves.
@@ -52,7 +54,7 @@ const RATE_VIEWS: usize = 16;
 #[derive(Debug, Clone)]
 pub struct RefineStage {
     /// Attributes that are optimized.
-    pub columns: Columns,
+    pub columns: Attributes,
     /// Maximum SH degree that is optimized.
     pub sh_degree: usize,
     /// Loss to be minimized.
@@ -82,7 +84,7 @@ impl RefineStage {
             recipe.refine;
         let refine = RefineStage {
             columns: refine.0,
-            sh_degree: ALL_HARMONICS,
+            sh_degree: NO_SH_LIMIT,
             loss: Loss { ssim: refine_ssim },
             steps: refine_steps as usize,
             cut_steps: refine_cut_steps as usize,
@@ -96,19 +98,20 @@ impl RefineStage {
     }
 
     /// Returns the stage with SH coefficients above degree 0 left unchanged.
-    pub fn without_bands(self) -> RefineStage {
+    pub fn with_fixed_higher_sh(self) -> RefineStage {
         RefineStage { sh_degree: 0, ..self }
     }
 
     /// Returns the stage with deltas that are constant in time.
-    pub fn without_course(self) -> RefineStage {
+    pub fn with_constant_deltas(self) -> RefineStage {
         RefineStage { knots: 0, ..self }
     }
 
     /// Returns the stage with a fraction `part` of the steps, and deltas that are constant in time.
-    pub fn in_part(&self, part: f64) -> RefineStage {
+    pub fn with_step_fraction(&self, part: f64) -> RefineStage {
         let scaled = |steps: usize| (part * steps as f64).ceil() as usize;
-        RefineStage { steps: scaled(self.steps), cut_steps: scaled(self.cut_steps), ..self.clone() }.without_course()
+        RefineStage { steps: scaled(self.steps), cut_steps: scaled(self.cut_steps), ..self.clone() }
+            .with_constant_deltas()
     }
 
     /// Returns the cache key of these parameters; the input is not included.
@@ -157,9 +160,9 @@ impl RefineStage {
 
     /// Estimates the memory and time of the stage: states, the optimizer, and a view with its gradient.
     pub fn need(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
-        let whole = work.state(Columns::all());
-        let read = [("readers", work.input.reader), ("held", work.held(limits, Columns::all()))];
-        let original = [("states", whole), ("pictures", PICTURE_ON_ALL_THREADS)];
+        let whole = work.state(Attributes::all());
+        let read = [("readers", work.input.reader), ("held", work.held(limits, Attributes::all()))];
+        let original = [("states", whole), ("pictures", SHARED_VIEW_BYTES_PER_GAUSSIAN)];
         let original: Vec<MemoryPart> = read.into_iter().chain(original).collect();
         let left = [
             ("states", (6 + work.threads) * whole),
@@ -172,12 +175,12 @@ impl RefineStage {
         // along time.
         let phase = |part: f64, more: Option<MemoryPart>| -> Vec<MemoryPart> {
             let parts = read.into_iter().chain(left).chain(more);
-            parts.map(|(name, bytes)| (name, of_left(part, bytes))).collect()
+            parts.map(|(name, bytes)| (name, bytes_of_survivors(part, bytes))).collect()
         };
         let (wanted, keyframe_count) = (self.target.unwrap_or(1.0).min(1.0), self.keyframes_for(work));
         // Includes the best time-varying delta so far.
         let keyframe_bytes = optimizer::bytes_per_gaussian(self.columns, 0) as u64
-            + work.state(self.columns.difference(Columns::SH))
+            + work.state(self.columns.difference(Attributes::SH))
             + 12;
         let keyframe_steps =
             (keyframe_count > 0).then(|| phase(wanted, Some(("course", keyframe_count as u64 * keyframe_bytes))));
@@ -199,14 +202,14 @@ impl RefineStage {
             // Evaluating states and their Jacobians takes three times as long as evaluating states.
             let found = if work.input.jacobian > 0 { 3.0 * steps as f64 / REEVALUATE_EVERY as f64 } else { 0.0 };
             work.reading(count, frames as f64 * found)
-                + work.picturing(renders + STEP_RENDERS * steps as f64, count, RENDER)
-                + work.picturing(ranked, count, REMOVE)
+                + work.render_seconds(renders + STEP_RENDERS * steps as f64, count, RENDER)
+                + work.render_seconds(ranked, count, REMOVE)
         };
         ResourceEstimate {
             stage: NAME,
             reads: 2.0 * work.scattered_reads(frames, limits),
             seconds: 2.0 * work.reading(work.count(), frames as f64)
-                + work.picturing(pictures, work.count(), RENDER)
+                + work.render_seconds(pictures, work.count(), RENDER)
                 + prune_counts.iter().enumerate().map(seconds).sum::<f64>(),
             per_gaussian: [scored_memory(limits), vec![("kept", 24)], per_gaussian].concat(),
             fixed: vec![

@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::compressed_model::ParamDelta;
-use crate::model::{Column, Columns, Gaussians, Gradients, sh_coefficients};
+use crate::model::{AttributeValues, Attributes, Gaussians, Gradients, sh_coefficients};
 
 /// Decay rates of the running means of the derivative and of its square.
 const BETAS: [f32; 2] = [0.9, 0.999];
@@ -49,36 +49,36 @@ impl RateSchedule {
 
 /// Adam optimizer of the stored parameters of Gaussians.
 #[derive(Debug)]
-pub struct Descent {
+pub struct Adam {
     change: ParamDelta,
     /// Running means of the derivatives, and of their squares.
     means: [Gaussians; 2],
     /// `[N]`, factors on the learning rate: for positions 0.04 times the geometric mean of the scales, for
     /// other attributes 1; 0 for fixed Gaussians.
     reach: [Vec<f32>; 2],
-    columns: Columns,
+    columns: Attributes,
     done: usize,
 }
 
-/// Returns the memory of a [`Descent`] and of the derivatives it uses, in bytes per Gaussian, for the attributes
+/// Returns the memory of a [`Adam`] and of the derivatives it uses, in bytes per Gaussian, for the attributes
 /// `columns` with SH coefficients up to `sh_degree`.
-pub fn bytes_per_gaussian(columns: Columns, sh_degree: usize) -> usize {
+pub fn bytes_per_gaussian(columns: Attributes, sh_degree: usize) -> usize {
     4 * 4 * columns.width(sh_degree) + 2 * size_of::<f32>()
 }
 
-impl Descent {
+impl Adam {
     /// Creates the optimizer at `start`. The attributes `columns` are optimized, SH coefficients up to `sh_degree`,
     /// except for the Gaussians `fixed`.
-    pub fn new(start: &Gaussians, columns: Columns, sh_degree: usize, fixed: &[bool]) -> Descent {
+    pub fn new(start: &Gaussians, columns: Attributes, sh_degree: usize, fixed: &[bool]) -> Adam {
         let mut change = Gaussians::default();
         for column in columns.iter() {
-            *change.column_mut(column) = Column::zeros(column.width(sh_degree), start.len());
+            *change.column_mut(column) = AttributeValues::zeros(column.width(sh_degree), start.len());
         }
         let extent = |i: usize| start.log_scale.row::<3>(i).iter().sum::<f32>() / 3.0;
         let free: Vec<f32> = fixed.iter().map(|&fixed| if fixed { 0.0 } else { 1.0 }).collect();
         let position_reach = |(i, free): (usize, &f32)| free * 0.04 * extent(i).clamp(-80.0, 80.0).exp();
         let reach = [free.iter().enumerate().map(position_reach).collect(), free];
-        Descent { means: [change.clone(), change.clone()], change: ParamDelta(change), reach, columns, done: 0 }
+        Adam { means: [change.clone(), change.clone()], change: ParamDelta(change), reach, columns, done: 0 }
     }
 
     /// Returns the delta to be added to the start.
@@ -110,7 +110,7 @@ impl Descent {
         self.done = 0;
     }
 
-    /// Returns the contents of a checkpoint: delta, means, and number of steps. [`Descent::resume`] resumes from it.
+    /// Returns the contents of a checkpoint: delta, means, and number of steps. [`Adam::resume`] resumes from it.
     pub fn checkpoint(&self) -> (&ParamDelta, &[Gaussians; 2], usize) {
         (&self.change, &self.means, self.done)
     }
@@ -136,7 +136,7 @@ impl Descent {
         let moved = self.columns.iter().zip(moved.zip(self.change.0.columns_mut(self.columns)));
         let mut planes = Vec::new();
         for (column, ((means, squares), values)) in moved {
-            let reach = if column == Columns::POSITION { position_reach } else { other_reach };
+            let reach = if column == Attributes::POSITION { position_reach } else { other_reach };
             let slopes_of_column = gradients.column(column).planes().chunks_exact(count);
             let state = means.planes_mut().chunks_exact_mut(count).zip(squares.planes_mut().chunks_exact_mut(count));
             let state = state.zip(values.planes_mut().chunks_exact_mut(count)).zip(slopes_of_column).enumerate();
@@ -157,12 +157,12 @@ impl Descent {
 }
 
 /// Returns the learning rate of component `c` of `column`; positions are in units of their `reach`.
-fn rate(column: Columns, c: usize) -> f32 {
+fn rate(column: Attributes, c: usize) -> f32 {
     match column {
-        Columns::POSITION => 1.0,
-        Columns::ROTATION => 0.006,
-        Columns::SH if c < 3 * sh_coefficients(0) => 0.015,
-        Columns::SH => 0.001_25,
+        Attributes::POSITION => 1.0,
+        Attributes::ROTATION => 0.006,
+        Attributes::SH if c < 3 * sh_coefficients(0) => 0.015,
+        Attributes::SH => 0.001_25,
         // Log scale and opacity logit.
         _ => 0.05,
     }
@@ -174,8 +174,8 @@ mod tests {
 
     /// Returns the derivatives of Σ (value − aim)² / 2 in every attribute.
     fn slopes(state: &Gaussians, aim: f32) -> Gradients {
-        let mut gradients = Gradients::new(state.len(), Columns::all(), 0);
-        for column in Columns::all().iter() {
+        let mut gradients = Gradients::new(state.len(), Attributes::all(), 0);
+        for column in Attributes::all().iter() {
             let values = state.column(column).planes();
             gradients.column_mut(column).planes_mut().iter_mut().zip(values).for_each(|(slope, x)| *slope = x - aim);
         }
@@ -185,15 +185,15 @@ mod tests {
     #[test]
     fn values_converge_to_zero_slope_and_fixed_ones_stay() {
         let start = Gaussians::zeros(3, 0);
-        let mut descent = Descent::new(&start, Columns::all(), 0, &[false, true, false]);
+        let mut descent = Adam::new(&start, Attributes::all(), 0, &[false, true, false]);
         for _ in 0..2000 {
             let mut now = start.clone();
-            descent.change().add_to(&mut now, Columns::all());
+            descent.change().add_to(&mut now, Attributes::all());
             descent.step(&slopes(&now, 0.25), 1.0, &RateSchedule::new(2000, 0.05, 1.0));
         }
         let mut end = start.clone();
-        descent.change().add_to(&mut end, Columns::all());
-        for column in Columns::all().iter() {
+        descent.change().add_to(&mut end, Attributes::all());
+        for column in Attributes::all().iter() {
             for c in 0..end.column(column).width() {
                 let plane = end.column(column).plane(c);
                 assert_eq!(plane[1], 0.0);
@@ -206,12 +206,12 @@ mod tests {
     fn steps_equal_adam_in_f64() {
         let start = Gaussians::zeros(1, 0);
         let (steps, error) = (50, 0.009);
-        let mut descent = Descent::new(&start, Columns::OPACITY, 0, &[false]);
+        let mut descent = Adam::new(&start, Attributes::OPACITY, 0, &[false]);
         let (mut value, mut mean, mut square) = (0.0f64, 0.0f64, 0.0f64);
         for k in 0..steps {
-            let mut gradients = Gradients::new(1, Columns::OPACITY, 0);
+            let mut gradients = Gradients::new(1, Attributes::OPACITY, 0);
             let slope = (k as f64 * 0.7).sin() + 0.3;
-            gradients.column_mut(Columns::OPACITY).set_row(0, [slope as f32]);
+            gradients.column_mut(Attributes::OPACITY).set_row(0, [slope as f32]);
             descent.step(&gradients, 1.0, &RateSchedule::new(steps, 0.05, error));
             mean = 0.9 * mean + 0.1 * slope;
             square = 0.999 * square + 0.001 * slope * slope;
@@ -226,15 +226,15 @@ mod tests {
 
     #[test]
     fn extreme_slopes_leave_values_finite() {
-        let mut descent = Descent::new(&Gaussians::zeros(4, 0), Columns::all(), 0, &[false; 4]);
+        let mut descent = Adam::new(&Gaussians::zeros(4, 0), Attributes::all(), 0, &[false; 4]);
         for slope in [f32::MAX, 1e-38, -f32::MAX, 0.0, 3e20] {
-            let mut gradients = Gradients::new(4, Columns::all(), 0);
-            for column in Columns::all().iter() {
+            let mut gradients = Gradients::new(4, Attributes::all(), 0);
+            for column in Attributes::all().iter() {
                 gradients.column_mut(column).planes_mut().fill(slope);
             }
             descent.step(&gradients, 1.0, &RateSchedule::new(10, 0.05, 1.0));
         }
         let change = descent.change();
-        assert!(Columns::all().iter().all(|column| change.0.column(column).planes().iter().all(|x| x.is_finite())));
+        assert!(Attributes::all().iter().all(|column| change.0.column(column).planes().iter().all(|x| x.is_finite())));
     }
 }

@@ -8,9 +8,9 @@ use super::loss::{Loss, RenderQuality};
 use super::targets::Targets;
 use crate::compressed_model::{ParamDelta, TrajectoryDelta};
 use crate::error::{Error, Result};
-use crate::model::{Columns, Gaussians, Gradients, Raw, SequenceInfo};
+use crate::model::{Attributes, Gaussians, Gradients, SequenceInfo, StoredParams};
 use crate::passes::States;
-use crate::refinement::optimizer::{Descent, RateSchedule};
+use crate::refinement::optimizer::{Adam, RateSchedule};
 use crate::render::{RemovalError, Renderer};
 use crate::scene::Scene;
 use crate::source::{Deformation, FrameSource, ReadPlan};
@@ -19,7 +19,7 @@ use crate::source::{Deformation, FrameSource, ReadPlan};
 #[derive(Debug, Clone, Copy)]
 pub(super) struct StepParams {
     /// Attributes that are optimized.
-    pub(super) columns: Columns,
+    pub(super) columns: Attributes,
     /// Maximum SH degree that is optimized.
     pub(super) sh_degree: usize,
     /// Loss to be minimized.
@@ -45,7 +45,7 @@ pub(super) const REEVALUATE_EVERY: usize = 200;
 /// [`REEVALUATE_EVERY`] steps and extrapolated along their Jacobians in between. Evaluating a field and its derivative
 /// at every step would take three times as long and gain nothing (method.md, section 6.2).
 ///
-/// Memory: six states, [`Descent`], and a view with its gradient; in a scratch file one state per frame, of the
+/// Memory: six states, [`Adam`], and a view with its gradient; in a scratch file one state per frame, of the
 /// Gaussians present if they are few.
 pub(super) struct OptimizerState<'a> {
     scene: &'a Scene,
@@ -53,21 +53,21 @@ pub(super) struct OptimizerState<'a> {
     deformation: Option<&'a dyn Deformation>,
     /// Frames of the target views, increasing.
     frames: Vec<usize>,
-    varying: Columns,
+    varying: Attributes,
     /// State of each of these frames before `descent` changed anything.
     linearized: LinearizedFrames,
     /// Stored parameters before `descent` changed anything, if states depend on them by more than a sum.
-    stored: Raw,
+    stored: StoredParams,
     /// Delta that was added to the stored parameters before that.
     before: ParamDelta,
     fixed: Vec<bool>,
     /// Attributes and loss, limited to what the states have.
     step_params: StepParams,
-    descent: Descent,
+    descent: Adam,
     /// One optimizer per keyframe of the time-varying delta; empty if there is none.
-    course: Vec<Descent>,
+    course: Vec<Adam>,
     /// Attributes of each Gaussian that vary between frames; empty with a deformation field.
-    changing: Vec<Columns>,
+    changing: Vec<Attributes>,
     gradients: Gradients,
     /// Buffer for the state of the view being rendered.
     now: LinearizedState,
@@ -85,7 +85,7 @@ type OptimizerCheckpoint<Stored, Added, Means> =
     (Option<(Stored, Added)>, (Added, Means, usize), usize, Vec<(Added, Means, usize)>);
 
 /// An [`OptimizerCheckpoint`] read back from the cache.
-pub(super) type KeptCheckpoint = OptimizerCheckpoint<Raw, ParamDelta, [Gaussians; 2]>;
+pub(super) type KeptCheckpoint = OptimizerCheckpoint<StoredParams, ParamDelta, [Gaussians; 2]>;
 
 impl<'a> OptimizerState<'a> {
     /// Creates the state for the survivors in `result`, to be optimized with these parameters except for the Gaussians
@@ -105,7 +105,7 @@ impl<'a> OptimizerState<'a> {
         let deformation = result.deformation();
         let SequenceInfo { varying, sh_degree: state_degree, .. } = *result.info();
         let sh_degree = sh_degree.min(state_degree);
-        let columns = columns & deformation.map_or(Columns::all(), Deformation::movable);
+        let columns = columns & deformation.map_or(Attributes::all(), Deformation::movable);
         let empty = Gaussians::zeros(0, state_degree);
         let mut optimizer = OptimizerState {
             scene,
@@ -114,9 +114,9 @@ impl<'a> OptimizerState<'a> {
             linearized: LinearizedFramesWriter::new(&scene.scratch, varying)?.finish()?,
             stored: deformation.map_or_else(|| empty.clone().into(), |deformation| deformation.stored().clone()),
             before: ParamDelta::default(),
-            descent: Descent::new(&empty, columns, sh_degree, &[]),
+            descent: Adam::new(&empty, columns, sh_degree, &[]),
             course: Vec::new(),
-            changing: vec![Columns::empty(); fixed.len()],
+            changing: vec![Attributes::empty(); fixed.len()],
             gradients: Gradients::new(0, columns, sh_degree),
             now: LinearizedState::none(state_degree),
             renderer: Renderer::on_all_threads(),
@@ -159,7 +159,7 @@ impl<'a> OptimizerState<'a> {
         self.reevaluated = false;
         let Some(LinearizedState { state, .. }) = self.linearized.first() else { return };
         let StepParams { columns, sh_degree, .. } = self.step_params;
-        self.descent = Descent::new(state, columns, sh_degree, &self.fixed);
+        self.descent = Adam::new(state, columns, sh_degree, &self.fixed);
         self.gradients = Gradients::new(state.len(), columns, sh_degree);
     }
 
@@ -171,7 +171,7 @@ impl<'a> OptimizerState<'a> {
         let Some(LinearizedState { state, .. }) = self.linearized.first().filter(|_| !columns.is_empty()) else {
             return false;
         };
-        self.course = (0..keyframe_count).map(|_| Descent::new(state, columns, 0, &self.fixed)).collect();
+        self.course = (0..keyframe_count).map(|_| Adam::new(state, columns, 0, &self.fixed)).collect();
         true
     }
 
@@ -205,7 +205,7 @@ impl<'a> OptimizerState<'a> {
         self.bake_delta();
         let mut linearized = LinearizedFramesWriter::new(&self.scene.scratch, self.varying)?;
         for &frame in &self.frames {
-            let want = if linearized.is_empty() { Columns::all() } else { self.varying };
+            let want = if linearized.is_empty() { Attributes::all() } else { self.varying };
             self.now.present = None;
             deformation.state(frame, &self.stored, want, &mut self.now.state)?;
             self.now.jacobian = deformation.jacobian(frame, &self.stored, self.step_params.columns)?;
@@ -219,8 +219,8 @@ impl<'a> OptimizerState<'a> {
     /// Returns the state that a checkpoint stores and [`OptimizerState::resume`] resumes from.
     pub(super) fn checkpoint(&self) -> impl Serialize + '_ {
         let reevaluated = self.reevaluated.then_some((&self.stored, &self.before));
-        let course = self.course.iter().map(Descent::checkpoint).collect();
-        let checkpoint: OptimizerCheckpoint<&Raw, &ParamDelta, &[Gaussians; 2]> =
+        let course = self.course.iter().map(Adam::checkpoint).collect();
+        let checkpoint: OptimizerCheckpoint<&StoredParams, &ParamDelta, &[Gaussians; 2]> =
             (reevaluated, self.descent.checkpoint(), self.steps, course);
         checkpoint
     }
@@ -260,7 +260,7 @@ impl<'a> OptimizerState<'a> {
         }
         let moved = self.descent.take();
         if self.deformation.is_some() {
-            moved.add_to(&mut self.stored.gaussians, Columns::all());
+            moved.add_to(&mut self.stored.gaussians, Attributes::all());
         }
         self.before = std::mem::take(&mut self.before).and(moved);
     }
@@ -303,7 +303,7 @@ impl<'a> OptimizerState<'a> {
                 change.scale(weight);
                 change
             });
-            deltas.iter().for_each(|change| change.add_to(&mut now.state, Columns::all()));
+            deltas.iter().for_each(|change| change.add_to(&mut now.state, Attributes::all()));
         }
         Ok(())
     }

@@ -7,8 +7,8 @@ use serde::{Deserialize, Serialize};
 use super::loss::RenderQuality;
 use super::optimizer::RateSchedule;
 use super::optimizer_state::{KeptCheckpoint, OptimizerState, keyframe_count};
-use super::targets::{Parted, Targets};
-use super::{CLOSE_ENOUGH, NAME, RANKING_VIEWS, RATE_VIEWS, RefineStage, along_time, prune_counts};
+use super::targets::{Targets, ViewSplit};
+use super::{MAX_USEFUL_PSNR, NAME, RANKING_VIEWS, RATE_VIEWS, RefineStage, along_time, prune_counts};
 use crate::cache::CacheKey;
 use crate::compressed_model::{CompressedModel, ParamDelta, TrajectoryDelta};
 use crate::error::Result;
@@ -63,7 +63,7 @@ impl RefineStage {
         let run = |journal: &mut Journal| {
             journal.stage(NAME, count, scene.source(), |journal| {
                 let targets = Targets::new(scene, self.pictures)?;
-                scene.work.not_divided(NAME)?;
+                scene.work.end_shard_before(NAME)?;
                 let mut run = RefineRun::new(NAME, self, scene, scored, &targets, targets.parted(false));
                 Ok((run.run_all(&reduction, wanted, steps, journal)?.0, wanted))
             })
@@ -191,7 +191,7 @@ impl<'a> RefineRun<'a> {
         scene: &'a Scene,
         scored: &'a Scored,
         targets: &'a Targets,
-        parts: Parted,
+        parts: ViewSplit,
     ) -> RefineRun<'a> {
         let views = (&targets.cameras, &targets.pictures, &parts.stepped, &parts.apart);
         let key = scene.work.key(&(refine.key(), views, &scored.protected));
@@ -385,7 +385,7 @@ impl<'a> RefineRun<'a> {
                 }
                 let views: Vec<usize> = (0..RANKING_VIEWS).map(|_| self.sampler.next()).collect();
                 let errors = optimizer.removal_error(&views, self.refine.contrast_floor as f32)?;
-                let left = errors.most_missed(size, |place| optimizer.fixed()[place]);
+                let left = errors.top_by_error(size, |place| optimizer.fixed()[place]);
                 work.keep(&name, key, &(optimizer.checkpoint(), &left, self.sampler.taken))?;
                 left
             }
@@ -415,7 +415,7 @@ impl<'a> RefineRun<'a> {
                     journal.leave_out("refinement", why);
                     return Ok(BestState::new(before, optimizer.change()));
                 }
-                if before.psnr >= CLOSE_ENOUGH {
+                if before.psnr >= MAX_USEFUL_PSNR {
                     let why = format!("the {count} validation views have {:.2} dB PSNR without it", before.psnr);
                     journal.leave_out("refinement", why);
                     return Ok(BestState::new(before, optimizer.change()));
@@ -472,7 +472,7 @@ impl<'a> RefineRun<'a> {
         steps: usize,
     ) -> Result<bool> {
         let keyframe_steps = self.steps_along_time(steps);
-        if keyframe_steps == 0 || best_state.constant.psnr >= CLOSE_ENOUGH {
+        if keyframe_steps == 0 || best_state.constant.psnr >= MAX_USEFUL_PSNR {
             return Ok(false);
         }
         if done <= steps {

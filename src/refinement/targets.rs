@@ -6,8 +6,8 @@ use rayon::prelude::*;
 
 use crate::cache::{Spill, SpillWriter};
 use crate::error::Result;
-use crate::model::{Camera, Picture};
-use crate::passes::{Batch, Subject, VIEWS_AT_ONCE, ViewStates, show, spread};
+use crate::model::{Camera, FrameView};
+use crate::passes::{Batch, RenderedSource, VIEWS_PER_FRAME, ViewStates, show, spread};
 use crate::render::{Image, render};
 use crate::scene::Scene;
 use crate::scene::between::{SplitMix64, between};
@@ -28,7 +28,7 @@ const TEST_EVERY: usize = 4;
 
 /// Indices of the target views by purpose.
 #[derive(Clone)]
-pub(crate) struct Parted {
+pub(crate) struct ViewSplit {
     /// Training views, which optimization steps use.
     pub(crate) stepped: Vec<usize>,
     /// Validation views, which choose the best state.
@@ -48,7 +48,7 @@ pub(super) fn view_counts(max_views: usize, pixels: u64) -> [usize; 2] {
 pub(crate) struct Targets {
     pub(crate) cameras: Vec<Camera>,
     /// Views, sorted by frame.
-    pub(crate) pictures: Vec<Picture>,
+    pub(crate) pictures: Vec<FrameView>,
     /// Files with the values of consecutive views, from 0 to 1 as 16 bits, one view after the other.
     values: Vec<(Range<usize>, Spill)>,
 }
@@ -61,7 +61,7 @@ impl Targets {
     pub(crate) fn new(scene: &Scene, max_views: usize) -> Result<Targets> {
         let (cameras, pictures) = choose_views(scene, max_views);
         let make = |some: Range<usize>, values: &mut SpillWriter| {
-            let subject = [Subject::all(scene.source())];
+            let subject = [RenderedSource::all(scene.source())];
             show(subject, &cameras, &pictures[some], Batch::of_frame(&scene.limits), |views| {
                 let picture = |view: &ViewStates<'_, 1>| narrow(&render(view.states[0], view.camera, scene.background));
                 let made: Vec<Vec<u16>> = views.par_iter().map(picture).collect();
@@ -69,17 +69,17 @@ impl Targets {
             })
         };
         let key = scene.work.key(&(&cameras, &pictures));
-        let values = scene.work.divided_spill(NAME, key, pictures.len(), &scene.scratch, make)?;
+        let values = scene.work.sharded_spill(NAME, key, pictures.len(), &scene.scratch, make)?;
         Ok(Targets { cameras, pictures, values })
     }
 
     /// Assigns each view to training, validation or test. With `held` every fourth view is a test view, else none is.
-    pub(crate) fn parted(&self, held: bool) -> Parted {
+    pub(crate) fn parted(&self, held: bool) -> ViewSplit {
         let (held, rest): (Vec<usize>, Vec<usize>) =
             (0..self.pictures.len()).partition(|k| held && k % TEST_EVERY == TEST_EVERY - 1);
         // Validation views are chosen from the views that are not test views.
         let (apart, stepped) = rest.into_iter().partition(|k| k % VALIDATION_EVERY == 1);
-        Parted { stepped, apart, held }
+        ViewSplit { stepped, apart, held }
     }
 
     /// Returns the camera of view `k`.
@@ -108,9 +108,9 @@ impl Targets {
 }
 
 /// Chooses cameras and views, sorted by frame: those that the scene is scored by, and those in between.
-fn choose_views(scene: &Scene, max_views: usize) -> (Vec<Camera>, Vec<Picture>) {
+fn choose_views(scene: &Scene, max_views: usize) -> (Vec<Camera>, Vec<FrameView>) {
     let [scene_views, between_views] = view_counts(max_views, scene.workload().pixels);
-    let mut pictures = spread(&scene.schedule, scene_views, VIEWS_AT_ONCE);
+    let mut pictures = spread(&scene.schedule, scene_views, VIEWS_PER_FRAME);
     let used = scene.schedule.used();
     let mut cameras: Vec<Camera> = used.iter().map(|&camera| scene.schedule.cameras[camera as usize].clone()).collect();
     for picture in &mut pictures {
@@ -119,7 +119,7 @@ fn choose_views(scene: &Scene, max_views: usize) -> (Vec<Camera>, Vec<Picture>) 
     let (seen, mut random) = (pictures.len(), SplitMix64(2));
     for camera in between(&cameras, if seen == 0 { 0 } else { between_views }) {
         let frame = pictures[random.below(seen)].frame;
-        pictures.push(Picture { frame, view: u32::MAX, camera: cameras.len() as u32 });
+        pictures.push(FrameView { frame, view: u32::MAX, camera: cameras.len() as u32 });
         cameras.push(camera);
     }
     pictures.sort_by_key(|picture| picture.frame);

@@ -43,7 +43,7 @@ fn test_psnr(scene: &Scene, rig: &Rig, reduction: &CompressedModel) -> f64 {
     let result = scene.input.reduced(reduction).unwrap();
     let frame_psnr = |(frame, views): (usize, &[(u32, u32)])| -> f64 {
         let [original, now] =
-            [scene.source(), &*result].map(|source| gather_all(source, frame, Columns::all()).unwrap());
+            [scene.source(), &*result].map(|source| gather_all(source, frame, Attributes::all()).unwrap());
         let view_psnr = |&(_, camera): &(u32, u32)| {
             let rendered = |state| render(state, &schedule.cameras[camera as usize], scene.background);
             psnr(&rendered(&now), &rendered(&original))
@@ -81,11 +81,11 @@ fn threads_and_limits_do_not_change_the_result() {
     scene.limits = Limits { frames_held: 1, pictures_together: 1, ..Limits::NONE };
     assert!(on(2, &scene).change == one.change, "limits change it");
     for (place, id) in one.kept.iter().enumerate().filter(|(_, id)| keep.contains(id)) {
-        let moved = |column: Columns| {
+        let moved = |column: Attributes| {
             let delta = one.change.0.column(column);
             (0..delta.width()).any(|c| delta.plane(c)[place] != 0.0)
         };
-        assert!(!Columns::all().iter().any(moved), "Gaussian {id} is protected and moved");
+        assert!(!Attributes::all().iter().any(moved), "Gaussian {id} is protected and moved");
     }
 }
 
@@ -96,7 +96,7 @@ fn interrupted_runs_resume_to_the_same_result() {
     let model = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/tiny_model");
     let long = folder.path().join("long.gseq");
     let demo = demo_scene::Scene::new(900, 16);
-    write_container(&demo, &long, gseq::Compression::Raw, Default::default(), |_| ()).unwrap();
+    write_container(&demo, &long, gseq::Compression::StoredParams, Default::default(), |_| ()).unwrap();
     let short = folder.path().join("scene.gseq");
     drop(scene(folder.path()));
     // States that are the stored parameters plus a delta, states from a deformation field, and time-varying deltas.
@@ -177,9 +177,9 @@ impl FrameSource for ShortLives {
 }
 
 impl BlockReader for Reader<'_> {
-    fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
+    fn read(&mut self, frame: usize, want: Attributes, out: &mut Gaussians) -> Result<()> {
         self.0.read(frame, want, out)?;
-        if want.contains(Columns::OPACITY) {
+        if want.contains(Attributes::OPACITY) {
             let logits = out.opacity_logit.plane_mut(0).iter_mut().zip(&self.1);
             logits.filter(|(_, id)| !(*id + frame).is_multiple_of(3)).for_each(|(logit, _)| *logit = self.2);
         }
@@ -192,10 +192,10 @@ fn leaving_out_absent_gaussians_changes_no_result() {
     let folder = tempfile::tempdir().unwrap();
     let [away, unseen] = [-40.0, -25.0].map(|logit| {
         let demo = demo_scene::Scene::new(900, 6);
-        let (rig, info) = (demo.rig(), SequenceInfo { varying: Columns::all(), ..demo.info().clone() });
+        let (rig, info) = (demo.rig(), SequenceInfo { varying: Attributes::all(), ..demo.info().clone() });
         let path = folder.path().join("scene.gseq");
         let source = ShortLives(demo, info, logit);
-        write_container(&source, &path, gseq::Compression::Raw, Default::default(), |_| ()).unwrap();
+        write_container(&source, &path, gseq::Compression::StoredParams, Default::default(), |_| ()).unwrap();
         let input = Box::new(Container::open(&path).unwrap());
         let scene = Scene::new(path, input, rig, Some(Split::Train)).unwrap();
         let recipe = Recipe::preset("default").unwrap();
@@ -214,11 +214,11 @@ fn explicit_frames_improve_along_time_in_every_output() {
     let folder = tempfile::tempdir().unwrap();
     let demo = demo_scene::Scene::new(900, 16);
     let [packed, files] = ["scene.gseq", "frames"].map(|name| folder.path().join(name));
-    write_container(&demo, &packed, gseq::Compression::Raw, Default::default(), |_| ()).unwrap();
+    write_container(&demo, &packed, gseq::Compression::StoredParams, Default::default(), |_| ()).unwrap();
     std::fs::create_dir(&files).unwrap();
     write_sequence(&demo, OutputKind::PlySequence, &files, 1, &Events::IGNORED).unwrap();
     let read = |source: &dyn FrameSource| -> Vec<Gaussians> {
-        (0..16).map(|frame| gather_all(source, frame, Columns::all()).unwrap()).collect()
+        (0..16).map(|frame| gather_all(source, frame, Attributes::all()).unwrap()).collect()
     };
     for (name, path, link) in
         [("packed", &packed, Link::Never), ("files", &files, Link::Never), ("linked", &files, Link::Apart)]
@@ -228,14 +228,14 @@ fn explicit_frames_improve_along_time_in_every_output() {
         let recipe = Recipe::preset("default").unwrap();
         let scored = score_scene(&scene, &recipe, &UserOverrides::default());
         let given = read(scene.source());
-        let is_still = |states: &[Gaussians], column: Columns, row: usize| {
+        let is_still = |states: &[Gaussians], column: Attributes, row: usize| {
             let values = |frame: &Gaussians| frame.column(column).pick(&[row as u32]);
             states.iter().all(|frame| values(frame) == values(&states[0]))
         };
         // Of the Gaussians that are always present, keep half of the moving and an eighth of the static ones.
         let is_there = |id: usize| given.iter().all(|frame| frame.opacity_logit.plane(0)[id] > -30.0);
         let part = |&id: &u32| {
-            let one_in = if is_still(&given, Columns::POSITION, id as usize) { 8 } else { 2 };
+            let one_in = if is_still(&given, Attributes::POSITION, id as usize) { 8 } else { 2 };
             id % one_in == 0 && is_there(id as usize)
         };
         let kept: Vec<u32> = (0..given[0].len() as u32).filter(part).collect();
@@ -251,7 +251,7 @@ fn explicit_frames_improve_along_time_in_every_output() {
         assert_eq!((constant.course.0.len(), varying.course.0.len()), (0, 4));
         assert!(varying.change == constant.change, "{name}");
         // Some tracks join two Gaussians of this scene, with different colors.
-        assert!(link == Link::Apart || !varying.course.columns().contains(Columns::SH), "{name}");
+        assert!(link == Link::Apart || !varying.course.columns().contains(Attributes::SH), "{name}");
         let [before, after] = [&constant, &varying].map(|reduction| test_psnr(&scene, &demo.rig(), reduction));
         // Moving Gaussians cover a small part of these views, and static ones must stay static.
         assert!(after > before + 0.02, "{name}: {before:.2} dB constant in time, {after:.2} varying in time");
@@ -259,10 +259,10 @@ fn explicit_frames_improve_along_time_in_every_output() {
         // Attributes that are constant in the input stay constant, for every Gaussian.
         let mut still = [0, 0];
         for (place, &id) in varying.kept.iter().enumerate() {
-            for column in Columns::all().iter() {
+            for column in Attributes::all().iter() {
                 let was_still = is_still(&given, column, id as usize);
                 assert!(!was_still || is_still(&expected, column, place), "{name}: {id}, {}", column.name());
-                still[usize::from(was_still && column == Columns::POSITION)] += 1;
+                still[usize::from(was_still && column == Attributes::POSITION)] += 1;
             }
         }
         assert!(still.iter().all(|&count| count > 20), "{name}: {still:?}");
@@ -287,7 +287,8 @@ fn without_bands_higher_sh_degrees_stay() {
     let scored = score_scene(&scene, &recipe, &UserOverrides::default());
     let reduction = CompressedModel::pruned(scored.ranked().take(300), &recipe.merge);
     let (mut journal, count) = (Journal::default(), reduction.len());
-    let refine = RefineStage { steps: 100, ..RefineStage::from_recipe(&recipe, None, false).unwrap() }.without_bands();
+    let refine =
+        RefineStage { steps: 100, ..RefineStage::from_recipe(&recipe, None, false).unwrap() }.with_fixed_higher_sh();
     let moved = refine.run(&scene, &scored, reduction, count, &mut journal).unwrap();
     assert_eq!((moved.change.0.sh.width(), moved.change.0.sh.len()), (3, count));
     assert!(scene.source().info().sh_degree > 0 && journal.notes.len() == 1, "{journal:?}");

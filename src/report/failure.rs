@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 use super::traits::{GaussianKind, Traits};
 use crate::evaluation::RenderedViews;
 use crate::metrics::{PSNR_CAP_DB, clamped, psnr};
-use crate::model::{Camera, Column, Gaussians, SH_C0};
+use crate::model::{AttributeValues, Camera, Gaussians, SH_C0};
 use crate::render::{Image, render};
 
 /// PSNR below which an error can be seen: one part in a hundred, root mean square.
@@ -123,7 +123,7 @@ pub struct KindMembers {
 
 /// For every pixel the share of each kind, as red, green and blue.
 pub fn shares_of_pixels(state: &Gaussians, traits: &[Traits], camera: &Camera) -> Image {
-    let mut sh = Column::zeros(3, state.len());
+    let mut sh = AttributeValues::zeros(3, state.len());
     for (i, traits) in traits.iter().enumerate() {
         // Color is 0.5 + SH_C0 · coefficient.
         sh.set_row(i, traits.map(|of| ((f64::from(u8::from(of)) - 0.5) / SH_C0) as f32));

@@ -15,7 +15,7 @@ use crate::evaluation::ModelPair;
 use crate::files::image::write::jpeg_bytes;
 use crate::memory_plan::Workload;
 use crate::metrics::psnr;
-use crate::model::Picture;
+use crate::model::FrameView;
 use crate::render::Image;
 use crate::scene::pictures::thin;
 
@@ -75,13 +75,13 @@ pub fn films(side: &ModelPair, shown: &[ShownImage]) -> Result<Vec<FilmPanel>> {
     let mut films: Vec<FilmPanel> = Vec::new();
     let mut cameras = Vec::new();
     for (k, ShownImage { choice, factor, .. }) in shown.iter().enumerate() {
-        let Picture { view, camera, .. } = side.picture(choice.place);
+        let FrameView { view, camera, .. } = side.picture(choice.place);
         let wanted = k == 0 || choice.why.iter().any(|why| why == "median picture");
         if every < 2 || !wanted || cameras.contains(&camera) || films.len() == VIEWS {
             continue;
         }
         cameras.push(camera);
-        let pictures = thin((0..every).map(|frame| Picture { frame, view, camera }).collect(), FRAMES);
+        let pictures = thin((0..every).map(|frame| FrameView { frame, view, camera }).collect(), FRAMES);
         let made = side.both(&pictures, |[original, compressed]| {
             let bright = brighter(&difference(compressed, original), *factor);
             let small = |image: &Image, most: u64| data_uri(&shrink(image, shrinkage(image, most)));

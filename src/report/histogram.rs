@@ -10,8 +10,8 @@ use serde::Serialize;
 
 use super::run::Fate;
 use crate::files::csv::table;
-use crate::model::{Rows, Statistic, Values};
-use crate::statistics::score::{Graded, Scores};
+use crate::model::{Rows, Statistic, StatisticAccess};
+use crate::statistics::score::{Quantity, Scores};
 
 /// Bins of a histogram.
 const BINS: usize = 40;
@@ -63,14 +63,14 @@ pub fn histograms(rows: &Rows, scores: &Scores, frames: usize, fates: &[Fate]) -
     use Statistic::{C, D, Kappa, Life, V, Vis, W};
     let scores = [
         ("S", "the whole score", &scores.score),
-        (Graded::Static.name(), Graded::Static.property(), &scores.static_score),
-        (Graded::Dynamic.name(), Graded::Dynamic.property(), &scores.dynamic_score),
+        (Quantity::Static.name(), Quantity::Static.property(), &scores.static_score),
+        (Quantity::Dynamic.name(), Quantity::Dynamic.property(), &scores.dynamic_score),
     ];
     let part = |&count: &u32| f64::from(count) / frames.max(1) as f64;
     let statistic = |of: Statistic| {
         let (values, most) = match of.values() {
-            Values::F64(values, _) => (Cow::Borrowed(&values(rows)[..]), None),
-            Values::U32(values, _) => (values(rows).iter().map(part).collect(), Some(frames)),
+            StatisticAccess::F64(values, _) => (Cow::Borrowed(&values(rows)[..]), None),
+            StatisticAccess::U32(values, _) => (values(rows).iter().map(part).collect(), Some(frames)),
         };
         (of.name(), of.meaning(), values, most)
     };

@@ -36,11 +36,11 @@ use crate::files::atomic::{Kind as TargetKind, MARKER, Replace, StagedFolder, ch
 use crate::files::text::read_text;
 use crate::journal::Journal;
 use crate::journal::records::TermSummary;
-use crate::model::{Camera, Gaussians, Rows, Schedule, Split};
+use crate::model::{Camera, Gaussians, Rows, Split, ViewSchedule};
 use crate::outputs::kind::check_folder_name;
 use crate::pipeline::stage::MeasuredOnArrival;
 use crate::pipeline::stages::measure::Measure;
-use crate::pruning::score::{SCORED, Scored, UserOverrides};
+use crate::pruning::score::{SCORED_BYTES, Scored, UserOverrides};
 use crate::recipe::{NonFinite, Recipe};
 use crate::scene::Scene;
 pub use findings::ReportData;
@@ -98,7 +98,7 @@ fn report_whole(options: &ReportOptions) -> Result<ReportData> {
         let mut needs = measure.needs(work, limits, MeasuredOnArrival::default());
         needs.push(traits::need(work));
         needs.extend(evaluation::needs(work, limits).into_iter().map(|mut need| {
-            need.per_gaussian.push(("rows", SCORED + 8));
+            need.per_gaussian.push(("rows", SCORED_BYTES + 8));
             need.fixed.push(("films", film::bytes(work)));
             need
         }));
@@ -122,7 +122,7 @@ fn report_whole(options: &ReportOptions) -> Result<ReportData> {
         None => side.observe(look)?,
         Some(compared) => (compared, side.observe_in_parts("failure", look)?),
     };
-    side.scene.work.not_divided("the page")?;
+    side.scene.work.end_shard_before("the page")?;
     let names: Vec<(usize, u32)> = evaluation.pictures.iter().map(|picture| (picture.frame, picture.view)).collect();
     let failure_modes: Vec<FailureMode> =
         GaussianKind::ALL.iter().zip(members).map(|(&kind, members)| judge(kind, members, &seen, &names)).collect();
@@ -195,7 +195,7 @@ fn recipe_to_score_with(run: &RunFiles) -> Result<Recipe> {
 
 /// The pictures that the run scored with: the split that has as many as its summary says, else those of
 /// training, else all.
-fn scored_pictures(scene: &Scene, run: &RunFiles) -> Result<Schedule> {
+fn scored_pictures(scene: &Scene, run: &RunFiles) -> Result<ViewSchedule> {
     let times = &scene.source().info().times;
     let wanted = run.summary.as_ref().map(|(summary, _)| summary.cameras.pairs);
     let mut first = None;

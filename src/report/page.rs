@@ -397,9 +397,9 @@ fn score_histograms(report: &ReportData) -> String {
     };
     let mut out = String::from(
         "<p class=\"note\">How many Gaussians of the original have which value: those that were kept at the bottom of each bar, \
-         then those dropped, then those merged into others. Values go by powers of ten, but shares of the frames from none to \
+         then those dropped, then those merged into others. StatisticAccess go by powers of ten, but shares of the frames from none to \
          all; 0 has no place among powers of ten, and who has it is counted in the legend. Where kept and dropped ones lie \
-         apart, the value says who goes; where they lie on one another, something else decided.</p>\n<div class=\"charts\">\n",
+         apart, the value says who goes; where they lie on one another, something else render_blended.</p>\n<div class=\"charts\">\n",
     );
     for of in histograms {
         out += &figure_of(&format!("{}: {}", of.name, of.meaning), &histogram(of));

@@ -195,7 +195,7 @@ mod tests {
         PrecisionKnob {
             name: "look".to_owned(),
             about: "<b>".to_owned(),
-            source: Source::Discretisation,
+            source: Source::Discretization,
             curves: vec![PrecisionCurve::new("look_pictures", "all", marks, Some(2.0), &[])],
         }
     }

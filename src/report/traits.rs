@@ -12,9 +12,9 @@ use crate::limits::Limits;
 use crate::memory_plan::{ResourceEstimate, Workload};
 use crate::merging::neighbors::PointIndex;
 use crate::merging::tree::TreePoint;
-use crate::model::{Columns, Gaussians, Rows, SH_C0, opacity};
+use crate::model::{Attributes, Gaussians, Rows, SH_C0, opacity};
 use crate::passes::{FrameReaders, gather};
-use crate::pruning::score::{SCORED, Scored};
+use crate::pruning::score::{SCORED_BYTES, Scored};
 use crate::source::{BlockReader, FrameSource, Ids, ReadPlan};
 
 /// D from which a Gaussian is fast: this part of the scene extent per frame. On a picture as wide as the
@@ -57,12 +57,12 @@ impl GaussianKind {
 /// Memory that finding [`traits`] takes.
 pub fn need(work: &Workload) -> ResourceEstimate {
     let per_gaussian = vec![
-        ("rows", SCORED),
-        ("states", work.state(Columns::POSITION | Columns::LOG_SCALE)),
-        ("colours", 88 + work.state(Columns::SH | Columns::OPACITY)),
+        ("rows", SCORED_BYTES),
+        ("states", work.state(Attributes::POSITION | Attributes::LOG_SCALE)),
+        ("colours", 88 + work.state(Attributes::SH | Attributes::OPACITY)),
         ("neighbours", 190),
         ("readers", work.input.reader),
-        ("held", work.held(&Limits::NONE, Columns::SH | Columns::OPACITY)),
+        ("held", work.held(&Limits::NONE, Attributes::SH | Attributes::OPACITY)),
     ];
     let frames = SAMPLES.min(work.frames as usize) as u64;
     let reads = work.scattered_reads(1, &Limits::NONE) + 2.0 * work.scattered_reads(frames, &Limits::NONE);
@@ -86,7 +86,7 @@ pub fn traits(source: &dyn FrameSource, scored: &Scored, alpha_min: f64) -> Resu
     }
     let visible = |i: usize| rows.life[i] > 0 && rows.c[i] > 0.0;
     let all: Vec<u32> = (0..rows.len() as u32).collect();
-    let reference = gather(source, &all, scored.reference.frame, Columns::POSITION | Columns::LOG_SCALE)?;
+    let reference = gather(source, &all, scored.reference.frame, Attributes::POSITION | Attributes::LOG_SCALE)?;
     let fast: Vec<u32> =
         all.iter().copied().filter(|&i| visible(i as usize) && rows.d[i as usize] >= FAST * extent).collect();
     for (&id, bent) in fast.iter().zip(bending(source, &reference, &fast, visible, &frames, NEAREST * extent)?) {
@@ -158,15 +158,15 @@ fn bending(
         ids.iter().zip(&near).map(|(&id, near)| (place(id), near.iter().map(|&j| place(j)).collect())).collect();
     let start = reference.position.pick(&followed);
     let mut sums: Vec<Vec<f64>> = near.iter().map(|near| vec![0.0; near.len()]).collect();
-    let distance = |p: &crate::model::Column, i: usize, j: usize| -> f64 {
+    let distance = |p: &crate::model::AttributeValues, i: usize, j: usize| -> f64 {
         let (a, b) = (p.row::<3>(i), p.row::<3>(j));
         (0..3).map(|c| (f64::from(a[c]) - f64::from(b[c])).powi(2)).sum::<f64>().sqrt()
     };
     let mut reader =
-        FrameReaders::open(source, Ids::List(&followed), Columns::POSITION, &ReadPlan::new(frames.to_vec()))?;
+        FrameReaders::open(source, Ids::List(&followed), Attributes::POSITION, &ReadPlan::new(frames.to_vec()))?;
     let mut state = reader.state();
     for &frame in frames {
-        reader.read(frame, Columns::POSITION, &mut state)?;
+        reader.read(frame, Attributes::POSITION, &mut state)?;
         let now = &state.position;
         sums.par_iter_mut().zip(&pairs).for_each(|(sums, (i, near))| {
             for (sum, &j) in sums.iter_mut().zip(near) {
@@ -188,13 +188,13 @@ fn bending(
 /// Standard deviation of every Gaussian's base color over the sampled frames it lives in; empty where
 /// colors are constant.
 fn color_change(source: &dyn FrameSource, all: &[u32], frames: &[usize], alpha_min: f64) -> Result<Vec<f64>> {
-    if !source.info().varying.contains(Columns::SH) {
+    if !source.info().varying.contains(Attributes::SH) {
         return Ok(Vec::new());
     }
     // From the first living frame's color: sums of small differences lose no digits.
     let mut first: Vec<Option<[f64; 3]>> = vec![None; all.len()];
     let mut sums = vec![(0u32, [0.0f64; 3], [0.0f64; 3]); all.len()];
-    let columns = Columns::SH | Columns::OPACITY;
+    let columns = Attributes::SH | Attributes::OPACITY;
     let mut reader = FrameReaders::open(source, Ids::List(all), columns, &ReadPlan::new(frames.to_vec()))?;
     let mut now = reader.state();
     for &frame in frames {
@@ -242,7 +242,7 @@ mod tests {
     struct Reader<'a, F>(Vec<usize>, &'a F);
 
     impl<F: Fn(usize, usize, &mut Gaussians, usize) + Sync> BlockReader for Reader<'_, F> {
-        fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
+        fn read(&mut self, frame: usize, want: Attributes, out: &mut Gaussians) -> Result<()> {
             let mut all = Gaussians::zeros(self.0.len(), 0);
             for (row, &id) in self.0.iter().enumerate() {
                 (self.1)(id, frame, &mut all, row);
@@ -253,7 +253,7 @@ mod tests {
     }
 
     fn info(count: usize, frames: usize) -> SequenceInfo {
-        SequenceInfo { count, times: (0..frames).map(|t| t as f64).collect(), sh_degree: 0, varying: Columns::all() }
+        SequenceInfo { count, times: (0..frames).map(|t| t as f64).collect(), sh_degree: 0, varying: Attributes::all() }
     }
 
     /// Bending of a 5 × 5 × 5 lattice that `place` moves.
@@ -263,7 +263,7 @@ mod tests {
             out.position.set_row(row, place(at, frame as f64 / 9.0).map(|x| x as f32));
         });
         let all: Vec<u32> = (0..125).collect();
-        let reference = gather(&source, &all, 0, Columns::POSITION).unwrap();
+        let reference = gather(&source, &all, 0, Attributes::POSITION).unwrap();
         bending(&source, &reference, &all, |_| true, &samples(10), 1e-3).unwrap()
     }
 
@@ -293,7 +293,7 @@ mod tests {
         let found = color_change(&source, &[0, 1, 2], &samples(8), 0.01).unwrap();
         assert!((found[0] - 0.05).abs() < 1e-6, "half of the time 0.1 away: got {}", found[0]);
         assert_eq!(found[1..], [0.0, 0.0]);
-        let still = Made(SequenceInfo { varying: Columns::POSITION, ..info(3, 8) }, source.1);
+        let still = Made(SequenceInfo { varying: Attributes::POSITION, ..info(3, 8) }, source.1);
         assert!(color_change(&still, &[0, 1, 2], &samples(8), 0.01).unwrap().is_empty(), "nothing is read");
     }
 

@@ -7,7 +7,7 @@
 use std::sync::{Arc, PoisonError, RwLock};
 
 use crate::error::Result;
-use crate::model::{Columns, Gaussians};
+use crate::model::{Attributes, Gaussians};
 use crate::source::{BlockReader, Ids, ReadPlan};
 
 /// Ids of the absent Gaussians, increasing.
@@ -49,7 +49,7 @@ struct HidingReader<'a> {
 }
 
 impl BlockReader for HidingReader<'_> {
-    fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
+    fn read(&mut self, frame: usize, want: Attributes, out: &mut Gaussians) -> Result<()> {
         self.reader.read(frame, want, out)?;
         self.rows.iter().for_each(|&row| clear_row(out, want, row));
         Ok(())
@@ -59,23 +59,23 @@ impl BlockReader for HidingReader<'_> {
         self.reader.expect(wanted);
     }
 
-    fn prepare(&mut self, frame: usize, want: Columns) -> Result<()> {
+    fn prepare(&mut self, frame: usize, want: Attributes) -> Result<()> {
         self.reader.prepare(frame, want)
     }
 }
 
 /// Sets the columns `want` of row `row` to the state of an absent Gaussian: a position of NaN (which is in no box and
 /// is not rendered), an opacity of 0, the identity rotation, size 1 and no color.
-fn clear_row(state: &mut Gaussians, want: Columns, row: usize) {
+fn clear_row(state: &mut Gaussians, want: Attributes, row: usize) {
     for column in want.iter() {
         let value = match column {
-            Columns::POSITION => f32::NAN,
-            Columns::OPACITY => f32::NEG_INFINITY,
+            Attributes::POSITION => f32::NAN,
+            Attributes::OPACITY => f32::NEG_INFINITY,
             _ => 0.0,
         };
         let values = state.column_mut(column);
         (0..values.width()).for_each(|plane| values.plane_mut(plane)[row] = value);
-        if column == Columns::ROTATION {
+        if column == Attributes::ROTATION {
             values.plane_mut(0)[row] = 1.0;
         }
     }

@@ -54,7 +54,7 @@ impl FrameSource for Scene {
 mod tests {
     use super::*;
     use crate::model::RobustBox;
-    use crate::model::{Columns, Gaussians};
+    use crate::model::{Attributes, Gaussians};
     use crate::passes::gather_all;
     use crate::pipeline::tests::scene;
     use crate::render::render;
@@ -64,10 +64,10 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let scene = scene(folder.path());
         let absent = [3, 4, 700, 1499];
-        let whole = gather_all(scene.source(), 2, Columns::all()).unwrap();
+        let whole = gather_all(scene.source(), 2, Attributes::all()).unwrap();
         let others: Vec<u32> = (0..1500).filter(|id| !absent.contains(id)).collect();
         scene.set_absent(&absent);
-        let hidden = gather_all(scene.source(), 2, Columns::all()).unwrap();
+        let hidden = gather_all(scene.source(), 2, Attributes::all()).unwrap();
         let expected = whole.pick(&others);
         assert!(hidden.pick(&others) == expected);
         let camera = &scene.schedule.cameras[0];
@@ -75,7 +75,7 @@ mod tests {
         let [found, expected] = [&hidden, &expected].map(|state| RobustBox::from_positions(&state.position));
         assert_eq!((found.low, found.high), (expected.low, expected.high));
         scene.set_absent(&[]);
-        assert!(gather_all(scene.source(), 2, Columns::all()).unwrap() == whole);
+        assert!(gather_all(scene.source(), 2, Attributes::all()).unwrap() == whole);
     }
 
     #[test]
@@ -84,7 +84,7 @@ mod tests {
         let scene = scene(folder.path());
         scene.set_absent(&[7]);
         let mut state = Gaussians::zeros(0, scene.info().sh_degree);
-        scene.source().open(Ids::List(&[9, 7, 3])).unwrap().read(0, Columns::all(), &mut state).unwrap();
+        scene.source().open(Ids::List(&[9, 7, 3])).unwrap().read(0, Attributes::all(), &mut state).unwrap();
         let is_absent = |row: usize| state.opacity_logit.row::<1>(row) == [f32::NEG_INFINITY];
         assert_eq!([0, 1, 2].map(is_absent), [false, true, false]);
         assert!(state.position.row::<3>(1)[0].is_nan() && state.rotation.row::<4>(1) == [1.0, 0.0, 0.0, 0.0]);

@@ -105,7 +105,7 @@ impl InputOptions {
 }
 
 /// Opened input, with its cameras if there are any.
-pub struct Opened {
+pub struct OpenedInput {
     /// The input.
     pub input: Box<dyn InputModel>,
     /// Cameras given by the user or found with the input.

@@ -18,15 +18,15 @@ use crate::cache::Cache;
 use crate::error::Result;
 use crate::limits::Limits;
 use crate::memory_plan::{Budget, Plan, ResourceEstimate, Throughput, Workload};
-use crate::model::{Rig, Schedule, Split};
+use crate::model::{Rig, Split, ViewSchedule};
 use crate::models::InputModel;
 use crate::progress::Events;
 use crate::source::Reads;
 
 use absent::Absent;
 pub use compressed::open_compressed;
-pub use input::{InputOptions, Opened, load_cameras};
-pub use open::{first_box, open_input, open_scene, scene_of, scratch_beside};
+pub use input::{InputOptions, OpenedInput, load_cameras};
+pub use open::{first_box, from_input, open_input, open_scene, scratch_beside};
 pub use stream::{FrameQuota, is_linked, link_stream, open_stream, receiving, room_to_pack};
 pub use work::kept_work;
 pub(crate) use work::stamps;
@@ -40,7 +40,7 @@ pub struct Scene {
     /// Cameras of all splits.
     pub rig: Rig,
     /// Cameras of the chosen split, for each frame.
-    pub schedule: Schedule,
+    pub schedule: ViewSchedule,
     /// Whether the views show the whole scene: the cameras were given or found, or they surround a still scene.
     /// Otherwise the cameras are a virtual rig, which may see only what is in front of it.
     pub has_cameras: bool,

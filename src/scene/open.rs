@@ -5,14 +5,14 @@ use std::path::{Path, PathBuf};
 use glam::DVec3;
 
 use super::Scene;
-use super::input::{InputOptions, Opened, load_cameras};
+use super::input::{InputOptions, OpenedInput, load_cameras};
 use super::pictures::no_picture;
 use super::stream::open_packed_stream;
 use crate::error::{Error, Result, ShowPath};
 use crate::files::cameras;
 use crate::files::cameras::{Clock, Times};
 use crate::model::RobustBox;
-use crate::model::{Columns, Rig, opacity};
+use crate::model::{Attributes, Rig, opacity};
 use crate::models;
 use crate::models::{InputModel, Timing};
 use crate::passes::gather_all;
@@ -23,7 +23,7 @@ use crate::source::FrameSource;
 ///
 /// # Errors
 /// Invalid input or cameras; cameras of a sequence with different frames; options that do not apply to the input.
-pub fn open_input(options: &InputOptions) -> Result<Opened> {
+pub fn open_input(options: &InputOptions) -> Result<OpenedInput> {
     options.check_folders()?;
     if options.is_stream() {
         return check_frames(open_packed_stream(options)?, &options.path);
@@ -62,7 +62,7 @@ pub fn open_input(options: &InputOptions) -> Result<Opened> {
     };
     // Some notes depend on the times.
     let notes = [input.notes(), notes].concat();
-    check_frames(Opened { input, rig, notes }, path)
+    check_frames(OpenedInput { input, rig, notes }, path)
 }
 
 /// Loads the cameras that `options` give or that are found with `input`. Frames with time stamps may have cameras of a
@@ -104,7 +104,7 @@ fn evenly_spaced(given: Option<usize>, span: f64, notes: &mut Vec<String>) -> Re
     Ok((0..frames).map(|i| span * i as f64 / frames as f64).collect())
 }
 
-fn check_frames(opened: Opened, path: &Path) -> Result<Opened> {
+fn check_frames(opened: OpenedInput, path: &Path) -> Result<OpenedInput> {
     let info = opened.input.source().info();
     if info.times.is_empty() && info.count > 0 {
         let found = format!("no frame, but {} Gaussians", info.count);
@@ -118,7 +118,7 @@ fn check_frames(opened: Opened, path: &Path) -> Result<Opened> {
 /// # Errors
 /// Errors of [`open_input`]; a split without views.
 pub fn open_scene(options: &InputOptions) -> Result<Scene> {
-    scene_of(open_input(options)?, options)
+    from_input(open_input(options)?, options)
 }
 
 /// Creates the scene of an opened input, seen by the cameras of the split in `options`. Without cameras, a rig is
@@ -126,8 +126,8 @@ pub fn open_scene(options: &InputOptions) -> Result<Scene> {
 ///
 /// # Errors
 /// Cameras of another scene; a split without views.
-pub fn scene_of(opened: Opened, options: &InputOptions) -> Result<Scene> {
-    let Opened { input, rig, mut notes } = check_frames(opened, &options.path)?;
+pub fn from_input(opened: OpenedInput, options: &InputOptions) -> Result<Scene> {
+    let OpenedInput { input, rig, mut notes } = check_frames(opened, &options.path)?;
     // The content of a stream is unknown when its run is planned, so it never counts as still.
     let is_still = !options.is_stream() && input.source().info().times.len() == 1;
     let has_cameras = rig.is_some() || is_still;
@@ -171,7 +171,7 @@ fn camera_path(options: &InputOptions, input: &dyn InputModel) -> Option<PathBuf
 
 /// Returns a rig around the surface of the only frame. Memory: 64 bytes per Gaussian.
 fn surrounding_rig(source: &dyn FrameSource) -> Result<Rig> {
-    let state = gather_all(source, 0, Columns::POSITION | Columns::LOG_SCALE | Columns::OPACITY)?;
+    let state = gather_all(source, 0, Attributes::POSITION | Attributes::LOG_SCALE | Attributes::OPACITY)?;
     let positions: Vec<DVec3> =
         (0..state.len()).map(|i| DVec3::from_array(state.position.row::<3>(i).map(f64::from))).collect();
     let visible_area = |i: usize| {
@@ -194,7 +194,7 @@ pub fn first_box(source: &dyn FrameSource) -> Result<Option<RobustBox>> {
     if source.info().times.is_empty() {
         return Ok(None);
     }
-    Ok(Some(RobustBox::from_positions(&gather_all(source, 0, Columns::POSITION)?.position)))
+    Ok(Some(RobustBox::from_positions(&gather_all(source, 0, Attributes::POSITION)?.position)))
 }
 
 /// Returns the folder for scratch files of a run that writes `output`: the folder of the output, since a disk with

@@ -8,7 +8,7 @@ use hashbrown::HashMap;
 use super::work::stamps;
 use crate::error::{Error, Result, ShowPath};
 use crate::files::image::read_png;
-use crate::model::{Camera, Picture, Rig};
+use crate::model::{Camera, FrameView, Rig};
 use crate::render::Image;
 
 /// Files of the photographs of some views.
@@ -22,9 +22,9 @@ impl Photographs {
     ///
     /// # Errors
     /// Two views with the same file.
-    fn from_files(folder: &Path, found: impl Iterator<Item = Result<(Picture, PathBuf)>>) -> Result<Photographs> {
+    fn from_files(folder: &Path, found: impl Iterator<Item = Result<(FrameView, PathBuf)>>) -> Result<Photographs> {
         let mut files = HashMap::new();
-        let mut view_of_file: HashMap<PathBuf, Picture> = HashMap::new();
+        let mut view_of_file: HashMap<PathBuf, FrameView> = HashMap::new();
         for found in found {
             let (picture, file) = found?;
             // Cameras of a time-stamped rig may give all their views the same file names.
@@ -51,14 +51,14 @@ impl Photographs {
         folder: &Path,
         rig: &Rig,
         times: &[f64],
-        pictures: Vec<Picture>,
-    ) -> Result<(Vec<Picture>, Photographs)> {
+        pictures: Vec<FrameView>,
+    ) -> Result<(Vec<FrameView>, Photographs)> {
         check_folder(folder)?;
         let cameras = camera_folders(folder)?;
-        let named = |picture: Picture| Some((picture, inside(folder, rig.image(picture, times)?)?));
-        let mut found: Vec<(Picture, PathBuf)> = pictures.iter().copied().filter_map(named).collect();
+        let named = |picture: FrameView| Some((picture, inside(folder, rig.image(picture, times)?)?));
+        let mut found: Vec<(FrameView, PathBuf)> = pictures.iter().copied().filter_map(named).collect();
         if found.is_empty() {
-            let numbered = |picture: Picture| Some((picture, numbered_file(folder, picture, &cameras)?));
+            let numbered = |picture: FrameView| Some((picture, numbered_file(folder, picture, &cameras)?));
             found = pictures.iter().copied().filter_map(numbered).collect();
         }
         if let (true, Some(&picture)) = (found.is_empty(), pictures.first()) {
@@ -77,7 +77,7 @@ impl Photographs {
     }
 
     /// Returns whether there is a photograph of `picture`.
-    pub fn has(&self, picture: Picture) -> bool {
+    pub fn has(&self, picture: FrameView) -> bool {
         self.files.contains_key(&(picture.frame, picture.view))
     }
 
@@ -86,7 +86,7 @@ impl Photographs {
     ///
     /// # Errors
     /// A file that does not exist any more.
-    pub fn stamps(&self, pictures: &[Picture]) -> Result<Vec<(String, u64, u128)>> {
+    pub fn stamps(&self, pictures: &[FrameView]) -> Result<Vec<(String, u64, u128)>> {
         let mut files = Vec::with_capacity(pictures.len());
         for picture in pictures {
             if let Some(file) = self.files.get(&(picture.frame, picture.view)) {
@@ -100,7 +100,7 @@ impl Photographs {
     ///
     /// # Errors
     /// A view without a photograph; a file that is not an image of the camera's size.
-    pub fn read(&self, picture: Picture, camera: &Camera, background: [f32; 3]) -> Result<Image> {
+    pub fn read(&self, picture: FrameView, camera: &Camera, background: [f32; 3]) -> Result<Image> {
         let file = self.files.get(&(picture.frame, picture.view));
         let file = file.ok_or_else(|| Error::usage(format!("no photograph was found for {}", picture.name())))?;
         read_png(file, (camera.width, camera.height), background)
@@ -108,7 +108,7 @@ impl Photographs {
 }
 
 /// Returns the name of a view in messages.
-fn view_name(picture: Picture) -> String {
+fn view_name(picture: FrameView) -> String {
     format!("frame {}, view {}", picture.frame, picture.view)
 }
 
@@ -121,7 +121,7 @@ fn check_folder(folder: &Path) -> Result<()> {
 }
 
 /// Returns the photograph of `picture` by its frame and view: `tNNN_vNN.png`, or in the folder of its camera among `cameras`.
-fn numbered_file(folder: &Path, picture: Picture, cameras: &[PathBuf]) -> Option<PathBuf> {
+fn numbered_file(folder: &Path, picture: FrameView, cameras: &[PathBuf]) -> Option<PathBuf> {
     let in_camera = cameras.get(picture.view as usize).map(|camera| in_rig(camera, picture));
     let files = [Some(folder.join(format!("{}.png", picture.name()))), in_camera];
     files.into_iter().flatten().find(|file| file.is_file())
@@ -141,7 +141,7 @@ fn camera_folders(folder: &Path) -> Result<Vec<PathBuf>> {
 }
 
 /// Returns the path of the photograph of `picture` in the folder of a DyNeRF camera.
-fn in_rig(camera: &Path, picture: Picture) -> PathBuf {
+fn in_rig(camera: &Path, picture: FrameView) -> PathBuf {
     camera.join("images").join(format!("{:04}.png", picture.frame))
 }
 

@@ -3,13 +3,13 @@
 use super::Scene;
 use crate::error::{Error, Result};
 use crate::limits::Limits;
-use crate::memory_plan::{PICTURE_ON_ALL_THREADS, RENDER, ResourceEstimate, Workload};
-use crate::model::{Columns, Picture, Rig, Split};
+use crate::memory_plan::{RENDER, ResourceEstimate, SHARED_VIEW_BYTES_PER_GAUSSIAN, Workload};
+use crate::model::{Attributes, FrameView, Rig, Split};
 use crate::render;
 
 /// Part of a rig's views.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum PictureSet {
+pub enum ViewSet {
     /// Held-out views (test, else validation); all views if the cameras hold none out.
     #[default]
     HeldOut,
@@ -24,14 +24,14 @@ pub enum PictureSet {
 /// # Errors
 /// A view at a time that is not the time of any frame; a split without views; two cameras with the same frame and view
 /// number, which happens only if each split numbers its views on its own.
-pub fn pictures(rig: &Rig, frame_times: &[f64], part: PictureSet) -> Result<Vec<Picture>> {
+pub fn pictures(rig: &Rig, frame_times: &[f64], part: ViewSet) -> Result<Vec<FrameView>> {
     let mut found = Vec::new();
     for (frame, views) in rig.schedule(frame_times, part.split(rig))?.iter().enumerate() {
         let mut views = views.to_vec();
         views.sort_by_key(|&(view, _)| view);
         // Train and test files may list the same view.
         views.dedup();
-        found.extend(views.into_iter().map(|(view, camera)| Picture { frame, view, camera }));
+        found.extend(views.into_iter().map(|(view, camera)| FrameView { frame, view, camera }));
     }
     if let Some(pair) = found.windows(2).find(|pair| (pair[0].frame, pair[0].view) == (pair[1].frame, pair[1].view)) {
         return Err(Error::usage(format!(
@@ -62,12 +62,12 @@ pub fn no_picture(rig: &Rig) -> Error {
 ///
 /// # Errors
 /// Errors of [`pictures`]; a frame that the sequence does not have; a view number that the frame does not have.
-pub fn picture(rig: &Rig, frame_times: &[f64], part: PictureSet, frame: usize, view: u32) -> Result<Picture> {
+pub fn picture(rig: &Rig, frame_times: &[f64], part: ViewSet, frame: usize, view: u32) -> Result<FrameView> {
     if frame >= frame_times.len() {
         let last = frame_times.len().saturating_sub(1);
         return Err(Error::usage(format!("--frame {frame}: expected 0 to {last}, the frames of this sequence")));
     }
-    let here: Vec<Picture> =
+    let here: Vec<FrameView> =
         pictures(rig, frame_times, part)?.into_iter().filter(|picture| picture.frame == frame).collect();
     here.iter().find(|picture| picture.view == view).copied().ok_or_else(|| {
         let views: Vec<String> = here.iter().map(|picture| picture.view.to_string()).collect();
@@ -79,7 +79,7 @@ pub fn picture(rig: &Rig, frame_times: &[f64], part: PictureSet, frame: usize, v
 /// Returns the views of at most `count` (at least one) of the frames in `pictures`, evenly spaced from first to last.
 /// Of K frames it keeps those with index round(i·(K − 1)/(count − 1)), halves to even, as numpy's `round(linspace(0, K
 /// - 1, count))` does.
-pub fn thin(pictures: Vec<Picture>, count: usize) -> Vec<Picture> {
+pub fn thin(pictures: Vec<FrameView>, count: usize) -> Vec<FrameView> {
     let count = count.max(1);
     let mut frames: Vec<usize> = pictures.iter().map(|picture| picture.frame).collect();
     frames.dedup();
@@ -96,7 +96,7 @@ pub fn thin(pictures: Vec<Picture>, count: usize) -> Vec<Picture> {
 ///
 /// The views of frame number `f` are rotated by the fractional part of `f` times the golden ratio, so that an even step through
 /// the list does not return to the same views.
-pub fn spread_views(pictures: Vec<Picture>, most: usize) -> Vec<Picture> {
+pub fn spread_views(pictures: Vec<FrameView>, most: usize) -> Vec<FrameView> {
     let (count, most) = (pictures.len(), most.max(1));
     if count <= most {
         return pictures;
@@ -109,7 +109,7 @@ pub fn spread_views(pictures: Vec<Picture>, most: usize) -> Vec<Picture> {
         rotated.extend_from_slice(head);
     }
     // The middle of each of `most` equal parts of the list.
-    let mut spread: Vec<Picture> = (0..most).map(|k| rotated[(2 * k + 1) * count / (2 * most)]).collect();
+    let mut spread: Vec<FrameView> = (0..most).map(|k| rotated[(2 * k + 1) * count / (2 * most)]).collect();
     spread.sort_by_key(|picture| (picture.frame, picture.view));
     spread
 }
@@ -138,12 +138,12 @@ pub fn need(work: &Workload, limits: &Limits, stage: &'static str, models: u64, 
         reads: models as f64,
         seconds: models as f64
             * (work.reading(work.count(), work.frames as f64)
-                + work.picturing(work.pictures as f64, work.count(), RENDER)),
+                + work.render_seconds(work.pictures as f64, work.count(), RENDER)),
         per_gaussian: vec![
-            ("states", models * work.state(Columns::all())),
+            ("states", models * work.state(Attributes::all())),
             ("readers", models * work.input.reader),
-            ("held", models * work.held(limits, Columns::all())),
-            ("pictures", pictures * PICTURE_ON_ALL_THREADS),
+            ("held", models * work.held(limits, Attributes::all())),
+            ("pictures", pictures * SHARED_VIEW_BYTES_PER_GAUSSIAN),
         ],
         fixed: vec![
             work.arriving(),
@@ -153,13 +153,13 @@ pub fn need(work: &Workload, limits: &Limits, stage: &'static str, models: u64, 
     }
 }
 
-impl PictureSet {
+impl ViewSet {
     /// Returns the split to use with the cameras of `rig`; `None`: all views.
     pub fn split(self, rig: &Rig) -> Option<Split> {
         match self {
-            PictureSet::HeldOut => rig.held_out(),
-            PictureSet::Split(split) => Some(split),
-            PictureSet::All => None,
+            ViewSet::HeldOut => rig.held_out(),
+            ViewSet::Split(split) => Some(split),
+            ViewSet::All => None,
         }
     }
 }
@@ -183,14 +183,14 @@ mod tests {
         }
     }
 
-    fn pairs(pictures: &[Picture]) -> Vec<(usize, u32)> {
+    fn pairs(pictures: &[FrameView]) -> Vec<(usize, u32)> {
         pictures.iter().map(|picture| (picture.frame, picture.view)).collect()
     }
 
     #[test]
     fn spread_views_cover_frames_and_views() {
-        let picture = |k: usize| Picture { frame: k / 9, view: (k % 9) as u32, camera: 0 };
-        let all: Vec<Picture> = (0..180).map(picture).collect();
+        let picture = |k: usize| FrameView { frame: k / 9, view: (k % 9) as u32, camera: 0 };
+        let all: Vec<FrameView> = (0..180).map(picture).collect();
         assert_eq!(spread_views(all.clone(), 180), all);
         let some = spread_views(all, 60);
         assert_eq!(some.len(), 60);
@@ -213,36 +213,33 @@ mod tests {
             (5, 3, Some(0.5), Split::Train),
         ]);
         let times = [0.0, 0.5, 1.0];
-        assert_eq!(
-            pairs(&pictures(&rig, &times, PictureSet::HeldOut).unwrap()),
-            [(0, 1), (0, 7), (1, 7), (2, 2), (2, 7)]
-        );
-        assert_eq!(pairs(&pictures(&rig, &times, PictureSet::Split(Split::Train)).unwrap()), [(1, 5)]);
-        assert_eq!(pictures(&rig, &times, PictureSet::All).unwrap().len(), 6);
-        assert_eq!(pairs(&[picture(&rig, &times, PictureSet::All, 1, 5).unwrap()]), [(1, 5)]);
+        assert_eq!(pairs(&pictures(&rig, &times, ViewSet::HeldOut).unwrap()), [(0, 1), (0, 7), (1, 7), (2, 2), (2, 7)]);
+        assert_eq!(pairs(&pictures(&rig, &times, ViewSet::Split(Split::Train)).unwrap()), [(1, 5)]);
+        assert_eq!(pictures(&rig, &times, ViewSet::All).unwrap().len(), 6);
+        assert_eq!(pairs(&[picture(&rig, &times, ViewSet::All, 1, 5).unwrap()]), [(1, 5)]);
     }
 
     #[test]
     fn all_views_are_used_if_none_are_held_out() {
         let rig = rig(&[(0, 0, None, Split::Train)]);
-        assert_eq!(pairs(&pictures(&rig, &[0.0, 1.0], PictureSet::HeldOut).unwrap()), [(0, 0), (1, 0)]);
-        let message = pictures(&rig, &[0.0], PictureSet::Split(Split::Test)).unwrap_err().to_string();
+        assert_eq!(pairs(&pictures(&rig, &[0.0, 1.0], ViewSet::HeldOut).unwrap()), [(0, 0), (1, 0)]);
+        let message = pictures(&rig, &[0.0], ViewSet::Split(Split::Test)).unwrap_err().to_string();
         assert!(message.contains("--split"), "{message}");
     }
 
     #[test]
     fn equal_views_are_merged_and_conflicting_ones_refused() {
         let same = rig(&[(3, 1, Some(0.0), Split::Train), (3, 1, Some(0.0), Split::Test)]);
-        assert_eq!(pairs(&pictures(&same, &[0.0], PictureSet::All).unwrap()), [(0, 3)]);
+        assert_eq!(pairs(&pictures(&same, &[0.0], ViewSet::All).unwrap()), [(0, 3)]);
         let two = rig(&[(3, 1, Some(0.0), Split::Train), (3, 2, Some(0.0), Split::Test)]);
-        let message = pictures(&two, &[0.0], PictureSet::All).unwrap_err().to_string();
+        let message = pictures(&two, &[0.0], ViewSet::All).unwrap_err().to_string();
         assert!(message.contains("view 3 at frame 0") && message.contains("--split"), "{message}");
     }
 
     #[test]
     fn thinned_frames_equal_numpy_linspace() {
-        let every = |frames: usize| -> Vec<Picture> {
-            (0..frames).map(|frame| Picture { frame: 3 * frame, view: 0, camera: 0 }).collect()
+        let every = |frames: usize| -> Vec<FrameView> {
+            (0..frames).map(|frame| FrameView { frame: 3 * frame, view: 0, camera: 0 }).collect()
         };
         let kept = |frames, count| pairs(&thin(every(frames), count)).iter().map(|p| p.0 / 3).collect::<Vec<_>>();
         // Values of np.round(np.linspace(0, 59, 15)) and np.round(np.linspace(0, 9, 3)), where 4.5 rounds to 4.

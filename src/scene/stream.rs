@@ -3,15 +3,15 @@
 use std::io::{IsTerminal, Stdin};
 use std::path::Path;
 
-use super::input::{InputOptions, Opened, load_cameras};
+use super::input::{InputOptions, OpenedInput, load_cameras};
 use crate::error::{Error, Result};
 use crate::files::cameras::Clock;
 use crate::files::frame_stream::{FrameStream, StreamHeader};
 use crate::limits::Limits;
 use crate::memory_plan::{Budget, Plan, ResourceEstimate, Workload};
-use crate::model::{Columns, Rig};
+use crate::model::{Attributes, Rig};
 use crate::models::MemoryProfile;
-use crate::models::stream::{AHEAD, Streamed, frame_block};
+use crate::models::stream::{PREFETCH_FRAMES, ReceivedStream, frame_block};
 use crate::models::{InputModel, LinkedFrames};
 use crate::passes::BLOCK;
 use crate::statistics;
@@ -45,34 +45,34 @@ pub fn open_stream(options: &InputOptions) -> Result<FrameStream<Stdin>> {
 ///
 /// # Errors
 /// An invalid stream; a budget that is too small for the frames that are packed together.
-pub(super) fn open_packed_stream(options: &InputOptions) -> Result<Opened> {
+pub(super) fn open_packed_stream(options: &InputOptions) -> Result<OpenedInput> {
     let rig = load_cameras(options, options.cameras.as_deref(), options.times.clone(), Clock::Normalized, None)?;
     let stream = open_stream(options)?;
     if is_linked(stream.header(), options) {
         return link_stream(stream, options, rig);
     }
-    Ok(Opened { input: Box::new(pack_stream(stream, options)?), rig, notes: Vec::new() })
+    Ok(OpenedInput { input: Box::new(pack_stream(stream, options)?), rig, notes: Vec::new() })
 }
 
 /// Packs a stream into a scratch container.
 ///
 /// # Errors
 /// As [`link_stream`].
-fn pack_stream(stream: FrameStream<Stdin>, options: &InputOptions) -> Result<Streamed> {
+fn pack_stream(stream: FrameStream<Stdin>, options: &InputOptions) -> Result<ReceivedStream> {
     let mut quota = room_to_pack(options, stream.header())?;
-    Streamed::receive(stream, &options.scratch_folder(), &options.events, |held| quota.admit(held.len()))
+    ReceivedStream::receive(stream, &options.scratch_folder(), &options.events, |held| quota.admit(held.len()))
 }
 
 /// Returns whether the frames of a stream are linked: if they share no Gaussian ids, or if the user asks for it.
 pub fn is_linked(header: &StreamHeader, options: &InputOptions) -> bool {
-    header.is_unlinked || options.link.is_asked()
+    header.is_unlinked || options.link.always_links()
 }
 
 /// Receives a stream whose frames [are linked](is_linked).
 ///
 /// # Errors
 /// An invalid stream; a budget that is too small for the frames that are packed together.
-pub fn link_stream(stream: FrameStream<Stdin>, options: &InputOptions, rig: Option<Rig>) -> Result<Opened> {
+pub fn link_stream(stream: FrameStream<Stdin>, options: &InputOptions, rig: Option<Rig>) -> Result<OpenedInput> {
     let joins = options.link.joins();
     let input = match stream.header().is_unlinked {
         true => LinkedFrames::receive(stream, Path::new(STANDARD_INPUT), joins, &options.opening().ply())?,
@@ -84,7 +84,7 @@ pub fn link_stream(stream: FrameStream<Stdin>, options: &InputOptions, rig: Opti
         )?,
     };
     let notes = input.notes();
-    Ok(Opened { input: Box::new(input), rig, notes })
+    Ok(OpenedInput { input: Box::new(input), rig, notes })
 }
 
 /// Returns the number of frames of a stream that can be packed within the memory budget.
@@ -93,9 +93,9 @@ pub fn link_stream(stream: FrameStream<Stdin>, options: &InputOptions, rig: Opti
 /// A budget that is too small for the frames that are packed together.
 pub fn room_to_pack(options: &InputOptions, header: &StreamHeader) -> Result<FrameQuota> {
     let block = frame_block(header);
-    let held = (block + AHEAD) as u64;
+    let held = (block + PREFETCH_FRAMES) as u64;
     let no_cameras = Rig { cameras: Vec::new(), shots: Vec::new(), background: None, origin: String::new() };
-    let work = |frames| Workload::of_stream(header, block, &no_cameras, frames);
+    let work = |frames| Workload::from_stream_header(header, block, &no_cameras, frames);
     let receive = |frames| move |work: &Workload, limits: &Limits| vec![receiving(work, limits, held, None, frames)];
     Plan::fit(work(0), options.memory, &options.events, receive(0))?;
     Ok(FrameQuota::new(options.memory, |budget, frames| {
@@ -166,7 +166,7 @@ pub fn receiving(
     measuring: Option<bool>,
     frames: u64,
 ) -> ResourceEstimate {
-    let whole = work.state(Columns::all());
+    let whole = work.state(Attributes::all());
     let mut per_gaussian =
         vec![("frames", held * work.state(work.varying)), ("constant columns", whole - work.state(work.varying))];
     let mut fixed = work.writing();
@@ -176,7 +176,7 @@ pub fn receiving(
         fixed.push(("blocks", work.threads * BLOCK as u64 * whole));
         if visible {
             let nothing_held = Workload { input: MemoryProfile { frame_block: 0, ..work.input }, ..*work };
-            let (more, pictures) = nothing_held.looking(limits, Columns::all().difference(Columns::SH), 12);
+            let (more, pictures) = nothing_held.looking(limits, Attributes::all().difference(Attributes::SH), 12);
             per_gaussian.extend(more);
             fixed.extend(pictures);
         }

@@ -1,7 +1,7 @@
 //! Anisotropy E of every Gaussian, computed from one set of scales: the canonical scales, or those of the reference
 //! frame.
 
-use crate::model::{Column, Flags, Rows};
+use crate::model::{AttributeValues, Flags, Rows};
 use crate::recipe::Anisotropy;
 
 /// Smallest scale in the logarithmic form, as a fraction of the scene extent; smaller scales are raised to it. Renders
@@ -19,7 +19,7 @@ const MAX_LOG_RATIO: f64 = 700.0;
 ///
 /// # Panics
 /// If the number of rows differs.
-pub fn fill_anisotropy(rows: &mut Rows, log_scale: &Column, kind: Anisotropy, extent: f64) {
+pub fn fill_anisotropy(rows: &mut Rows, log_scale: &AttributeValues, kind: Anisotropy, extent: f64) {
     assert_eq!(rows.len(), log_scale.len(), "one row per Gaussian");
     let floor = (SCALE_FLOOR * extent).ln();
     rows.e = (0..rows.len())
@@ -47,7 +47,7 @@ mod tests {
     use super::*;
 
     fn anisotropy_and_flags(log_scale: [f32; 3], kind: Anisotropy, extent: f64) -> (f64, Flags) {
-        let mut column = Column::zeros(3, 1);
+        let mut column = AttributeValues::zeros(3, 1);
         column.set_row(0, log_scale);
         let mut rows = Rows { d: vec![0.0], flags: vec![Flags::empty()], ..Rows::default() };
         fill_anisotropy(&mut rows, &column, kind, extent);

@@ -12,7 +12,7 @@ use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 use crate::cache::{Spill, SpillWriter};
 use crate::error::Result;
-use crate::model::{Flags, Rows, Statistic, Values};
+use crate::model::{Flags, Rows, Statistic, StatisticAccess};
 
 /// Rows of N Gaussians, one per Gaussian.
 pub(crate) enum StatisticsRows {
@@ -49,8 +49,8 @@ impl StatisticsRows {
         let mut file = SpillWriter::new(folder)?;
         let bytes = |statistic: &Statistic| -> &[u8] {
             match statistic.values() {
-                Values::F64(values, _) => bytemuck::cast_slice(values(&rows)),
-                Values::U32(values, _) => bytemuck::cast_slice(values(&rows)),
+                StatisticAccess::F64(values, _) => bytemuck::cast_slice(values(&rows)),
+                StatisticAccess::U32(values, _) => bytemuck::cast_slice(values(&rows)),
             }
         };
         let columns: Vec<_> = Statistic::ALL.into_iter().filter(|statistic| !bytes(statistic).is_empty()).collect();
@@ -92,8 +92,8 @@ impl SpilledRows {
         let mut rows = Rows::default();
         for &column in &self.columns {
             match column.values() {
-                Values::F64(_, values_mut) => *values_mut(&mut rows) = self.column(column)?,
-                Values::U32(_, values_mut) => *values_mut(&mut rows) = self.column(column)?,
+                StatisticAccess::F64(_, values_mut) => *values_mut(&mut rows) = self.column(column)?,
+                StatisticAccess::U32(_, values_mut) => *values_mut(&mut rows) = self.column(column)?,
             }
         }
         let flags: Vec<u8> = self.values(&self.columns)?;

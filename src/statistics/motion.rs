@@ -14,7 +14,7 @@
 
 use std::mem::size_of;
 
-use crate::model::Column;
+use crate::model::AttributeValues;
 use crate::recipe;
 
 /// History bit: alive in the previous frame.
@@ -32,8 +32,8 @@ pub(super) struct MotionSums {
     /// are not counted in `steps`, `turns` and `history` yet.
     steady: u32,
     /// Positions x(t−1); `before` holds x(t−2). Shape `[3, len]` each.
-    previous: Column,
-    before: Column,
+    previous: AttributeValues,
+    before: AttributeValues,
     sum_step2: Vec<f64>,
     sum_turn: Vec<f64>,
     /// `Literal` only: norm of the turn about the last frame in which the Gaussian was alive. It counts only if the
@@ -55,8 +55,8 @@ impl MotionSums {
             kind,
             frames: 0,
             steady: 0,
-            previous: Column::zeros(3, len),
-            before: Column::zeros(3, len),
+            previous: AttributeValues::zeros(3, len),
+            before: AttributeValues::zeros(3, len),
             sum_step2: vec![0.0; len],
             sum_turn: vec![0.0; len],
             pending: vec![0.0; len],
@@ -71,7 +71,7 @@ impl MotionSums {
     #[inline(always)]
     pub(super) fn add_frame(
         &mut self,
-        position: &Column,
+        position: &AttributeValues,
         opacity: &[f64],
         alpha_min: f64,
         steps: [f64; 2],
@@ -95,7 +95,7 @@ impl MotionSums {
     #[inline(always)]
     fn add_frame_of_runs<const EVEN: bool>(
         &mut self,
-        position: &Column,
+        position: &AttributeValues,
         opacity: &[f64],
         alpha_min: f64,
         steps: [f64; 2],
@@ -122,7 +122,7 @@ impl MotionSums {
     /// [`MotionSums::add_frame_of_runs`] for a frame in which no Gaussian appears or disappears. Which terms count is
     /// then known without reading the history, so half of the memory is touched (`cargo bench --bench scan`).
     #[inline(always)]
-    fn add_steady_frame<const EVEN: bool>(&mut self, position: &Column, steps: [f64; 2]) {
+    fn add_steady_frame<const EVEN: bool>(&mut self, position: &AttributeValues, steps: [f64; 2]) {
         self.steady += 1;
         let n = self.history.len();
         let [x, previous, before] = [position, &self.previous, &self.before].map(|column| planes(column, n));
@@ -156,7 +156,7 @@ impl MotionSums {
     }
 
     #[inline(always)]
-    fn add_frame_of_literal(&mut self, position: &Column, opacity: &[f64], alpha_min: f64) {
+    fn add_frame_of_literal(&mut self, position: &AttributeValues, opacity: &[f64], alpha_min: f64) {
         let n = opacity.len();
         let [x, previous, before] = [position, &self.previous, &self.before].map(|column| planes(column, n));
         let (sum_step2, sum_turn) = (&mut self.sum_step2[..n], &mut self.sum_turn[..n]);
@@ -217,7 +217,7 @@ impl MotionSums {
 /// Returns the planes x, y, z of a column of `n` Gaussians. Slicing to `n` shows the compiler equal lengths, which
 /// removes the bounds checks.
 #[inline(always)]
-fn planes(column: &Column, n: usize) -> [&[f32]; 3] {
+fn planes(column: &AttributeValues, n: usize) -> [&[f32]; 3] {
     std::array::from_fn(|axis| &column.plane(axis)[..n])
 }
 

@@ -10,7 +10,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::error::Result;
-use crate::model::{Camera, Gaussians, Rows, Schedule, SequenceInfo};
+use crate::model::{Camera, Gaussians, Rows, SequenceInfo, ViewSchedule};
 use crate::passes::BLOCK;
 use crate::progress::Events;
 use crate::source::{FrameSource, Ids};
@@ -19,7 +19,7 @@ use crate::statistics::{BlockScan, NEEDED, ScanPlan, wanted};
 
 /// Result of a scan.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
-pub struct Scanned {
+pub struct ScanResult {
     /// One row per Gaussian. D and κ still include rounding noise, and E is not filled.
     pub rows: Rows,
     /// Number of Gaussians alive in each frame.
@@ -37,7 +37,7 @@ pub struct Scanned {
 ///
 /// # Errors
 /// Frames that cannot be read.
-pub fn scan(source: &dyn FrameSource, schedule: &Schedule, plan: &ScanPlan) -> Result<Scanned> {
+pub fn scan(source: &dyn FrameSource, schedule: &ViewSchedule, plan: &ScanPlan) -> Result<ScanResult> {
     scan_blocks(source, schedule, plan, 0..scan_units(source.info()), &Events::IGNORED)
 }
 
@@ -46,14 +46,14 @@ pub fn scan_units(info: &SequenceInfo) -> usize {
     info.count.div_ceil(BLOCK)
 }
 
-/// Scans some consecutive blocks of Gaussians only. [`Scanned::join`] combines several such results.
+/// Scans some consecutive blocks of Gaussians only. [`ScanResult::join`] combines several such results.
 pub fn scan_blocks(
     source: &dyn FrameSource,
-    schedule: &Schedule,
+    schedule: &ViewSchedule,
     plan: &ScanPlan,
     blocks: Range<usize>,
     events: &Events,
-) -> Result<Scanned> {
+) -> Result<ScanResult> {
     let info = source.info();
     let frames = info.times.len();
     let gaussians = info.count.min(blocks.end * BLOCK) - info.count.min(blocks.start * BLOCK);
@@ -66,9 +66,9 @@ pub fn scan_blocks(
     Ok(joined(blocks, scan.alive.into_inner().unwrap_or_else(PoisonError::into_inner)))
 }
 
-impl Scanned {
+impl ScanResult {
     /// Appends the result of the Gaussians that follow these, for the same frames.
-    pub fn join(&mut self, mut other: Scanned) {
+    pub fn join(&mut self, mut other: ScanResult) {
         self.rows.append(&mut other.rows);
         self.alive_per_frame.iter_mut().zip(other.alive_per_frame).for_each(|(sum, alive)| *sum += alive);
         self.largest_coordinate = self.largest_coordinate.max(other.largest_coordinate);
@@ -76,14 +76,14 @@ impl Scanned {
 }
 
 /// Joins the rows and largest coordinates of consecutive blocks into one result.
-fn joined(blocks: impl IntoIterator<Item = (Rows, f32)>, alive_per_frame: Vec<u32>) -> Scanned {
+fn joined(blocks: impl IntoIterator<Item = (Rows, f32)>, alive_per_frame: Vec<u32>) -> ScanResult {
     let mut rows = Rows::default();
     let mut largest_coordinate = 0.0f32;
     for (mut block, largest) in blocks {
         rows.append(&mut block);
         largest_coordinate = largest_coordinate.max(largest);
     }
-    Scanned { rows, alive_per_frame, largest_coordinate }
+    ScanResult { rows, alive_per_frame, largest_coordinate }
 }
 
 /// Scan of frames that arrive over time: [`scan`] with the frames cut into groups that are read once each.
@@ -141,7 +141,7 @@ impl<'a> RunningScan<'a> {
     ///
     /// # Panics
     /// If `plan` does not belong to the frames that were added ([`ScanPlan::finishes`]).
-    pub fn finish(self, plan: &ScanPlan) -> Scanned {
+    pub fn finish(self, plan: &ScanPlan) -> ScanResult {
         let blocks = self.blocks.into_iter().map(|block| {
             let found = block.finish_by(plan);
             (found.rows, found.largest_coordinate)
@@ -156,7 +156,7 @@ mod tests {
 
     use super::*;
     use crate::diagnostics::demo_scene::Scene;
-    use crate::model::{Columns, SequenceInfo, Split};
+    use crate::model::{Attributes, SequenceInfo, Split};
     use crate::recipe::Recipe;
     use crate::source::BlockReader;
 
@@ -165,7 +165,7 @@ mod tests {
         scene: Scene,
         info: SequenceInfo,
         /// Frame and columns of each read.
-        reads: Mutex<Vec<(usize, Columns)>>,
+        reads: Mutex<Vec<(usize, Attributes)>>,
     }
 
     struct RecordingReader<'a>(&'a RecordingScene, Box<dyn BlockReader + 'a>);
@@ -180,10 +180,10 @@ mod tests {
     }
 
     impl BlockReader for RecordingReader<'_> {
-        fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
+        fn read(&mut self, frame: usize, want: Attributes, out: &mut Gaussians) -> Result<()> {
             self.0.reads.lock().unwrap().push((frame, want));
-            self.1.read(frame, want & Columns::POSITION, out)?;
-            self.1.read(0, want.difference(Columns::POSITION), out)
+            self.1.read(frame, want & Attributes::POSITION, out)?;
+            self.1.read(0, want.difference(Attributes::POSITION), out)
         }
     }
 
@@ -193,19 +193,19 @@ mod tests {
         let info = scene.info().clone();
         let schedule = scene.rig().schedule(&info.times, Some(Split::Train)).unwrap();
         let mut recording = RecordingScene { scene, info, reads: Mutex::default() };
-        let mut scan_with = |varying: Columns| {
+        let mut scan_with = |varying: Attributes| {
             recording.info.varying = varying;
             let plan =
                 ScanPlan::new(&Recipe::preset("default").unwrap().scan, &recording.info.times, &schedule).unwrap();
             let found = scan(&recording, &schedule, &plan).unwrap();
             (format!("{:?}", found.rows), found.alive_per_frame, std::mem::take(&mut *recording.reads.lock().unwrap()))
         };
-        let (skipping, everything) = (scan_with(Columns::POSITION), scan_with(Columns::all()));
+        let (skipping, everything) = (scan_with(Attributes::POSITION), scan_with(Attributes::all()));
         assert_eq!((&skipping.0, &skipping.1), (&everything.0, &everything.1));
         for (frame, want) in &skipping.2 {
-            assert_eq!(*want, if *frame == 0 { Columns::all() } else { Columns::POSITION }, "frame {frame}");
+            assert_eq!(*want, if *frame == 0 { Attributes::all() } else { Attributes::POSITION }, "frame {frame}");
         }
-        assert!(everything.2.iter().all(|(_, want)| *want == Columns::all()));
+        assert!(everything.2.iter().all(|(_, want)| *want == Attributes::all()));
         assert_eq!((skipping.2.len(), everything.2.len()), (10, 10), "blocks times frames");
     }
 }

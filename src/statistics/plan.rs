@@ -3,7 +3,7 @@
 use serde::Serialize;
 
 use crate::error::{Error, Result};
-use crate::model::{Camera, Schedule};
+use crate::model::{Camera, ViewSchedule};
 use crate::recipe::{MotionParams, ScanParams};
 
 /// Largest deviation of a time step from the mean step, as a fraction of the mean step, up to which frames count as
@@ -44,7 +44,7 @@ impl ScanPlan {
     /// [`Error::Usage`] for time stamps that do not increase, for two time stamps so close that their distance vanishes
     /// beside the mean step, and for more than 2³² (frame, view) pairs. An internal error for a schedule with a
     /// different number of frames.
-    pub fn new(scan: &ScanParams, times: &[f64], schedule: &Schedule) -> Result<Self> {
+    pub fn new(scan: &ScanParams, times: &[f64], schedule: &ViewSchedule) -> Result<Self> {
         if let Some(t) =
             (1..times.len()).find(|&t| times[t - 1].partial_cmp(&times[t]) != Some(std::cmp::Ordering::Less))
         {
@@ -139,7 +139,7 @@ mod tests {
     use crate::recipe::Recipe;
 
     fn plan(times: &[f64]) -> Result<ScanPlan> {
-        let mut schedule = Schedule::default();
+        let mut schedule = ViewSchedule::default();
         schedule.push(times.len(), &[]);
         ScanPlan::new(&Recipe::preset("default").unwrap().scan, times, &schedule)
     }

@@ -8,7 +8,7 @@ use super::motion::MotionSums;
 use super::plan::{PAIRS_PER_CARRY, ScanPlan};
 use super::projection::{CoverageScale, CoverageSums, FootprintPlanes, project};
 use super::state::{BlockState, CHUNK};
-use crate::model::{Camera, Columns, Flags, Gaussians, Rows};
+use crate::model::{Attributes, Camera, Flags, Gaussians, Rows};
 
 /// Resident bytes of a [`BlockScan`] per Gaussian, independent of the number of frames.
 pub const BYTES_PER_GAUSSIAN: usize = BlockState::BYTES_PER_GAUSSIAN
@@ -25,11 +25,11 @@ const NEGLIGIBLE_OPACITY: f64 = 0.5 * f64::EPSILON;
 const CARRY_BITS: u32 = 52;
 
 /// Columns that a scan needs for every model; SH may be omitted.
-pub const NEEDED: Columns = Columns::all().difference(Columns::SH);
+pub const NEEDED: Attributes = Attributes::all().difference(Attributes::SH);
 
 /// Returns the columns to read at `frame`: all of them at the first frame, the `varying` ones after it.
-pub(super) fn wanted(frame: usize, varying: Columns) -> Columns {
-    if frame == 0 { Columns::all() } else { varying }
+pub(super) fn wanted(frame: usize, varying: Attributes) -> Attributes {
+    if frame == 0 { Attributes::all() } else { varying }
 }
 
 /// Running statistics of a block of consecutive Gaussians.
@@ -91,7 +91,7 @@ impl<'a> BlockScan<'a> {
     ///
     /// # Panics
     /// If frames are not added in order, or a column does not have the length of the block.
-    pub fn frame(&mut self, t: usize, gaussians: &Gaussians, cameras: &[&Camera], changed: Columns) {
+    pub fn frame(&mut self, t: usize, gaussians: &Gaussians, cameras: &[&Camera], changed: Attributes) {
         assert_eq!(t, self.next_frame, "frames are scanned in order");
         self.next_frame += 1;
         let changed = if t == 0 { changed | NEEDED } else { changed };
@@ -120,7 +120,7 @@ impl<'a> BlockScan<'a> {
         std::mem::take(&mut self.alive_per_frame)
     }
 
-    fn advance(&mut self, t: usize, gaussians: &Gaussians, changed: Columns) {
+    fn advance(&mut self, t: usize, gaussians: &Gaussians, changed: Attributes) {
         #[cfg(target_arch = "x86_64")]
         if std::arch::is_x86_feature_detected!("avx2") {
             // SAFETY: the line above saw that this processor has AVX2.
@@ -133,19 +133,19 @@ impl<'a> BlockScan<'a> {
     /// [`BlockScan::advance_portable`] compiled for AVX2: the same operations, several lanes at a time.
     #[cfg(target_arch = "x86_64")]
     #[target_feature(enable = "avx2")]
-    fn advance_avx2(&mut self, t: usize, gaussians: &Gaussians, changed: Columns) {
+    fn advance_avx2(&mut self, t: usize, gaussians: &Gaussians, changed: Attributes) {
         self.advance_portable(t, gaussians, changed);
     }
 
     /// Updates state, life spans and motion by one frame. Inlined, with the loops it calls, into the copy for each
     /// instruction set.
     #[inline(always)]
-    fn advance_portable(&mut self, t: usize, gaussians: &Gaussians, changed: Columns) {
+    fn advance_portable(&mut self, t: usize, gaussians: &Gaussians, changed: Attributes) {
         self.state.update(gaussians, changed);
         let alpha_min = self.plan.alpha_min;
         // The first frame is the one that the others are compared with; its opacities are new even if `changed` omits
         // them.
-        self.steady &= t == 0 || !changed.contains(Columns::OPACITY);
+        self.steady &= t == 0 || !changed.contains(Attributes::OPACITY);
         let repeats = t > 0 && self.steady;
         let opacity = &self.state.opacity;
         let alive = if repeats { self.life.repeat_frame() } else { self.life.add_frame(opacity, alpha_min) };
@@ -235,7 +235,7 @@ fn clear_non_finite(rows: &mut Rows) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::model::Schedule;
+    use crate::model::ViewSchedule;
     use crate::model::hash_id;
     use crate::recipe::{MotionParams, Recipe, ScanParams};
 
@@ -246,10 +246,11 @@ mod tests {
     /// Returns a frame with the positions of frame `t` and the opacities of frame `opacity_frame`.
     fn test_frame(t: usize, opacity_frame: usize) -> Gaussians {
         let mut frame = Gaussians::zeros(77, 0);
-        for (column, t) in [(Columns::POSITION, t), (Columns::OPACITY, opacity_frame), (Columns::ROTATION, 0)] {
+        for (column, t) in [(Attributes::POSITION, t), (Attributes::OPACITY, opacity_frame), (Attributes::ROTATION, 0)]
+        {
             for (i, x) in frame.column_mut(column).planes_mut().iter_mut().enumerate() {
                 // About half of the opacities are below 1/255.
-                *x = 10.0 * random(1000 * t + i) - if column == Columns::OPACITY { 10.5 } else { 7.0 };
+                *x = 10.0 * random(1000 * t + i) - if column == Attributes::OPACITY { 10.5 } else { 7.0 };
             }
         }
         frame
@@ -264,7 +265,7 @@ mod tests {
             let opacity_frames: [&[usize]; 4] = [&[0; 7], &[0, 0, 0, 3, 3, 3, 6], &[0, 1, 1, 1], &[0]];
             for opacities in opacity_frames {
                 let times: Vec<f64> = (0..opacities.len()).map(|t| t as f64 + f64::from(t > 4)).collect();
-                let mut schedule = Schedule::default();
+                let mut schedule = ViewSchedule::default();
                 schedule.push(times.len(), &[]);
                 let plan = ScanPlan::new(&scan, &times, &schedule).unwrap();
                 let [mut all, mut named] = [BlockScan::new(77, 0, &plan), BlockScan::new(77, 0, &plan)];
@@ -272,8 +273,8 @@ mod tests {
                     let frame = test_frame(t, opacity_frame);
                     let changed = t > 0 && opacity_frame != opacities[t - 1];
                     all.frame(t, &frame, &[], NEEDED);
-                    let opacity = if changed { Columns::OPACITY } else { Columns::empty() };
-                    named.frame(t, &frame, &[], Columns::POSITION | opacity);
+                    let opacity = if changed { Attributes::OPACITY } else { Attributes::empty() };
+                    named.frame(t, &frame, &[], Attributes::POSITION | opacity);
                 }
                 let (all, named) = (all.finish(), named.finish());
                 let living = all.rows.life.iter().filter(|&&life| life > 0).count();
@@ -289,7 +290,7 @@ mod tests {
         for motion in [MotionParams::Literal, MotionParams::Runs] {
             for times in [[0.0, 1.0, 2.0, 3.0, 4.0], [0.0, 1.0, 1.5, 4.0, 4.5]] {
                 let scan = ScanParams { motion, ..Recipe::preset("default").unwrap().scan };
-                let mut schedule = Schedule::default();
+                let mut schedule = ViewSchedule::default();
                 schedule.push(times.len(), &[]);
                 let plan = ScanPlan::new(&scan, &times, &schedule).unwrap();
                 let [mut wide, mut baseline] = [BlockScan::new(LEN, 0, &plan), BlockScan::new(LEN, 0, &plan)];

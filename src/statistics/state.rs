@@ -4,7 +4,7 @@
 use std::mem::size_of;
 use std::ops::Range;
 
-use crate::model::{self, Column, Columns, Flags, Gaussians};
+use crate::model::{self, AttributeValues, Attributes, Flags, Gaussians};
 
 /// Largest ln(scale); larger values are clamped to it. e¹⁰⁰ scene units cause no overflow later and already cover every
 /// view entirely.
@@ -43,32 +43,32 @@ impl BlockState {
     /// Decodes the columns `changed` and flags non-finite values and zero quaternions in them. Axes are only needed for
     /// projection; [`BlockState::update_axes`] updates them.
     #[inline(always)]
-    pub(super) fn update(&mut self, gaussians: &Gaussians, changed: Columns) {
+    pub(super) fn update(&mut self, gaussians: &Gaussians, changed: Attributes) {
         for column in changed.iter() {
             let values = gaussians.column(column);
             let largest = largest_magnitude(values.planes());
             if !largest.is_finite() {
                 self.flag_non_finite(values);
             }
-            if column == Columns::POSITION {
+            if column == Attributes::POSITION {
                 let finite = if largest.is_finite() { largest } else { largest_finite(values.planes()) };
                 self.largest_coordinate = self.largest_coordinate.max(finite);
             }
         }
-        if changed.contains(Columns::OPACITY) {
+        if changed.contains(Attributes::OPACITY) {
             for (opacity, &logit) in self.opacity.iter_mut().zip(gaussians.opacity_logit.plane(0)) {
                 *opacity = model::opacity(logit);
             }
         }
-        if changed.contains(Columns::ROTATION) {
+        if changed.contains(Attributes::ROTATION) {
             self.flag_zero_rotation(&gaussians.rotation);
         }
-        if changed.intersects(Columns::ROTATION | Columns::LOG_SCALE) {
+        if changed.intersects(Attributes::ROTATION | Attributes::LOG_SCALE) {
             self.axes_outdated.fill(true);
         }
     }
 
-    fn flag_non_finite(&mut self, column: &Column) {
+    fn flag_non_finite(&mut self, column: &AttributeValues) {
         for c in 0..column.width() {
             for (flags, x) in self.flags.iter_mut().zip(column.plane(c)) {
                 *flags |= if x.is_finite() { Flags::empty() } else { Flags::NON_FINITE };
@@ -77,7 +77,7 @@ impl BlockState {
     }
 
     #[inline(always)]
-    fn flag_zero_rotation(&mut self, rotation: &Column) {
+    fn flag_zero_rotation(&mut self, rotation: &AttributeValues) {
         let n = self.flags.len();
         let [w, x, y, z]: [&[f32]; 4] = std::array::from_fn(|c| &rotation.plane(c)[..n]);
         for (i, flags) in self.flags.iter_mut().enumerate() {

@@ -7,7 +7,7 @@ use proptest::prelude::*;
 use super::{BYTES_PER_GAUSSIAN, BlockScan, BlockStatistics, ScanPlan, snap, ulp};
 use crate::diagnostics::selfcheck::oracle::statistics as oracle;
 use crate::model::hash_id;
-use crate::model::{Camera, Columns, Flags, Gaussians, Schedule};
+use crate::model::{Attributes, Camera, Flags, Gaussians, ViewSchedule};
 use crate::recipe::{MotionParams, Recipe, ScanParams};
 
 fn recipe(motion: MotionParams) -> ScanParams {
@@ -38,9 +38,9 @@ fn camera(seed: u64) -> Camera {
     }
 }
 
-fn schedule(frames: usize, views: u32) -> Schedule {
+fn schedule(frames: usize, views: u32) -> ViewSchedule {
     let cameras: Vec<Camera> = (0..views.into()).map(camera).collect();
-    let mut schedule = Schedule::new(cameras);
+    let mut schedule = ViewSchedule::new(cameras);
     schedule.push(frames, &(0..views).map(|v| (v, v)).collect::<Vec<_>>());
     schedule
 }
@@ -76,17 +76,17 @@ fn even_times(frames: usize) -> Vec<f64> {
     (0..frames).map(|t| t as f64).collect()
 }
 
-fn scan_at(times: &[f64], frames: &[Gaussians], schedule: &Schedule, scan: &ScanParams) -> BlockStatistics {
+fn scan_at(times: &[f64], frames: &[Gaussians], schedule: &ViewSchedule, scan: &ScanParams) -> BlockStatistics {
     let plan = ScanPlan::new(scan, times, schedule).unwrap();
     let mut block = BlockScan::new(frames.first().map_or(0, Gaussians::len), 0, &plan);
     for (t, frame) in frames.iter().enumerate() {
         let cameras: Vec<&Camera> = schedule.views(t).iter().map(|&(_, c)| &schedule.cameras[c as usize]).collect();
-        block.frame(t, frame, &cameras, Columns::all());
+        block.frame(t, frame, &cameras, Attributes::all());
     }
     block.finish()
 }
 
-fn scan(frames: &[Gaussians], schedule: &Schedule, scan: &ScanParams) -> BlockStatistics {
+fn scan(frames: &[Gaussians], schedule: &ViewSchedule, scan: &ScanParams) -> BlockStatistics {
     scan_at(&even_times(frames.len()), frames, schedule, scan)
 }
 
@@ -105,7 +105,7 @@ fn scan_one(
         g.position.set_row(0, [x(t), 0.0, 0.0]);
         let alpha = opacity(t);
         g.opacity_logit.set_row(0, [(alpha / (1.0 - alpha)).ln() as f32]);
-        block.frame(t, &g, &[], Columns::POSITION | Columns::OPACITY);
+        block.frame(t, &g, &[], Attributes::POSITION | Attributes::OPACITY);
     }
     block.finish()
 }
@@ -234,7 +234,7 @@ fn opacities_0_and_1_give_zero_variance() {
     let mut block = BlockScan::new(1, 0, &plan);
     let mut g = Gaussians::zeros(1, 0);
     g.opacity_logit.set_row(0, [80.0]);
-    (0..20).for_each(|t| block.frame(t, &g, &[], Columns::empty()));
+    (0..20).for_each(|t| block.frame(t, &g, &[], Attributes::empty()));
     let full = block.finish().rows;
     assert_eq!((full.v[0], full.life[0]), (0.0, 20));
 }
@@ -243,7 +243,7 @@ fn opacities_0_and_1_give_zero_variance() {
 fn non_finite_values_clear_only_their_own_row() {
     let (clean, schedule, recipe) = (wanderers(300, 6, 2), schedule(6, 2), recipe(MotionParams::Runs));
     let expected = scan(&clean, &schedule, &recipe);
-    for (k, column) in Columns::all().iter().enumerate() {
+    for (k, column) in Attributes::all().iter().enumerate() {
         for bad in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
             let mut frames = clean.clone();
             let (t, i) = (k, 37 * k + 5);
@@ -324,7 +324,7 @@ fn needle_keeps_the_digits_of_its_area() {
     let turn = DQuat::from_rotation_arc(DVec3::X, along);
     g.rotation.set_row(0, [turn.w, turn.x, turn.y, turn.z].map(|x| x as f32));
     g.log_scale.set_row(0, [f64::ln(length) as f32, -30.0, -30.0]);
-    let mut schedule = Schedule::new(vec![camera.clone()]);
+    let mut schedule = ViewSchedule::new(vec![camera.clone()]);
     schedule.push(1, &[(0, 0)]);
     let area = 2.0 * scan(std::slice::from_ref(&g), &schedule, &recipe(MotionParams::Runs)).rows.c[0];
     // A diagonal line: det = 0.3·(Σ_xx + Σ_yy − 0.3), clipped to the fraction of its box inside the image.
@@ -380,7 +380,7 @@ fn mean_coverage_of_300_000_equal_views_is_that_of_one() {
     // More contributions than a 64-bit fixed-point sum holds; the mean of equal contributions is any of them.
     let (mut frames, one) = (wanderers(40, 1, 3), schedule(1, 1));
     frames[0].log_scale.planes_mut().fill(2.0);
-    let mut many = Schedule::new(one.cameras.clone());
+    let mut many = ViewSchedule::new(one.cameras.clone());
     many.push(1, &[(0, 0); 300_000]);
     let [one, many] = [one, many].map(|schedule| scan(&frames, &schedule, &recipe(MotionParams::Runs)).rows);
     assert!(one.c.iter().filter(|&&c| c * 300_000.0 > 2f64.powi(64 - 34)).count() > 10, "the case must overflow");
@@ -403,7 +403,7 @@ fn unchanged_columns_may_be_left_out_of_changed() {
     let mut block = BlockScan::new(300, 0, &plan);
     for (t, frame) in frames.iter().enumerate() {
         let cameras: Vec<&Camera> = schedule.cameras.iter().collect();
-        block.frame(t, frame, &cameras, Columns::POSITION | Columns::LOG_SCALE);
+        block.frame(t, frame, &cameras, Attributes::POSITION | Attributes::LOG_SCALE);
     }
     assert_eq!(block.finish(), scan(&frames, &schedule, &recipe));
 }
@@ -461,7 +461,7 @@ proptest! {
 /// Returns the Gaussians of `range`.
 fn slice(from: &Gaussians, range: std::ops::Range<usize>) -> Gaussians {
     let mut out = Gaussians::zeros(range.len(), 0);
-    for column in Columns::all().iter() {
+    for column in Attributes::all().iter() {
         for c in 0..from.column(column).width() {
             out.column_mut(column).plane_mut(c).copy_from_slice(&from.column(column).plane(c)[range.clone()]);
         }

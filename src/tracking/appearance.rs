@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-use crate::model::{Column, Gaussians, SH_C0};
+use crate::model::{AttributeValues, Gaussians, SH_C0};
 
 /// Largest magnitude of the natural log of a scale; others are clamped to it, so that squares of scales stay finite in
 /// f32.
@@ -45,7 +45,7 @@ impl ComparedAppearance {
     }
 
     fn from_gaussian(state: &Gaussians, i: usize) -> ComparedAppearance {
-        let row = |column: &Column| column.row::<3>(i);
+        let row = |column: &AttributeValues| column.row::<3>(i);
         let (position, rotation, log_scale) = (row(&state.position), state.rotation.row::<4>(i), row(&state.log_scale));
         let (logit, dc) = (state.opacity_logit.row::<1>(i), row(&state.sh));
         let values = position.iter().chain(&rotation).chain(&log_scale).chain(&logit).chain(&dc);

@@ -9,7 +9,7 @@ use super::appearance::ComparedAppearance;
 use super::grid::CellGrid;
 use super::linker::Linker;
 use super::track::{Candidate, Candidates, MAX_CANDIDATES, NONE, OpenTrack, Round};
-use crate::model::{Column, Gaussians};
+use crate::model::{AttributeValues, Gaussians};
 
 /// Parameters r and q of the two rules: `ALIKE` for tracks that may be one Gaussian, `CLOSE` for tracks that look the
 /// same.
@@ -63,7 +63,7 @@ impl Joiner {
     /// Bytes for each track so far, in lists that grow by being copied to twice their length, including the result.
     pub const BYTES_PER_TRACK: usize = 2 * RULES.len() * (size_of::<u32>() + size_of::<bool>());
     /// Bytes for each open track.
-    pub const BYTES_PER_LIVING: usize = 2 * size_of::<ComparedAppearance>()
+    pub const BYTES_PER_OPEN_TRACK: usize = 2 * size_of::<ComparedAppearance>()
         + 6 * size_of::<u32>()
         + RULES.len() * MAX_CANDIDATES * (size_of::<Candidate>() + 2 * size_of::<TrackPair>());
 
@@ -251,7 +251,7 @@ pub fn blend(state: &mut Gaussians, rows: &[usize]) {
             if dot < 0.0 { -1.0 } else { 1.0 }
         })
         .collect();
-    let mean = |column: &mut Column, signs: Option<&[f64]>| {
+    let mean = |column: &mut AttributeValues, signs: Option<&[f64]>| {
         for c in 0..column.width() {
             let plane = column.plane_mut(c);
             let part =

@@ -49,7 +49,7 @@ impl Linker {
         2 * size_of::<OpenTrack>() + 2 * size_of::<u32>() + MAX_CANDIDATES * size_of::<Candidate>() + size_of::<f32>();
 
     /// Returns the number of open tracks.
-    pub fn may_go_on(&self) -> usize {
+    pub fn open_track_count(&self) -> usize {
         self.tracks.len()
     }
 

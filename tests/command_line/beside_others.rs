@@ -212,7 +212,8 @@ fn killed_run_leaves_old_or_new_output_and_foreign_files() {
     fs::write(workplace.path("frames/notes.txt"), "precious").unwrap();
     const ENDS: u32 = 24;
     for end in 0..ENDS {
-        let mut child = start_program(&workplace, &format!("convert {} frames --as ply-sequence --overwrite", tiny().display()));
+        let mut child =
+            start_program(&workplace, &format!("convert {} frames --as ply-sequence --overwrite", tiny().display()));
         std::thread::sleep(whole * end / ENDS);
         let is_terminated = end % 2 == 0;
         if is_terminated {

@@ -107,7 +107,10 @@ fn final_report_has_count_size_quality_time_and_path() {
     assert_eq!(starts[..5], ["kept", "size", "quality", "took", "output"], "{most}");
     assert!(starts.len() <= 9 && most.contains("kept    150 of 300 Gaussians (50.0%)\n"), "{most}");
     assert!(most.contains("\noutput  out\n"), "{most}");
-    assert!(["dB against the original", "no difference from the original in "].iter().any(|quality| most.contains(quality)), "{most}");
+    assert!(
+        ["dB against the original", "no difference from the original in "].iter().any(|quality| most.contains(quality)),
+        "{most}"
+    );
     assert!(!most.contains("left out") && !most.contains(" -> "), "{most}");
     let all = workplace.done(&format!("{options} -o again --verbose"));
     assert!(all.contains("left out: ") && all.contains(" -> ") && all.contains("\nkept    150"), "{all}");

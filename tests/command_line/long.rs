@@ -10,7 +10,7 @@ use std::process::Output;
 
 use crate::scene::Workplace;
 use splatsieve::files::frame_stream::StreamHeader;
-use splatsieve::model::{Columns, Gaussians};
+use splatsieve::model::{Attributes, Gaussians};
 use splatsieve::outputs::frame_stream::StreamWriter;
 
 /// Scores and prunes by formula, because stages that use renders take much time but no memory that grows with frames.
@@ -28,7 +28,7 @@ impl LongSequence {
     /// Writes the sequence as a stream. Stops without an error if the reader closes the pipe.
     fn write(self, to: impl Write) {
         let header =
-            StreamHeader { count: self.gaussians, sh_degree: 0, varying: Columns::POSITION, is_unlinked: false };
+            StreamHeader { count: self.gaussians, sh_degree: 0, varying: Attributes::POSITION, is_unlinked: false };
         let mut state = Gaussians::zeros(self.gaussians, 0);
         let value = |i: usize, k: f32| (i as f32 * k).fract();
         for c in 0..3 {

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use crate::scene::{Workplace, files, lasting_files, said};
 use splatsieve::error::Result;
 use splatsieve::model::hash_id;
-use splatsieve::model::{Columns, Gaussians, SequenceInfo};
+use splatsieve::model::{Attributes, Gaussians, SequenceInfo};
 use splatsieve::outputs::container::write_container;
 use splatsieve::source::{BlockReader, FrameSource, Ids};
 
@@ -31,7 +31,7 @@ impl ChangingScene {
             count: GAUSSIANS,
             times,
             sh_degree: 1,
-            varying: Columns::all().difference(Columns::SH),
+            varying: Attributes::all().difference(Attributes::SH),
         })
     }
 }
@@ -49,13 +49,13 @@ impl FrameSource for ChangingScene {
 struct Block(Vec<usize>);
 
 impl BlockReader for Block {
-    fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
+    fn read(&mut self, frame: usize, want: Attributes, out: &mut Gaussians) -> Result<()> {
         for column in want.iter() {
             // Center and amplitude of the values; Gaussians with close ids are close in space.
             let (middle, wander, shake) = match column {
-                Columns::POSITION => (0.0, 2.0, 1e-3),
-                Columns::LOG_SCALE => (-3.5, 0.2, 1e-3),
-                Columns::OPACITY => (1.0, 3.0, 1e-3),
+                Attributes::POSITION => (0.0, 2.0, 1e-3),
+                Attributes::LOG_SCALE => (-3.5, 0.2, 1e-3),
+                Attributes::OPACITY => (1.0, 3.0, 1e-3),
                 _ => (0.3, 1.0, 1e-3),
             };
             let to = out.column_mut(column);
@@ -64,7 +64,7 @@ impl BlockReader for Block {
                 for (x, &id) in to.plane_mut(c).iter_mut().zip(&self.0) {
                     let k = 64 * (id / 4) + 16 * c + column.width(1);
                     let own = wander * (random(k) - 0.5) + 0.01 * random(64 * id + c);
-                    let time = if column == Columns::SH { 0 } else { frame };
+                    let time = if column == Attributes::SH { 0 } else { frame };
                     *x = middle + own + shake * (0.3 * time as f32 + 6.0 * random(k + 1)).sin();
                 }
             }
@@ -76,7 +76,9 @@ impl BlockReader for Block {
 /// Returns a folder with the scene as `packed.gseq` and `raw.gseq`, and its cameras.
 fn scene_workplace() -> Workplace {
     let workplace = Workplace::new();
-    for (name, compression) in [("packed.gseq", gseq::Compression::Zstd(1)), ("raw.gseq", gseq::Compression::Raw)] {
+    for (name, compression) in
+        [("packed.gseq", gseq::Compression::Zstd(1)), ("raw.gseq", gseq::Compression::StoredParams)]
+    {
         write_container(&ChangingScene::new(), &workplace.path(name), compression, Default::default(), |_| ()).unwrap();
     }
     let camera = r#"{"id": 0, "img_name": "a", "width": 96, "height": 64, "fx": 90, "fy": 90, "position": [0, -4, 0],
@@ -123,8 +125,14 @@ fn named_minimum_memory_works_and_changes_no_byte() {
         workplace.done(&format!("{} --memory {minimum_memory}MiB", request("tight")));
         let [free, tight] = ["free", "tight"].map(|name| workplace.path(name));
         if let Some(peak_memory) = peak_memory(&tight.join("small.gseq")) {
-            assert!(peak_memory <= minimum_memory, "{input} {rest}: {peak_memory} MiB resident, {minimum_memory} promised");
-            assert!(minimum_memory < 63 || rest != "--no-refine", "{input} {rest}: {minimum_memory} MiB would hold the scene");
+            assert!(
+                peak_memory <= minimum_memory,
+                "{input} {rest}: {peak_memory} MiB resident, {minimum_memory} promised"
+            );
+            assert!(
+                minimum_memory < 63 || rest != "--no-refine",
+                "{input} {rest}: {minimum_memory} MiB would hold the scene"
+            );
         }
         assert!(lasting_files(&free) == lasting_files(&tight), "{input} {rest}: other bytes at {minimum_memory} MiB");
     }

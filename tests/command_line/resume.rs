@@ -14,8 +14,7 @@ use std::time::{Duration, Instant, SystemTime};
 use crate::scene::{Workplace, program};
 
 /// Run with many Gaussians for the file size of its scene, in which every stage can be cached.
-const RUN: &str =
-    "compress scene/scene.gseq --cameras scene/cameras.json --quiet --ratio 0.2 --set refine_steps=150";
+const RUN: &str = "compress scene/scene.gseq --cameras scene/cameras.json --quiet --ratio 0.2 --set refine_steps=150";
 
 fn command(workplace: &Workplace, arguments: &str) -> Command {
     let mut command = Command::new(program());
@@ -34,7 +33,8 @@ fn stderr_text(output: &Output) -> String {
 
 fn workplace_with_scene(gaussians: usize) -> Workplace {
     let workplace = Workplace::new();
-    let output = run_program(&workplace, &format!("demo --gaussians {gaussians} --frames 8 -o scene --quiet --no-refine"));
+    let output =
+        run_program(&workplace, &format!("demo --gaussians {gaussians} --frames 8 -o scene --quiet --no-refine"));
     assert!(output.status.success(), "{}", stderr_text(&output));
     workplace
 }
@@ -155,7 +155,8 @@ fn changed_recipe_recomputes_only_dependent_stages() {
     let workplace = workplace_with_scene(700);
     let run = |name: &str, options: &str| {
         let before = cache_entries(&workplace.path("work"));
-        let run = RUN.replace("--set refine_steps=150", if options.contains("steps") { "" } else { "--set refine_steps=150" });
+        let run = RUN
+            .replace("--set refine_steps=150", if options.contains("steps") { "" } else { "--set refine_steps=150" });
         let output = run_program(&workplace, &format!("{run} -o {name}.gseq --cache work {options}"));
         assert!(output.status.success(), "{}", stderr_text(&output));
         let after = cache_entries(&workplace.path("work"));
@@ -197,7 +198,11 @@ fn streams_cannot_resume_and_shards_need_a_cache() {
         ("work nowhere", "nowhere"),
     ] {
         let output = run_program(&workplace, arguments);
-        assert!(!output.status.success() && stderr_text(&output).contains(part), "{arguments}: {}", stderr_text(&output));
+        assert!(
+            !output.status.success() && stderr_text(&output).contains(part),
+            "{arguments}: {}",
+            stderr_text(&output)
+        );
     }
 }
 
@@ -216,7 +221,10 @@ fn full_cache_disk_is_named_and_a_larger_one_resumes() {
     let output = shell.args(["sh", "-c", &script]).current_dir(workplace.path("")).output().unwrap();
     let stderr_text = stderr_text(&output);
     assert!(output.status.success(), "{stderr_text}");
-    assert!(stderr_text.contains("code 1") && stderr_text.contains("disk/work") && stderr_text.contains("No space left"), "{stderr_text}");
+    assert!(
+        stderr_text.contains("code 1") && stderr_text.contains("disk/work") && stderr_text.contains("No space left"),
+        "{stderr_text}"
+    );
     assert!(run_program(&workplace, &format!("{RUN} -o plain.gseq")).status.success());
     assert_eq!(result_files(&workplace, "full.gseq"), result_files(&workplace, "plain.gseq"));
 }

@@ -6,7 +6,7 @@ use std::process::{Command, Stdio};
 
 use crate::scene::{Workplace, state, tiny};
 use splatsieve::files::container::Container;
-use splatsieve::model::Columns;
+use splatsieve::model::Attributes;
 use splatsieve::source::FrameSource;
 
 /// Returns a Python that has `modules`: `python3`, or the one that `PYTHON` names. Panics if a module is missing.
@@ -45,7 +45,7 @@ fn packed(workplace: &Workplace, exporter: &mut Command, name: &str) -> Containe
 /// Writes the values of the scene at `frame` as float32 files, one per attribute, Gaussian by Gaussian.
 fn write_columns(workplace: &Workplace, scene: &Container, frame: usize) {
     let state = state(scene, frame);
-    for column in Columns::all().iter() {
+    for column in Attributes::all().iter() {
         let values = state.column(column);
         let bytes: Vec<u8> = (0..values.len())
             .flat_map(|i| (0..values.width()).flat_map(move |c| values.plane(c)[i].to_le_bytes()))
@@ -96,7 +96,7 @@ fn exported_arrays_arrive_bit_for_bit() {
          np.savez('model.npz', **a)\n\
          os.mkdir('folder')\n\
          [np.save(f'folder/{{n}}.npy', x) for n, x in a.items()]",
-        varying.iter().map(Columns::name).collect::<Vec<_>>().join(" "),
+        varying.iter().map(Attributes::name).collect::<Vec<_>>().join(" "),
         times.join(", ")
     );
     run(Command::new(&python).args(["-c", &make]), &workplace);
@@ -271,7 +271,7 @@ fn generated_stream_always_moves_and_is_reproducible() {
     let again = packed(&workplace, &mut exporter(&["500", "70"]), "b.gseq");
     let info = found.info();
     assert_eq!((info.count, info.times.len(), info.sh_degree), (500, 70, 3));
-    assert_eq!(info.varying, Columns::all().difference(Columns::SH));
+    assert_eq!(info.varying, Attributes::all().difference(Attributes::SH));
     // One period apart the curves have the same values, except for noise.
     for (frame, other) in [(0, 1), (33, 34), (5, 65)] {
         let (one, two) = (state(&found, frame), state(&found, other));
@@ -284,7 +284,7 @@ fn generated_stream_always_moves_and_is_reproducible() {
         }
     }
     let moved = packed(&workplace, &mut exporter(&["40", "3", "--varying", "position", "--sh-degree", "0"]), "c.gseq");
-    assert_eq!((moved.info().varying, moved.info().sh_degree), (Columns::POSITION, 0));
+    assert_eq!((moved.info().varying, moved.info().sh_degree), (Attributes::POSITION, 0));
 }
 
 #[test]

@@ -53,7 +53,7 @@ fn write(path: &Path, rows: &[[u32; WORDS]]) {
 
 fn rows_of(path: &Path) -> Vec<SplatvGaussian> {
     let file = splatsieve::files::splatv::Splatv::open(path).unwrap();
-    (0..file.count()).map(|i| SplatvGaussian::of_words(&file.words(i))).collect()
+    (0..file.count()).map(|i| SplatvGaussian::from_words(&file.words(i))).collect()
 }
 
 fn json(workplace: &Workplace, arguments: &str) -> Value {
@@ -89,7 +89,8 @@ fn defective_rows_are_counted_and_left_out_or_kept() {
     let summary = workplace.summary(&format!("odd.splatv -o small.splatv {options}"));
     assert_eq!((&summary["input"]["gaussians"], &summary["gaussians"]), (&192.into(), &150.into()));
     assert_said(&notes(&summary), &parts);
-    let places: Vec<[f32; 3]> = (0..ROWS).filter(|row| !DROPPED.contains(row)).map(|row| valid_gaussian(row).position).collect();
+    let places: Vec<[f32; 3]> =
+        (0..ROWS).filter(|row| !DROPPED.contains(row)).map(|row| valid_gaussian(row).position).collect();
     let small = rows_of(&workplace.path("small.splatv"));
     assert!(small.len() == 150 && small.iter().all(|row| places.contains(&row.position)));
     let map = index_map(&workplace.path("small.splatv.index_map.npy"));

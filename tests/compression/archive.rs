@@ -4,7 +4,7 @@ use std::fs;
 use std::path::Path;
 
 use crate::scene::{PlyRows, Workplace, bits, files, index_map, lasting_files, state, tiny};
-use splatsieve::model::{Columns, Gaussians};
+use splatsieve::model::{Attributes, Gaussians};
 use splatsieve::models::{InputModel, ModelFolder};
 use splatsieve::outputs::container::write_container;
 
@@ -86,7 +86,10 @@ fn archive_reads_like_the_folder_it_unpacks_to() {
     workplace.done("render small.gsz --cameras {tiny} --all -o pictures");
     workplace.done("info small.gsz");
     workplace.done("compress small.gsz --cameras {tiny} --ratio 0.5 --no-refine --prune-only -o smaller");
-    assert_eq!(point_cloud(&workplace.path("smaller")).rows.len(), point_cloud(&workplace.path("small")).rows.len().div_ceil(2));
+    assert_eq!(
+        point_cloud(&workplace.path("smaller")).rows.len(),
+        point_cloud(&workplace.path("small")).rows.len().div_ceil(2)
+    );
     // The decoded scratch folder is removed.
     let left = files(&workplace.path(""));
     assert!(left.keys().all(|name| !name.to_string_lossy().contains("scratch")), "{:?}", left.keys());
@@ -105,7 +108,7 @@ fn archive_bytes_ignore_thread_count() {
 fn archive_of_frames_keeps_bounds_and_the_asked_psnr() {
     let workplace = Workplace::new();
     let made = splatsieve::diagnostics::demo_scene::Scene::new(1500, 20);
-    let raw = gseq::Compression::Raw;
+    let raw = gseq::Compression::StoredParams;
     write_container(&made, &workplace.path("frames.gseq"), raw, Default::default(), |_| ()).unwrap();
     let how = "--ratio 0.5 --no-refine --prune-only";
     let exact = workplace.summary(&format!("frames.gseq {how} -o exact.gseq"));
@@ -126,7 +129,7 @@ fn archive_of_frames_keeps_bounds_and_the_asked_psnr() {
     assert_eq!(after.kind(), "gseq container");
     for frame in [0, 7, 19] {
         let [before, after] = [&before, &after].map(|input| state(input.source(), frame));
-        for column in Columns::all().iter() {
+        for column in Attributes::all().iter() {
             let bound = archive["bounds"][column.name()].as_f64().unwrap();
             let off = before.column(column).planes().iter().zip(after.column(column).planes());
             let off = off.map(|(a, b)| (f64::from(*a) - f64::from(*b)).abs()).fold(0.0, f64::max);
@@ -162,7 +165,7 @@ fn single_ply_returns_with_its_header_and_close_values() {
     let workplace = Workplace::new();
     let mut gaussians = Gaussians::zeros(400, 1);
     let mut seed = 1u64;
-    for column in gaussians.columns_mut(splatsieve::model::Columns::all()) {
+    for column in gaussians.columns_mut(splatsieve::model::Attributes::all()) {
         column.planes_mut().iter_mut().for_each(|value| {
             seed = seed.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
             *value = (seed >> 40) as f32 / (1 << 24) as f32 - 0.5;

@@ -7,14 +7,14 @@ use crate::scene::{Workplace, files, state};
 use gseq::Reader;
 use serde_json::Value;
 use splatsieve::files::container::Container;
-use splatsieve::model::Columns;
+use splatsieve::model::Attributes;
 use splatsieve::source::FrameSource;
 
 const BOUNDS: &str = "position=2e-3,rotation=5e-3,log_scale=1e-2,opacity_logit=2e-2,sh=1e-2";
 
 /// Returns the largest difference between the finite values of an attribute in the two containers, and whether all
 /// other values are equal.
-fn largest_difference(workplace: &Workplace, column: Columns) -> (f64, bool) {
+fn largest_difference(workplace: &Workplace, column: Attributes) -> (f64, bool) {
     let [exact, within] = ["exact.gseq", "within.gseq"].map(|name| Container::open(&workplace.path(name)).unwrap());
     let (mut largest_difference, mut kept) = (0.0f64, true);
     for frame in 0..exact.info().times.len() {
@@ -41,10 +41,13 @@ fn every_attribute_keeps_its_bound_and_names_it() {
     for bound in BOUNDS.split(',') {
         let (name, bound) = bound.split_once('=').unwrap();
         let bound: f64 = bound.parse().unwrap();
-        let column = Columns::all().iter().find(|column| column.name() == name).unwrap();
+        let column = Attributes::all().iter().find(|column| column.name() == name).unwrap();
         let (largest_difference, kept) = largest_difference(&workplace, column);
         assert!(largest_difference <= bound && kept, "{name}: {largest_difference} off, {bound} promised");
-        assert!(largest_difference > 0.3 * bound, "{name}: a bound of {bound} is not made use of, {largest_difference} off");
+        assert!(
+            largest_difference > 0.3 * bound,
+            "{name}: a bound of {bound} is not made use of, {largest_difference} off"
+        );
         let column = info["columns"].as_array().unwrap().iter().find(|column| column["name"] == name).unwrap();
         assert_eq!(column["max_error"].as_f64(), Some(bound), "{info}");
     }
@@ -64,12 +67,15 @@ fn unbounded_attributes_are_exact_percent_is_of_extent() {
     let workplace = Workplace::new();
     workplace.done("convert {tiny} exact.gseq");
     workplace.done("convert {tiny} within.gseq --max-error position=0.1%");
-    for column in Columns::all().difference(Columns::POSITION).iter() {
+    for column in Attributes::all().difference(Attributes::POSITION).iter() {
         assert_eq!(largest_difference(&workplace, column), (0.0, true), "{}", column.name());
     }
     let bound = Reader::open(workplace.path("within.gseq")).unwrap().layout().columns[0].max_error;
-    let (largest_difference, _) = largest_difference(&workplace, Columns::POSITION);
-    assert!(largest_difference <= bound && largest_difference > 0.3 * bound, "{largest_difference} off, {bound} promised");
+    let (largest_difference, _) = largest_difference(&workplace, Attributes::POSITION);
+    assert!(
+        largest_difference <= bound && largest_difference > 0.3 * bound,
+        "{largest_difference} off, {bound} promised"
+    );
     // The Gaussians of the tiny model lie in a box of a few units.
     assert!((1e-4..1e-1).contains(&bound), "{bound}");
 }

@@ -6,7 +6,7 @@ use std::path::Path;
 use crate::scene::{Workplace, state, tiny, without_sh_head};
 use splatsieve::compressed_model::{Cluster, CompressedModel, ParamDelta, Reference};
 use splatsieve::limits::Limits;
-use splatsieve::model::{ALL_HARMONICS, Columns, Gaussians};
+use splatsieve::model::{Attributes, Gaussians, NO_SH_LIMIT};
 use splatsieve::models;
 use splatsieve::models::{InputModel, OpenOptions};
 use splatsieve::outputs::kind::OutputKind;
@@ -34,7 +34,7 @@ fn compress_by_three(input: &dyn InputModel) -> CompressedModel {
 }
 
 /// Returns a parameter delta that changes the attributes `columns` of every third Gaussian.
-fn delta_of_every_third(count: usize, columns: Columns) -> ParamDelta {
+fn delta_of_every_third(count: usize, columns: Attributes) -> ParamDelta {
     let mut delta = Gaussians::default();
     for column in columns.iter() {
         *delta.column_mut(column) = Gaussians::zeros(count, 0).column(column).clone();
@@ -87,7 +87,7 @@ fn compressed_states_equal_written_states_after_any_delta() {
         for kind in kinds {
             compressed.change = ParamDelta::default();
             let [plain, _] = states_before_and_after_writing(&workplace, &*input, &compressed, kind);
-            for column in Columns::all().iter().chain([Columns::all()]) {
+            for column in Attributes::all().iter().chain([Attributes::all()]) {
                 compressed.change = delta_of_every_third(compressed.len(), column);
                 let [reduced, written] = states_before_and_after_writing(&workplace, &*input, &compressed, kind);
                 let case = format!("{}, {}, {kind:?}", path.display(), column.name());
@@ -111,7 +111,7 @@ fn compressed_states_equal_written_states_after_any_delta() {
                     assert!(reduced == written, "{}, {kind:?}: degree {sh_degree}", path.display());
                     assert_eq!(written[0].sh_degree(), sh_degree);
                 }
-                compressed.sh_degree = ALL_HARMONICS;
+                compressed.sh_degree = NO_SH_LIMIT;
             }
         }
     }

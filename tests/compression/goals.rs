@@ -14,7 +14,8 @@ fn with_demo() -> Workplace {
 }
 
 /// Arguments for a short refinement.
-const SHORT_REFINEMENT: &str = "demo/scene.gseq --cameras demo/cameras.json --set refine_steps=120 --set refine_cut_steps=20";
+const SHORT_REFINEMENT: &str =
+    "demo/scene.gseq --cameras demo/cameras.json --set refine_steps=120 --set refine_cut_steps=20";
 
 /// Returns the bytes of all files below the output folder, or of the output file and the files beside it that begin
 /// with its name.
@@ -63,7 +64,8 @@ fn unreachable_psnr_keeps_all_and_no_refine_holds() {
 fn max_loss_compares_with_photographs() {
     let workplace = with_demo();
     workplace.done("render demo/scene.gseq --cameras demo/cameras.json --all --split all -o photographs");
-    let summary = workplace.summary(&format!("{SHORT_REFINEMENT} --max-loss 60dB --ground-truth photographs -o small.gseq"));
+    let summary =
+        workplace.summary(&format!("{SHORT_REFINEMENT} --max-loss 60dB --ground-truth photographs -o small.gseq"));
     let goal = &summary["goal"];
     // Photographs that are renders of the original reach 59 dB with their 8 bits.
     assert_eq!(goal["name"], "max_loss");
@@ -119,6 +121,7 @@ fn contradictory_targets_are_refused() {
 #[ignore = "needs time"]
 fn target_size_above_the_input_only_drops_named_ids() {
     let workplace = with_demo();
-    let summary = workplace.summary(&format!("{SHORT_REFINEMENT} --no-refine --size 10MB --drop-ids 5-14 -o small.gseq"));
+    let summary =
+        workplace.summary(&format!("{SHORT_REFINEMENT} --no-refine --size 10MB --drop-ids 5-14 -o small.gseq"));
     assert_eq!(summary["gaussians"], 790);
 }

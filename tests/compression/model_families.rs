@@ -185,7 +185,8 @@ fn every_command_accepts_dynamic_3d_gaussians() {
         println!("{ratio}: {pruned} dB pruned, {default} with merging, {refined} refined");
         assert!(default >= pruned && refined > pruned + 1.0, "{pruned} {default} {refined}");
     }
-    workplace.done(&format!("compress {model} --cameras {model} -o merged.gseq --merge-only --preset strong --no-refine"));
+    workplace
+        .done(&format!("compress {model} --cameras {model} -o merged.gseq --merge-only --preset strong --no-refine"));
     workplace.done(&format!("convert {model} packed.gseq"));
     workplace.done(&format!("score {model} --cameras {model} -o rows.csv"));
     workplace.done(&format!("render {model} --cameras {model} --frame 3 --view 1 -o picture.png"));
@@ -262,8 +263,7 @@ fn splatv_of_the_lite_model_equals_its_converter_rounded() {
     let workplace = Workplace::new();
     let lite = model_path("stg_lite");
     let [model, cameras] = [lite.clone(), lite.clone()].map(|path| path.display().to_string());
-    workplace
-        .done(&format!("compress {model} --cameras {cameras} -o all.splatv --ratio 1 --prune-only --no-refine"));
+    workplace.done(&format!("compress {model} --cameras {cameras} -o all.splatv --ratio 1 --prune-only --no-refine"));
     let texture = |path: &Path| {
         let bytes = fs::read(path).unwrap();
         let words: Vec<u32> = bytes[..8].chunks(4).map(|word| u32::from_le_bytes(word.try_into().unwrap())).collect();
@@ -347,7 +347,10 @@ fn native_4d_gaussians_states_match_their_trainer() {
             }
         }
     }
-    println!("position {:e}, opacity {:e}, covariance {:e}, harmonics {:e}", errors[0], errors[1], errors[2], errors[3]);
+    println!(
+        "position {:e}, opacity {:e}, covariance {:e}, harmonics {:e}",
+        errors[0], errors[1], errors[2], errors[3]
+    );
     assert!(errors[0] <= 2e-6 && errors[1] <= 5e-7 && errors[2] <= 5e-6 && errors[3] <= 1e-6, "{errors:?}");
 }
 

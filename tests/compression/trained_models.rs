@@ -4,7 +4,7 @@ use std::fmt::{self, Display, Formatter};
 use std::path::Path;
 
 use crate::scene::{arrays, shared, state, tiny};
-use splatsieve::model::{Gaussians, Rows, Schedule};
+use splatsieve::model::{Gaussians, Rows, ViewSchedule};
 use splatsieve::pipeline::score_scene;
 use splatsieve::pruning::score::UserOverrides;
 use splatsieve::recipe::{MotionParams, Recipe};
@@ -79,7 +79,7 @@ fn rows(model: &Path, motion: MotionParams) -> (Rows, f64) {
     let mut scene = crate::scene::scene(model);
     // Motion and opacity do not depend on cameras; the cameras of one frame are enough to accept the scene.
     let first = scene.schedule.views(0).to_vec();
-    scene.schedule = Schedule::new(scene.schedule.cameras.clone());
+    scene.schedule = ViewSchedule::new(scene.schedule.cameras.clone());
     scene.schedule.push(1, &first);
     scene.schedule.push(scene.source().info().times.len() - 1, &[]);
     let scored = score_scene(&scene, &recipe, &UserOverrides::default()).unwrap();

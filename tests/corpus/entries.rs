@@ -17,7 +17,7 @@ use splatsieve::files::frame_stream::FrameStream;
 use splatsieve::files::in_memory;
 use splatsieve::files::ply::check_header;
 use splatsieve::limits::ReadLimit;
-use splatsieve::model::{Columns, Gaussians};
+use splatsieve::model::{Attributes, Gaussians};
 use splatsieve::models;
 use splatsieve::models::OpenOptions;
 use splatsieve::models::archive::unpack;
@@ -165,7 +165,7 @@ fn look(source: &dyn FrameSource) -> Outcome {
     }
     let ids: Vec<u32> = (0..info.count as u32).collect();
     for frame in [0, info.times.len().saturating_sub(1)].into_iter().take(info.times.len()) {
-        gather(source, &ids, frame, Columns::all())?;
+        gather(source, &ids, frame, Attributes::all())?;
     }
     Ok(())
 }

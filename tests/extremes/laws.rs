@@ -10,7 +10,7 @@ use std::collections::BTreeMap;
 use glam::{DMat3, DVec3};
 use proptest::prelude::*;
 use splatsieve::files::container::Container;
-use splatsieve::model::{Camera, Columns, Gaussians, Rig, Rows, Shot, Split};
+use splatsieve::model::{Attributes, Camera, Gaussians, Rig, Rows, Shot, Split};
 use splatsieve::outputs::container::write_container;
 use splatsieve::passes::HeldFrames;
 use splatsieve::pipeline::score_scene;
@@ -43,9 +43,9 @@ impl World {
         recipe.select.tau_static = 0.3;
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("world.gseq");
-        let mut held = HeldFrames::new(self.frames[0].len(), 0, Columns::all(), Gaussians::zeros(0, 0));
+        let mut held = HeldFrames::new(self.frames[0].len(), 0, Attributes::all(), Gaussians::zeros(0, 0));
         self.times.iter().zip(&self.frames).for_each(|(&time, frame)| held.push(time, frame.clone()));
-        write_container(&held, &path, gseq::Compression::Raw, BTreeMap::new(), |_| ()).unwrap();
+        write_container(&held, &path, gseq::Compression::StoredParams, BTreeMap::new(), |_| ()).unwrap();
         let shot =
             |view: usize| Shot { view: view as u32, camera: view as u32, time: None, split: Split::Train, image: None };
         let rig = Rig {

@@ -66,7 +66,7 @@ use std::process::Output;
 
 use scene::Workplace;
 use splatsieve::files::frame_stream::StreamHeader;
-use splatsieve::model::{Columns, Gaussians};
+use splatsieve::model::{Attributes, Gaussians};
 use splatsieve::outputs::frame_stream::StreamWriter;
 
 /// `n` gray balls of radius 0.05 strewn over a unit square by the golden ratio, opacity 0.73.
@@ -115,7 +115,7 @@ struct Sequence {
 
 impl Sequence {
     /// `frames` frames of `count` balls, of which `varying` may be set anew in each.
-    fn new(count: usize, frames: usize, varying: Columns) -> Sequence {
+    fn new(count: usize, frames: usize, varying: Attributes) -> Sequence {
         let header = StreamHeader { count, sh_degree: 0, varying, is_unlinked: false };
         Sequence { frames, header, state: balls(count), cameras: None, time: |t| t as f64 }
     }

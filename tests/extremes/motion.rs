@@ -2,7 +2,7 @@
 
 use std::f64::consts::TAU;
 
-use splatsieve::model::Columns;
+use splatsieve::model::Attributes;
 
 use super::{Rows, Sequence, close};
 
@@ -20,7 +20,7 @@ fn walking(
     x: impl Fn(usize, usize) -> f64 + Send + 'static,
     life: impl Fn(usize, usize) -> f32 + Send + 'static,
 ) -> Rows {
-    Sequence::new(count, frames, Columns::POSITION | Columns::OPACITY).rows(flags, move |t, state| {
+    Sequence::new(count, frames, Attributes::POSITION | Attributes::OPACITY).rows(flags, move |t, state| {
         for i in 0..count {
             state.position.set_row(i, [x(i, t) as f32, 0.0, 0.0]);
             state.opacity_logit.set_row(i, [life(i, t)]);
@@ -79,7 +79,7 @@ fn sinusoids_over_100_000_frames_have_their_analytic_motion() {
 #[ignore = "needs time"]
 fn constant_opacity_has_variance_exactly_0_over_100_000_frames() {
     let logits: [f32; 6] = [-4.0, -0.847_297_9, 0.0, 0.3, 6.9, 16.1];
-    for varying in [Columns::POSITION, Columns::POSITION | Columns::OPACITY] {
+    for varying in [Attributes::POSITION, Attributes::POSITION | Attributes::OPACITY] {
         for flags in [RUNS, LITERAL] {
             let rows =
                 Sequence::new(logits.len(), 100_000, varying).with_logits(logits.to_vec()).rows(flags, |_, _| ());
@@ -168,7 +168,7 @@ fn subnormals_move_as_values_and_minus_0_is_0() {
         close(format!("D of steps of {:e}", step(i)), of(&rows, "D", i), step(i), 1e-12 * step(i));
     }
     let signed = |zero: f32| {
-        Sequence::new(40, 4, Columns::POSITION | Columns::OPACITY).rows(RUNS, move |t, state| {
+        Sequence::new(40, 4, Attributes::POSITION | Attributes::OPACITY).rows(RUNS, move |t, state| {
             for i in 0..40 {
                 state.position.set_row(i, [if (i + t) % 3 == 0 { zero } else { (i % 5) as f32 }, zero, 1.0]);
                 state.opacity_logit.set_row(i, [if i % 2 == 0 { zero } else { 1.0 }]);
@@ -194,7 +194,7 @@ fn far_from_the_origin_noise_is_snapped_and_counted_and_motion_is_that_of_the_fl
             0..RESTING => offset + ulp * ((t >> (i % 3)) % 2) as f64,
             _ => offset + 64.0 * ulp * (t * (i - RESTING + 1) % 7) as f64,
         };
-        let sequence = || Sequence::new(2 * RESTING, 40, Columns::POSITION);
+        let sequence = || Sequence::new(2 * RESTING, 40, Attributes::POSITION);
         let fill = move |t: usize, state: &mut splatsieve::model::Gaussians| {
             (0..2 * RESTING).for_each(|i| state.position.set_row(i, [x(i, t) as f32, 0.0, 0.0]));
         };

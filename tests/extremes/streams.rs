@@ -3,14 +3,14 @@
 use super::scene::{Workplace, files};
 use super::{balls, piped};
 use splatsieve::files::frame_stream::StreamHeader;
-use splatsieve::model::Columns;
+use splatsieve::model::Attributes;
 use splatsieve::outputs::frame_stream::StreamWriter;
 use std::path::Path;
 
 /// A stream of five frames of four balls.
 fn stream() -> Vec<u8> {
     let (mut bytes, state) = (Vec::new(), balls(4));
-    let header = StreamHeader { count: 4, sh_degree: 0, varying: Columns::POSITION, is_unlinked: false };
+    let header = StreamHeader { count: 4, sh_degree: 0, varying: Attributes::POSITION, is_unlinked: false };
     let mut stream = StreamWriter::new(&mut bytes, Path::new("memory"), header, &state).unwrap();
     (0..5).for_each(|t| stream.frame(f64::from(t), &state).unwrap());
     stream.finish().unwrap();

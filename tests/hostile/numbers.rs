@@ -4,7 +4,7 @@ use std::fs;
 use std::path::PathBuf;
 
 use splatsieve::files::ply::write::write_inria;
-use splatsieve::model::{Column, Gaussians};
+use splatsieve::model::{AttributeValues, Gaussians};
 
 use crate::runner::{Attack, Folder, Outcome};
 
@@ -187,7 +187,7 @@ const EXTREME: [Edit; 12] = [
     ("harmonic 1e30", |cloud| cloud.sh.plane_mut(7)[3] = 1e30),
     ("all opacities 0", |cloud| cloud.opacity_logit.planes_mut().fill(-100.0)),
     ("all at one place", |cloud| cloud.position.planes_mut().fill(0.25)),
-    ("all behind the cameras", |cloud| cloud.position = Column::from_planes(3, vec![1e4; 3 * cloud.len()])),
+    ("all behind the cameras", |cloud| cloud.position = AttributeValues::from_planes(3, vec![1e4; 3 * cloud.len()])),
 ];
 
 const OUTPUTS: [&str; 5] = ["out.ply", "out.gseq", "out.spz", "out.splatv", "out.gsz"];

@@ -299,7 +299,12 @@ fn photographs_are_found_by_the_names_the_cameras_give() {
         assert!(views[2]["psnr"].as_f64().unwrap() < 50.0, "view 3 is not view 0");
     }
     // In one camera's folder the same name would stand for all of them.
-    refused(folder.path(), &format!("{first} photos/cam0"), 1, &["view 2", "a photograph of its own", "frame 0, view 0"]);
+    refused(
+        folder.path(),
+        &format!("{first} photos/cam0"),
+        1,
+        &["view 2", "a photograph of its own", "frame 0, view 0"],
+    );
     fs::remove_file(folder.path().join("photos/cam2/a.png")).unwrap();
     let found: Value = serde_json::from_str(&done(folder.path(), &format!("{first} photos"))).unwrap();
     let truth = &found["ground_truth"];

@@ -5,7 +5,7 @@ use std::path::Path;
 use glam::DVec3;
 use splatsieve::diagnostics::selfcheck::made::clouds::{Random, camera, plain_camera, scene, single};
 use splatsieve::diagnostics::selfcheck::oracle::picture as oracle;
-use splatsieve::model::{Camera, Columns, Gaussians, Gradients, Raw};
+use splatsieve::model::{Attributes, Camera, Gaussians, Gradients, StoredParams};
 use splatsieve::models::ModelFolder;
 use splatsieve::render::{Image, Renderer, render};
 use splatsieve::source::FrameSource;
@@ -14,7 +14,7 @@ const BACKGROUND: [f32; 3] = [0.1, 0.9, 0.4];
 
 /// The gradients of a loss whose derivative by the picture is `pull`.
 fn gradients(gaussians: &Gaussians, camera: &Camera, pull: impl FnOnce(&Image) -> Image) -> Gradients {
-    let mut gradients = Gradients::new(gaussians.len(), Columns::all(), gaussians.sh_degree());
+    let mut gradients = Gradients::new(gaussians.len(), Attributes::all(), gaussians.sh_degree());
     Renderer::new().gradient(gaussians, camera, BACKGROUND, |picture| (0.0, pull(picture)), &mut gradients);
     gradients
 }
@@ -50,11 +50,11 @@ fn derivatives_are_those_of_the_oracle_by_central_differences() {
 
         let blended = oracle::blended(&gaussians, &camera);
         let loss = |changed: &Gaussians| -> f64 {
-            let pixels = oracle::decided(changed, &camera, BACKGROUND, &blended);
+            let pixels = oracle::render_blended(changed, &camera, BACKGROUND, &blended);
             let square = |at: usize| (pixels[at / 3][at % 3] - f64::from(target[at])).powi(2);
             (0..target.len()).map(|at| 0.5 * sure[at / 3] * square(at)).sum()
         };
-        for column in Columns::all().iter() {
+        for column in Attributes::all().iter() {
             let got = found.column(column).planes();
             let mut largest: Vec<usize> = (0..got.len()).collect();
             largest.sort_by(|&a, &b| got[b].abs().total_cmp(&got[a].abs()));
@@ -112,20 +112,20 @@ fn one_gaussian_is_its_closed_form() {
             assert!(error <= tolerance, "channel {channel}, {what}: got {got}, expected {expected} ± {tolerance}");
         };
         let row = |column| found.column(column);
-        close("logit", row(Columns::OPACITY).plane(0)[0], (1.0 - opacity) * contrast * alphas);
+        close("logit", row(Attributes::OPACITY).plane(0)[0], (1.0 - opacity) * contrast * alphas);
         // Blue is cut off at 0.
         let color = if channel == 2 { 0.0 } else { splatsieve::model::SH_C0 * alphas };
-        (0..3).for_each(|c| close("sh", row(Columns::SH).plane(c)[0], if c == channel { color } else { 0.0 }));
+        (0..3).for_each(|c| close("sh", row(Attributes::SH).plane(c)[0], if c == channel { color } else { 0.0 }));
         let widths = squares.map(|square| contrast * square * seen / variance.powi(2));
-        close("scale x", row(Columns::LOG_SCALE).plane(0)[0], widths[0]);
-        close("scale y", row(Columns::LOG_SCALE).plane(1)[0], widths[1]);
+        close("scale x", row(Attributes::LOG_SCALE).plane(0)[0], widths[0]);
+        close("scale y", row(Attributes::LOG_SCALE).plane(1)[0], widths[1]);
         // Along the line of sight it has no extent; a ball looks the same however it is turned; and to either side
         // of the middle pixels are alike.
-        close("scale z", row(Columns::LOG_SCALE).plane(2)[0], 0.0);
-        (0..4).for_each(|c| close("rotation", row(Columns::ROTATION).plane(c)[0], 0.0));
-        (0..2).for_each(|c| close("position", row(Columns::POSITION).plane(c)[0], 0.0));
+        close("scale z", row(Attributes::LOG_SCALE).plane(2)[0], 0.0);
+        (0..4).for_each(|c| close("rotation", row(Attributes::ROTATION).plane(c)[0], 0.0));
+        (0..2).for_each(|c| close("position", row(Attributes::POSITION).plane(c)[0], 0.0));
         // Twice the distance is half the size.
-        close("depth", row(Columns::POSITION).plane(2)[0], -(widths[0] + widths[1]) / depth);
+        close("depth", row(Attributes::POSITION).plane(2)[0], -(widths[0] + widths[1]) / depth);
     }
 }
 
@@ -143,7 +143,7 @@ fn moving_a_picture_whole_moves_it_by_focal_over_depth() {
     let above = |red: f32| (f64::from(red) - 1.0 / 255.0).max(0.0);
     let red: f64 = picture.data.chunks_exact(3).map(|pixel| above(pixel[0])).sum();
     let expected = red * (1.0 - 0.1) * 50.0 / 2.0;
-    let got = f64::from(found.column(Columns::POSITION).plane(0)[0]);
+    let got = f64::from(found.column(Attributes::POSITION).plane(0)[0]);
     // The sum over whole pixels is the integral, but for pixels on the edge.
     assert!((got / expected - 1.0).abs() < 0.005, "got {got}, expected {expected}");
 }
@@ -164,20 +164,22 @@ fn threads_kept_buffers_and_frozen_columns_do_not_change_a_bit() {
             assert_eq!(value, 1.5);
             found
         };
-        let expected = with(&mut kept, Columns::all(), 2);
+        let expected = with(&mut kept, Attributes::all(), 2);
         for threads in [1, 2, 3] {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-            let got = pool.install(|| with(&mut Renderer::on_all_threads(), Columns::all(), 2));
+            let got = pool.install(|| with(&mut Renderer::on_all_threads(), Attributes::all(), 2));
             assert!(got == expected, "seed {seed}: {threads} threads differ from the single-thread renderer");
         }
-        for columns in [Columns::SH, Columns::POSITION | Columns::OPACITY, Columns::all(), Columns::empty()] {
+        for columns in
+            [Attributes::SH, Attributes::POSITION | Attributes::OPACITY, Attributes::all(), Attributes::empty()]
+        {
             let got = with(&mut kept, columns, 0);
             for column in columns.iter() {
                 let planes = got.column(column).planes();
                 assert!(planes == &expected.column(column).planes()[..planes.len()], "{columns:?}: {}", column.name());
                 assert!(planes.iter().any(|&x| x != 0.0));
             }
-            assert!(Columns::all().difference(columns).iter().all(|column| got.column(column).is_empty()));
+            assert!(Attributes::all().difference(columns).iter().all(|column| got.column(column).is_empty()));
         }
     }
 }
@@ -185,13 +187,13 @@ fn threads_kept_buffers_and_frozen_columns_do_not_change_a_bit() {
 #[test]
 fn pictures_add_up() {
     let (scene, views) = (scene(51, 200, 1), [camera(40, 40), camera(50, 30)]);
-    let mut both = Gradients::new(200, Columns::all(), 1);
+    let mut both = Gradients::new(200, Attributes::all(), 1);
     let mut renderer = Renderer::new();
     for camera in &views {
         renderer.gradient(&scene, camera, BACKGROUND, |picture| (0.0, picture.clone()), &mut both);
     }
     let apart = views.each_ref().map(|camera| gradients(&scene, camera, Image::clone));
-    for column in Columns::all().iter() {
+    for column in Attributes::all().iter() {
         let [first, second] = [0, 1].map(|k: usize| apart[k].column(column).planes());
         let sums = first.iter().zip(second).map(|(a, b)| a + b);
         // A position takes two parts of each picture.
@@ -199,7 +201,7 @@ fn pictures_add_up() {
         assert!(both.column(column).planes().iter().zip(sums).all(close), "{}", column.name());
     }
     both.clear();
-    assert!(both == Gradients::new(200, Columns::all(), 1));
+    assert!(both == Gradients::new(200, Attributes::all(), 1));
 }
 
 #[test]
@@ -230,14 +232,14 @@ fn extremes_give_finite_gradients_and_what_is_not_drawn_none() {
         scene.rotation.set_row(0, [1.0, 0.3, -0.2, 0.5]);
         extreme(&mut scene);
         let found = gradients(&scene, &camera, Image::clone);
-        for column in Columns::all().iter() {
+        for column in Attributes::all().iter() {
             let planes = found.column(column).planes();
             assert!(planes.iter().all(|x| x.is_finite()), "extreme {k}, {}: not finite", column.name());
             // The last three and what is too faint are not drawn.
             let of_it = (0..found.column(column).width()).all(|c| found.column(column).plane(c)[0] == 0.0);
             assert!(of_it || (k < 13 && k != 5), "extreme {k}, {}: {planes:?}", column.name());
         }
-        assert!(found.column(Columns::SH).planes().iter().any(|&x| x != 0.0), "extreme {k}: nothing is left");
+        assert!(found.column(Attributes::SH).planes().iter().any(|&x| x != 0.0), "extreme {k}: nothing is left");
     }
 }
 
@@ -248,9 +250,9 @@ fn one_gaussian_over_the_whole_picture_is_its_alpha() {
     let camera = plain_camera(40);
     let found = gradients(&wall, &camera, |_| plain_image(&camera, [1.0, 0.0, 0.0]));
     let expected = 0.6 * 0.4 * (1.0 - 0.1) * 1600.0;
-    let got = found.column(Columns::OPACITY).plane(0)[0];
+    let got = found.column(Attributes::OPACITY).plane(0)[0];
     assert!((got / expected - 1.0).abs() < 1e-5, "logit: got {got}, expected {expected}");
-    assert!(found.column(Columns::LOG_SCALE).planes().iter().all(|x| x.abs() < 1e-3), "it has no edge");
+    assert!(found.column(Attributes::LOG_SCALE).planes().iter().all(|x| x.abs() < 1e-3), "it has no edge");
 }
 
 #[test]
@@ -259,10 +261,10 @@ fn an_alpha_that_is_cut_moves_nothing_but_color() {
     wall.log_scale.set_row(0, [5.0f32; 3]);
     let camera = plain_camera(40);
     let found = gradients(&wall, &camera, |_| plain_image(&camera, [1.0; 3]));
-    for column in Columns::all().difference(Columns::SH).iter() {
+    for column in Attributes::all().difference(Attributes::SH).iter() {
         assert!(found.column(column).planes().iter().all(|&x| x == 0.0), "{} moves", column.name());
     }
-    let got = f64::from(found.column(Columns::SH).plane(0)[0]);
+    let got = f64::from(found.column(Attributes::SH).plane(0)[0]);
     let expected = splatsieve::model::SH_C0 * 0.99 * 1600.0;
     assert!((got / expected - 1.0).abs() < 1e-5, "colour: got {got}, expected {expected}");
 }
@@ -290,9 +292,9 @@ fn positions_that_are_stored_take_what_the_picture_of_a_deformed_state_takes_of_
     let model = ModelFolder::open(&root, None).unwrap().with_times(vec![0.0, 0.4, 1.0]).unwrap();
     let (deformation, frame) = (model.deformation().unwrap(), 1);
     let stored = deformation.stored();
-    let state_of = |stored: &Raw| {
+    let state_of = |stored: &StoredParams| {
         let mut state = Gaussians::zeros(0, stored.gaussians.sh_degree());
-        deformation.state(frame, stored, Columns::all(), &mut state).unwrap();
+        deformation.state(frame, stored, Attributes::all(), &mut state).unwrap();
         state
     };
     let state = state_of(stored);
@@ -310,16 +312,16 @@ fn positions_that_are_stored_take_what_the_picture_of_a_deformed_state_takes_of_
         ..*picture
     });
     let direct = found.clone();
-    deformation.jacobian(frame, stored, Columns::all()).unwrap().pull_back(&mut found);
+    deformation.jacobian(frame, stored, Attributes::all()).unwrap().pull_back(&mut found);
 
-    let loss = |stored: &Raw| -> f64 {
+    let loss = |stored: &StoredParams| -> f64 {
         // A step of the position moves other columns too, which a derivative by the position's head alone leaves out.
         let moved = Gaussians { position: state_of(stored).position, ..state.clone() };
-        let pixels = oracle::decided(&moved, &camera, BACKGROUND, &blended);
+        let pixels = oracle::render_blended(&moved, &camera, BACKGROUND, &blended);
         let square = |at: usize| (pixels[at / 3][at % 3] - f64::from(target[at])).powi(2);
         (0..target.len()).map(|at| 0.5 * sure[at / 3] * square(at)).sum()
     };
-    let got = found.column(Columns::POSITION).planes();
+    let got = found.column(Attributes::POSITION).planes();
     let mut largest: Vec<usize> = (0..got.len()).collect();
     largest.sort_by(|&a, &b| got[b].abs().total_cmp(&got[a].abs()));
     let (mut off, mut through_field) = (0, 0);
@@ -333,7 +335,7 @@ fn positions_that_are_stored_take_what_the_picture_of_a_deformed_state_takes_of_
         let expected = (losses[1] - losses[0]) / apart;
         // States are f32, and within a step some cross the edge of a texel or a ReLU.
         off += usize::from((f64::from(got[at]) - expected).abs() > 0.01 * expected.abs());
-        let alone = direct.column(Columns::POSITION).planes()[at];
+        let alone = direct.column(Attributes::POSITION).planes()[at];
         through_field += usize::from((alone - got[at]).abs() > 0.03 * got[at].abs());
     }
     assert!(off <= 3, "{off} of 60 derivatives are off");
@@ -345,5 +347,5 @@ fn empty_scenes_and_empty_pictures_are_valid() {
     assert!(gradients(&Gaussians::zeros(0, 1), &plain_camera(17), Image::clone).is_empty());
     let nothing = Camera { width: 0, height: 0, ..plain_camera(16) };
     let found = gradients(&single(2.0, 0.1, 0.5), &nothing, Image::clone);
-    assert!(found == Gradients::new(1, Columns::all(), 0));
+    assert!(found == Gradients::new(1, Attributes::all(), 0));
 }

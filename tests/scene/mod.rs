@@ -12,7 +12,7 @@ use std::process::{self, ChildStdin, Output, Stdio};
 use std::thread;
 
 use assert_cmd::Command;
-use splatsieve::model::{Columns, Gaussians};
+use splatsieve::model::{Attributes, Gaussians};
 use splatsieve::passes::gather;
 use splatsieve::scene::{InputOptions, Scene, open_scene};
 use splatsieve::source::FrameSource;
@@ -84,13 +84,13 @@ pub(crate) fn scene(model: &Path) -> Scene {
 /// Returns all attributes of every Gaussian at `frame`.
 pub(crate) fn state(source: &dyn FrameSource, frame: usize) -> Gaussians {
     let ids: Vec<u32> = (0..source.info().count as u32).collect();
-    gather(source, &ids, frame, Columns::all()).unwrap()
+    gather(source, &ids, frame, Attributes::all()).unwrap()
 }
 
 /// Returns all values of row `i` as bits, attribute by attribute.
 pub(crate) fn bits(state: &Gaussians, i: usize) -> Vec<u32> {
-    let planes = |column: Columns| (0..state.column(column).width()).map(move |c| (column, c));
-    Columns::all().iter().flat_map(planes).map(|(column, c)| state.column(column).plane(c)[i].to_bits()).collect()
+    let planes = |column: Attributes| (0..state.column(column).width()).map(move |c| (column, c));
+    Attributes::all().iter().flat_map(planes).map(|(column, c)| state.column(column).plane(c)[i].to_bits()).collect()
 }
 
 /// Temporary folder in which tests run the program and write files.
@@ -286,14 +286,14 @@ pub(crate) fn arrays(path: &Path) -> BTreeMap<String, Vec<f64>> {
 
 /// Returns a preset that scores by projected coverage and uses no renders, so that formulas alone decide.
 pub(crate) fn by_formula(preset: &str) -> splatsieve::recipe::Recipe {
-    use splatsieve::model::Columns;
-    use splatsieve::recipe::{AttributeGroups, Coverage, Precision, Recipe, StaticTerm, WhichBands};
+    use splatsieve::model::Attributes;
+    use splatsieve::recipe::{AttributeGroups, Coverage, Precision, Recipe, ShDegreeRule, StaticTerm};
     let mut recipe = Recipe::preset(preset).unwrap();
     recipe.scan.coverage = Coverage::Projected;
     recipe.score.static_term = StaticTerm::Mean;
     recipe.select.choose_by_views = false;
-    recipe.refine.refine = AttributeGroups(Columns::empty());
+    recipe.refine.refine = AttributeGroups(Attributes::empty());
     recipe.field.field = Precision::Exact;
-    recipe.bands.bands = WhichBands::All;
+    recipe.bands.bands = ShDegreeRule::All;
     recipe
 }

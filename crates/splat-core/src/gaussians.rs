@@ -8,16 +8,16 @@ use super::sh_coefficients;
 /// Values of one attribute of `len` Gaussians: `width` planes, where plane `c` holds component `c` of every Gaussian.
 /// The plane layout keeps the inner loops of projection and statistics contiguous in memory.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
-pub struct Column {
+pub struct AttributeValues {
     width: usize,
     len: usize,
     data: Vec<f32>,
 }
 
-impl Column {
+impl AttributeValues {
     /// Creates `width × len` zeros.
     pub fn zeros(width: usize, len: usize) -> Self {
-        Column { width, len, data: vec![0.0; width * len] }
+        AttributeValues { width, len, data: vec![0.0; width * len] }
     }
 
     /// Creates an attribute from its planes, one after the other: `[width, len]`.
@@ -26,7 +26,7 @@ impl Column {
     /// If the length of `data` is not a multiple of `width`.
     pub fn from_planes(width: usize, data: Vec<f32>) -> Self {
         assert!(data.len().is_multiple_of(width), "{} values are not {width} planes", data.len());
-        Column { width, len: data.len() / width, data }
+        AttributeValues { width, len: data.len() / width, data }
     }
 
     /// Returns the number of components per Gaussian.
@@ -82,9 +82,9 @@ impl Column {
     }
 
     /// Returns the values of the Gaussians `rows`, in that order.
-    pub fn pick(&self, rows: &[u32]) -> Column {
+    pub fn pick(&self, rows: &[u32]) -> AttributeValues {
         let data = (0..self.width).flat_map(|c| rows.iter().map(move |&i| self.plane(c)[i as usize])).collect();
-        Column { width: self.width, len: rows.len(), data }
+        AttributeValues { width: self.width, len: rows.len(), data }
     }
 
     /// Writes the first `W` components of Gaussian `i`.
@@ -102,26 +102,26 @@ impl Column {
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct Gaussians {
     /// Position `[3]`, scene units.
-    pub position: Column,
+    pub position: AttributeValues,
     /// Rotation `[4]`: wxyz quaternion of any length.
-    pub rotation: Column,
+    pub rotation: AttributeValues,
     /// Natural logarithm of the scales `[3]`; scales are in scene units.
-    pub log_scale: Column,
+    pub log_scale: AttributeValues,
     /// Logit of the opacity `[1]`.
-    pub opacity_logit: Column,
+    pub opacity_logit: AttributeValues,
     /// SH coefficients `[3·(degree + 1)²]`.
-    pub sh: Column,
+    pub sh: AttributeValues,
 }
 
 impl Gaussians {
     /// Creates `len` Gaussians whose values are all zero.
     pub fn zeros(len: usize, sh_degree: usize) -> Self {
         Gaussians {
-            position: Column::zeros(3, len),
-            rotation: Column::zeros(4, len),
-            log_scale: Column::zeros(3, len),
-            opacity_logit: Column::zeros(1, len),
-            sh: Column::zeros(3 * sh_coefficients(sh_degree), len),
+            position: AttributeValues::zeros(3, len),
+            rotation: AttributeValues::zeros(4, len),
+            log_scale: AttributeValues::zeros(3, len),
+            opacity_logit: AttributeValues::zeros(1, len),
+            sh: AttributeValues::zeros(3 * sh_coefficients(sh_degree), len),
         }
     }
 
@@ -141,13 +141,13 @@ impl Gaussians {
     }
 
     /// Drops the SH coefficients above degree `sh_degree`.
-    pub fn drop_bands(&mut self, sh_degree: usize) {
+    pub fn truncate_sh(&mut self, sh_degree: usize) {
         self.sh.narrow(3 * sh_coefficients(sh_degree.min(self.sh_degree())));
     }
 
     /// Resizes to `len` Gaussians. The values are unspecified until written.
     pub fn resize(&mut self, len: usize) {
-        for column in Columns::all().iter() {
+        for column in Attributes::all().iter() {
             self.column_mut(column).resize(len);
         }
     }
@@ -169,7 +169,7 @@ impl Gaussians {
     /// # Panics
     /// If these rows do not exist.
     pub fn write_rows(&mut self, first: usize, block: &Gaussians) {
-        for column in Columns::all().iter() {
+        for column in Attributes::all().iter() {
             let (from, to) = (block.column(column), self.column_mut(column));
             for c in 0..to.width() {
                 to.plane_mut(c)[first..][..from.len()].copy_from_slice(from.plane(c));
@@ -181,35 +181,35 @@ impl Gaussians {
     ///
     /// # Panics
     /// If `which` is not exactly one attribute.
-    pub fn column(&self, which: Columns) -> &Column {
+    pub fn column(&self, which: Attributes) -> &AttributeValues {
         match which {
-            Columns::POSITION => &self.position,
-            Columns::ROTATION => &self.rotation,
-            Columns::LOG_SCALE => &self.log_scale,
-            Columns::OPACITY => &self.opacity_logit,
-            Columns::SH => &self.sh,
+            Attributes::POSITION => &self.position,
+            Attributes::ROTATION => &self.rotation,
+            Attributes::LOG_SCALE => &self.log_scale,
+            Attributes::OPACITY => &self.opacity_logit,
+            Attributes::SH => &self.sh,
             _ => panic!("one column expected, {which:?} given"),
         }
     }
 
-    /// Returns the values of the attributes `which` for writing, in the order of [`Columns::all`].
-    pub fn columns_mut(&mut self, which: Columns) -> impl Iterator<Item = &mut Column> {
+    /// Returns the values of the attributes `which` for writing, in the order of [`Attributes::all`].
+    pub fn columns_mut(&mut self, which: Attributes) -> impl Iterator<Item = &mut AttributeValues> {
         let Gaussians { position, rotation, log_scale, opacity_logit, sh } = self;
         let all = [position, rotation, log_scale, opacity_logit, sh];
-        Columns::all().iter().zip(all).filter(move |(column, _)| which.contains(*column)).map(|(_, column)| column)
+        Attributes::all().iter().zip(all).filter(move |(column, _)| which.contains(*column)).map(|(_, column)| column)
     }
 
     /// Returns the values of a single attribute for writing.
     ///
     /// # Panics
     /// If `which` is not exactly one attribute.
-    pub fn column_mut(&mut self, which: Columns) -> &mut Column {
+    pub fn column_mut(&mut self, which: Attributes) -> &mut AttributeValues {
         match which {
-            Columns::POSITION => &mut self.position,
-            Columns::ROTATION => &mut self.rotation,
-            Columns::LOG_SCALE => &mut self.log_scale,
-            Columns::OPACITY => &mut self.opacity_logit,
-            Columns::SH => &mut self.sh,
+            Attributes::POSITION => &mut self.position,
+            Attributes::ROTATION => &mut self.rotation,
+            Attributes::LOG_SCALE => &mut self.log_scale,
+            Attributes::OPACITY => &mut self.opacity_logit,
+            Attributes::SH => &mut self.sh,
             _ => panic!("one column expected, {which:?} given"),
         }
     }
@@ -218,7 +218,7 @@ impl Gaussians {
 bitflags! {
     /// Set of attributes, in storage order from bit 0. Frame streams contain these bits.
     #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-    pub struct Columns: u32 {
+    pub struct Attributes: u32 {
         /// Position.
         const POSITION = 1;
         /// Rotation.
@@ -232,13 +232,13 @@ bitflags! {
     }
 }
 
-impl Columns {
+impl Attributes {
     /// Returns the number of components per Gaussian, summed over the attributes of the set, for SH degree `sh_degree`.
     pub fn width(self, sh_degree: usize) -> usize {
-        let components = |column: Columns| match column {
-            Columns::OPACITY => 1,
-            Columns::ROTATION => 4,
-            Columns::SH => 3 * sh_coefficients(sh_degree),
+        let components = |column: Attributes| match column {
+            Attributes::OPACITY => 1,
+            Attributes::ROTATION => 4,
+            Attributes::SH => 3 * sh_coefficients(sh_degree),
             _ => 3,
         };
         self.iter().map(components).sum()
@@ -247,11 +247,11 @@ impl Columns {
     /// Returns the name of a single attribute in containers and messages.
     pub fn name(self) -> &'static str {
         match self {
-            Columns::POSITION => "position",
-            Columns::ROTATION => "rotation",
-            Columns::LOG_SCALE => "log_scale",
-            Columns::OPACITY => "opacity_logit",
-            Columns::SH => "sh",
+            Attributes::POSITION => "position",
+            Attributes::ROTATION => "rotation",
+            Attributes::LOG_SCALE => "log_scale",
+            Attributes::OPACITY => "opacity_logit",
+            Attributes::SH => "sh",
             _ => "several columns",
         }
     }

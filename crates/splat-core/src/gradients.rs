@@ -2,7 +2,7 @@
 
 use std::ops::Range;
 
-use super::{Column, Columns, Gaussians};
+use super::{AttributeValues, Attributes, Gaussians};
 
 /// Derivatives ∂L/∂value of the stored values of N Gaussians: f32 sums in the layout of [`Gaussians`].
 ///
@@ -11,7 +11,7 @@ use super::{Column, Columns, Gaussians};
 #[derive(Debug, Clone, PartialEq)]
 pub struct Gradients {
     len: usize,
-    columns: Columns,
+    columns: Attributes,
     /// Sums of the derivatives. Attributes that are not differentiated have no rows.
     sums: Gaussians,
 }
@@ -19,7 +19,7 @@ pub struct Gradients {
 impl Gradients {
     /// Creates zero derivatives for the attributes `columns` of `len` Gaussians, with SH coefficients up to
     /// `sh_degree`.
-    pub fn new(len: usize, columns: Columns, sh_degree: usize) -> Self {
+    pub fn new(len: usize, columns: Attributes, sh_degree: usize) -> Self {
         let mut sums = Gaussians::zeros(0, sh_degree);
         sums.columns_mut(columns).for_each(|column| column.resize(len));
         Gradients { len, columns, sums }
@@ -36,7 +36,7 @@ impl Gradients {
     }
 
     /// Returns the attributes that are differentiated.
-    pub fn columns(&self) -> Columns {
+    pub fn columns(&self) -> Attributes {
         self.columns
     }
 
@@ -44,7 +44,7 @@ impl Gradients {
     ///
     /// # Panics
     /// If `which` is not exactly one attribute.
-    pub fn column(&self, which: Columns) -> &Column {
+    pub fn column(&self, which: Attributes) -> &AttributeValues {
         self.sums.column(which)
     }
 
@@ -52,7 +52,7 @@ impl Gradients {
     ///
     /// # Panics
     /// If `which` is not exactly one attribute.
-    pub fn column_mut(&mut self, which: Columns) -> &mut Column {
+    pub fn column_mut(&mut self, which: Attributes) -> &mut AttributeValues {
         self.sums.column_mut(which)
     }
 
@@ -85,7 +85,7 @@ impl Gradients {
         let ids = (0..self.len).step_by(len).map(|first| first..self.len.min(first + len));
         let mut spans: Vec<GradientSpan<'_>> =
             ids.map(|ids| GradientSpan { ids, columns: self.columns, planes: Default::default() }).collect();
-        for (index, column) in self.sums.columns_mut(Columns::all()).enumerate() {
+        for (index, column) in self.sums.columns_mut(Attributes::all()).enumerate() {
             // An attribute without rows has no planes.
             for plane in column.planes_mut().chunks_exact_mut(self.len.max(1)) {
                 spans.iter_mut().zip(plane.chunks_mut(len)).for_each(|(span, part)| span.planes[index].push(part));
@@ -99,8 +99,8 @@ impl Gradients {
 #[derive(Debug)]
 pub struct GradientSpan<'a> {
     ids: Range<usize>,
-    columns: Columns,
-    /// Planes of each attribute, in the order of [`Columns::all`]. Attributes that are not differentiated have none.
+    columns: Attributes,
+    /// Planes of each attribute, in the order of [`Attributes::all`]. Attributes that are not differentiated have none.
     planes: [Vec<&'a mut [f32]>; 5],
 }
 
@@ -111,13 +111,13 @@ impl<'a> GradientSpan<'a> {
     }
 
     /// Returns the attributes that are differentiated.
-    pub fn columns(&self) -> Columns {
+    pub fn columns(&self) -> Attributes {
         self.columns
     }
 
     /// Returns the sums of a single attribute, one plane per component. Returns no planes if the attribute is not
     /// differentiated.
-    pub fn planes(&mut self, column: Columns) -> &mut [&'a mut [f32]] {
+    pub fn planes(&mut self, column: Attributes) -> &mut [&'a mut [f32]] {
         &mut self.planes[column.bits().trailing_zeros() as usize]
     }
 
@@ -129,7 +129,7 @@ impl<'a> GradientSpan<'a> {
     /// # Panics
     /// If `first` lies before the span, or beyond the index that follows its last Gaussian.
     #[inline(always)]
-    pub fn add(&mut self, column: Columns, component: usize, first: usize, parts: impl IntoIterator<Item = f32>) {
+    pub fn add(&mut self, column: Attributes, component: usize, first: usize, parts: impl IntoIterator<Item = f32>) {
         let start = first - self.ids.start;
         let Some(plane) = self.planes(column).get_mut(component) else { return };
         for (sum, part) in plane[start..].iter_mut().zip(parts) {
@@ -145,31 +145,31 @@ mod tests {
 
     #[test]
     fn spans_cover_every_differentiated_sum_once() {
-        let columns = Columns::POSITION | Columns::SH;
+        let columns = Attributes::POSITION | Attributes::SH;
         for (len, span) in [(0, 3), (1, 3), (7, 3), (6, 3), (5, 100)] {
             let mut gradients = Gradients::new(len, columns, 1);
             for mut span in gradients.spans(span) {
                 let ids = span.ids();
                 for c in 0..48 {
-                    for column in [Columns::POSITION, Columns::ROTATION, Columns::SH] {
+                    for column in [Attributes::POSITION, Attributes::ROTATION, Attributes::SH] {
                         span.add(column, c, ids.start, vec![c as f32; ids.len()]);
                     }
                 }
             }
-            assert!(gradients.column(Columns::ROTATION).is_empty());
+            assert!(gradients.column(Attributes::ROTATION).is_empty());
             for id in 0..len {
-                assert_eq!(gradients.column(Columns::POSITION).row(id), [0.0, 1.0, 2.0]);
-                assert_eq!(gradients.column(Columns::SH).row::<12>(id), std::array::from_fn(|c| c as f32));
+                assert_eq!(gradients.column(Attributes::POSITION).row(id), [0.0, 1.0, 2.0]);
+                assert_eq!(gradients.column(Attributes::SH).row::<12>(id), std::array::from_fn(|c| c as f32));
             }
         }
     }
 
     #[test]
     fn parts_that_overflow_f32_are_skipped() {
-        let mut gradients = Gradients::new(1, Columns::OPACITY, 0);
+        let mut gradients = Gradients::new(1, Attributes::OPACITY, 0);
         for part in [3e38, f32::NAN, 3e38, f32::NEG_INFINITY, -1e38] {
-            gradients.spans(1)[0].add(Columns::OPACITY, 0, 0, [part]);
+            gradients.spans(1)[0].add(Attributes::OPACITY, 0, 0, [part]);
         }
-        assert_eq!(gradients.column(Columns::OPACITY).plane(0), [3e38f32 - 1e38]);
+        assert_eq!(gradients.column(Attributes::OPACITY).plane(0), [3e38f32 - 1e38]);
     }
 }

@@ -1,6 +1,6 @@
 //! Derivative of a frame state with respect to the stored attributes.
 
-use super::{Column, Columns, Gaussians, Gradients};
+use super::{AttributeValues, Attributes, Gaussians, Gradients};
 
 /// Derivatives ∂state/∂stored of N Gaussians at one frame. The stored values of an attribute change only the state of
 /// the same attribute.
@@ -10,11 +10,11 @@ use super::{Column, Columns, Gaussians, Gradients};
 /// state component i / ∂ stored component j.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Jacobian {
-    columns: [Column; 5],
+    columns: [AttributeValues; 5],
 }
 
-/// Returns the index of a single attribute in the order of [`Columns::all`].
-fn attribute_index(column: Columns) -> usize {
+/// Returns the index of a single attribute in the order of [`Attributes::all`].
+fn attribute_index(column: Attributes) -> usize {
     column.bits().trailing_zeros() as usize
 }
 
@@ -24,28 +24,29 @@ impl Jacobian {
 
     /// Returns the derivatives of a single attribute. The width is 0 if state and stored values change by the same
     /// amount.
-    pub fn column(&self, which: Columns) -> &Column {
+    pub fn column(&self, which: Attributes) -> &AttributeValues {
         &self.columns[attribute_index(which)]
     }
 
     /// Returns the derivatives of a single attribute for writing.
-    pub fn column_mut(&mut self, which: Columns) -> &mut Column {
+    pub fn column_mut(&mut self, which: Attributes) -> &mut AttributeValues {
         &mut self.columns[attribute_index(which)]
     }
 
-    /// Returns the derivatives of all attributes, in the order of [`Columns::all`].
-    pub fn columns(&self) -> &[Column; 5] {
+    /// Returns the derivatives of all attributes, in the order of [`Attributes::all`].
+    pub fn columns(&self) -> &[AttributeValues; 5] {
         &self.columns
     }
 
     /// Returns the derivatives of all attributes for writing.
-    pub fn columns_mut(&mut self) -> &mut [Column; 5] {
+    pub fn columns_mut(&mut self) -> &mut [AttributeValues; 5] {
         &mut self.columns
     }
 
     /// Returns the derivatives of the Gaussians at `rows`, in that order.
     pub fn pick(&self, rows: &[u32]) -> Jacobian {
-        let picked = |column: &Column| if column.width() > 0 { column.pick(rows) } else { Column::default() };
+        let picked =
+            |column: &AttributeValues| if column.width() > 0 { column.pick(rows) } else { AttributeValues::default() };
         Jacobian { columns: self.columns.each_ref().map(picked) }
     }
 
@@ -57,7 +58,7 @@ impl Jacobian {
             if width == 0 {
                 continue;
             }
-            *to = Column::zeros(width, len);
+            *to = AttributeValues::zeros(width, len);
             for c in 0..width {
                 let mut rest = to.plane_mut(c);
                 for part in blocks.iter().map(|block| &block.columns[index]) {
@@ -75,7 +76,7 @@ impl Jacobian {
     /// Changes only attributes of which `change` has rows. If `change` has a lower SH degree than `state`, the higher
     /// SH coefficients stay unchanged.
     pub fn add_to(&self, change: &Gaussians, state: &mut Gaussians) {
-        for which in Columns::all().iter() {
+        for which in Attributes::all().iter() {
             let (factors, delta, to) = (self.column(which), change.column(which), state.column_mut(which));
             if delta.is_empty() {
                 continue;
@@ -132,13 +133,13 @@ mod tests {
     use super::*;
 
     /// Fills a column with a low-discrepancy sequence in [−0.5, 0.5), which serves as noise.
-    fn fill_with_noise(column: &mut Column, step: f32) {
+    fn fill_with_noise(column: &mut AttributeValues, step: f32) {
         column.planes_mut().iter_mut().enumerate().for_each(|(k, x)| *x = (k as f32 * step).fract() - 0.5);
     }
 
     fn noisy_gaussians(len: usize, step: f32) -> Gaussians {
         let mut filled = Gaussians::zeros(len, 1);
-        filled.columns_mut(Columns::all()).for_each(|column| fill_with_noise(column, step));
+        filled.columns_mut(Attributes::all()).for_each(|column| fill_with_noise(column, step));
         filled
     }
 
@@ -146,8 +147,8 @@ mod tests {
     /// others.
     fn jacobian(len: usize) -> Jacobian {
         let mut filled = Jacobian::default();
-        for (which, width) in [(Columns::POSITION, 9), (Columns::ROTATION, 16), (Columns::OPACITY, 1)] {
-            *filled.column_mut(which) = Column::zeros(width, len);
+        for (which, width) in [(Attributes::POSITION, 9), (Attributes::ROTATION, 16), (Attributes::OPACITY, 1)] {
+            *filled.column_mut(which) = AttributeValues::zeros(width, len);
             fill_with_noise(filled.column_mut(which), 0.618_034);
         }
         filled
@@ -158,15 +159,15 @@ mod tests {
         let (jacobian, change) = (jacobian(11), noisy_gaussians(11, 0.754_878));
         let mut state = Gaussians::zeros(11, 1);
         jacobian.add_to(&change, &mut state);
-        let mut gradients = Gradients::new(11, Columns::all(), 1);
-        Columns::all().iter().for_each(|which| fill_with_noise(gradients.column_mut(which), 0.569_84));
-        let dot = |a: &Column, b: &Column| -> f64 {
+        let mut gradients = Gradients::new(11, Attributes::all(), 1);
+        Attributes::all().iter().for_each(|which| fill_with_noise(gradients.column_mut(which), 0.569_84));
+        let dot = |a: &AttributeValues, b: &AttributeValues| -> f64 {
             a.planes().iter().zip(b.planes()).map(|(a, b)| f64::from(*a) * f64::from(*b)).sum()
         };
-        let expected = Columns::all().iter().map(|which| dot(gradients.column(which), state.column(which)));
+        let expected = Attributes::all().iter().map(|which| dot(gradients.column(which), state.column(which)));
         let expected: Vec<f64> = expected.collect();
         jacobian.pull_back(&mut gradients);
-        for (which, expected) in Columns::all().iter().zip(expected) {
+        for (which, expected) in Attributes::all().iter().zip(expected) {
             let got = dot(gradients.column(which), change.column(which));
             assert!((got - expected).abs() < 1e-5, "{}: got {got}, expected {expected}", which.name());
         }
@@ -175,7 +176,7 @@ mod tests {
     #[test]
     fn add_to_changes_only_the_given_attributes_and_degrees() {
         let (mut change, mut state) = (Gaussians::zeros(0, 0), noisy_gaussians(5, 0.3));
-        change.sh = Column::from_planes(3, vec![1.0; 15]);
+        change.sh = AttributeValues::from_planes(3, vec![1.0; 15]);
         let before = state.clone();
         jacobian(5).add_to(&change, &mut state);
         assert_eq!(state.sh.plane(2)[4], before.sh.plane(2)[4] + 1.0);
@@ -186,13 +187,13 @@ mod tests {
     #[test]
     fn pulled_back_values_that_are_not_finite_become_zero() {
         let mut jacobian = jacobian(2);
-        jacobian.column_mut(Columns::POSITION).planes_mut()[0] = f32::MAX;
-        jacobian.column_mut(Columns::OPACITY).planes_mut()[0] = f32::MAX;
-        let mut gradients = Gradients::new(2, Columns::all(), 0);
-        Columns::all().iter().for_each(|which| gradients.column_mut(which).planes_mut().fill(3.0));
+        jacobian.column_mut(Attributes::POSITION).planes_mut()[0] = f32::MAX;
+        jacobian.column_mut(Attributes::OPACITY).planes_mut()[0] = f32::MAX;
+        let mut gradients = Gradients::new(2, Attributes::all(), 0);
+        Attributes::all().iter().for_each(|which| gradients.column_mut(which).planes_mut().fill(3.0));
         jacobian.pull_back(&mut gradients);
-        assert_eq!(gradients.column(Columns::POSITION).plane(0)[0], 0.0);
-        assert_eq!(gradients.column(Columns::OPACITY).plane(0)[0], 0.0);
-        assert_ne!(gradients.column(Columns::OPACITY).plane(0)[1], 0.0);
+        assert_eq!(gradients.column(Attributes::POSITION).plane(0)[0], 0.0);
+        assert_eq!(gradients.column(Attributes::OPACITY).plane(0)[0], 0.0);
+        assert_ne!(gradients.column(Attributes::OPACITY).plane(0)[1], 0.0);
     }
 }

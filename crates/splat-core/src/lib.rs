@@ -32,16 +32,16 @@ mod schedule;
 use crate::error::{Error, Result};
 pub use camera::Camera;
 pub use covariance::scale_rotation;
-pub use gaussians::{Column, Columns, Gaussians};
+pub use gaussians::{AttributeValues, Attributes, Gaussians};
 pub use gradients::{GradientSpan, Gradients};
 pub use hash::hash_id;
 pub use jacobian::Jacobian;
 pub use ranges::ranges;
-pub use raw::Raw;
+pub use raw::StoredParams;
 pub use rig::{Rig, Shot, Split};
 pub use robust_box::RobustBox;
-pub use rows::{Flags, Rows, Statistic, Values};
-pub use schedule::{Picture, Schedule};
+pub use rows::{Flags, Rows, Statistic, StatisticAccess};
+pub use schedule::{FrameView, ViewSchedule};
 
 /// Constant of the spherical-harmonic basis function of degree 0: color = 0.5 + SH_C0 · f_dc.
 pub const SH_C0: f64 = 0.282_094_791_773_878_14;
@@ -72,10 +72,10 @@ pub const fn sh_coefficients(degree: usize) -> usize {
 }
 
 /// Highest SH degree that renderers support.
-pub const HIGHEST_DEGREE: usize = 3;
+pub const MAX_SH_DEGREE: usize = 3;
 
 /// Value of an SH degree limit that keeps all coefficients.
-pub const ALL_HARMONICS: usize = usize::MAX;
+pub const NO_SH_LIMIT: usize = usize::MAX;
 
 /// Properties of a sequence that are known before any frame is read.
 #[derive(Debug, Clone, PartialEq)]
@@ -87,7 +87,7 @@ pub struct SequenceInfo {
     /// SH degree, 0 to 3.
     pub sh_degree: usize,
     /// Attributes that may differ between frames. All others have the same values in every frame.
-    pub varying: Columns,
+    pub varying: Attributes,
 }
 
 impl SequenceInfo {

@@ -2,19 +2,19 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{Column, Columns, Gaussians};
+use super::{AttributeValues, Attributes, Gaussians};
 
 /// Stored parameters of N Gaussians of a model whose frames all follow from them.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
-pub struct Raw {
+pub struct StoredParams {
     /// Attributes that every model format has, in stored encoding.
     pub gaussians: Gaussians,
     /// Further parameters of the model format (velocities, time windows, features), as planes in an order of the
     /// format. Width 0 if there are none.
-    pub own: Column,
+    pub own: AttributeValues,
 }
 
-impl Raw {
+impl StoredParams {
     /// Returns the number of Gaussians.
     pub fn len(&self) -> usize {
         self.gaussians.len()
@@ -26,28 +26,28 @@ impl Raw {
     }
 
     /// Returns the parameters of the Gaussians `rows`, in that order.
-    pub fn pick(&self, rows: &[u32]) -> Raw {
-        Raw { gaussians: self.gaussians.pick(rows), own: self.own.pick(rows) }
+    pub fn pick(&self, rows: &[u32]) -> StoredParams {
+        StoredParams { gaussians: self.gaussians.pick(rows), own: self.own.pick(rows) }
     }
 
     /// Copies the parameters of Gaussian `row` of `from` to Gaussian `to`. `from` has at least as many values per
     /// Gaussian.
-    pub fn set_row(&mut self, to: usize, from: &Raw, row: usize) {
-        let set = |column: &mut Column, from: &Column| {
+    pub fn set_row(&mut self, to: usize, from: &StoredParams, row: usize) {
+        let set = |column: &mut AttributeValues, from: &AttributeValues| {
             (0..column.width()).for_each(|c| column.plane_mut(c)[to] = from.plane(c)[row]);
         };
-        for column in Columns::all().iter() {
+        for column in Attributes::all().iter() {
             set(self.gaussians.column_mut(column), from.gaussians.column(column));
         }
         set(&mut self.own, &from.own);
     }
 }
 
-impl From<Gaussians> for Raw {
+impl From<Gaussians> for StoredParams {
     /// Creates the parameters of a model format that has no further parameters.
-    fn from(gaussians: Gaussians) -> Raw {
-        let own = Column::zeros(0, gaussians.len());
-        Raw { gaussians, own }
+    fn from(gaussians: Gaussians) -> StoredParams {
+        let own = AttributeValues::zeros(0, gaussians.len());
+        StoredParams { gaussians, own }
     }
 }
 
@@ -57,8 +57,8 @@ mod tests {
 
     #[test]
     fn pick_and_set_row_copy_all_parameters() {
-        let mut raw = Raw { gaussians: Gaussians::zeros(3, 1), own: Column::zeros(2, 3) };
-        raw.gaussians.columns_mut(Columns::all()).for_each(|column| {
+        let mut raw = StoredParams { gaussians: Gaussians::zeros(3, 1), own: AttributeValues::zeros(2, 3) };
+        raw.gaussians.columns_mut(Attributes::all()).for_each(|column| {
             column.planes_mut().iter_mut().enumerate().for_each(|(k, x)| *x = k as f32);
         });
         raw.own.set_row(2, [7.0, 8.0]);
@@ -70,7 +70,7 @@ mod tests {
         let mut other = raw.clone();
         other.set_row(1, &picked, 0);
         assert_eq!(other.pick(&[1]), raw.pick(&[2]));
-        let plain = Raw::from(raw.gaussians.clone()).pick(&[1]);
+        let plain = StoredParams::from(raw.gaussians.clone()).pick(&[1]);
         assert_eq!((plain.own.width(), plain.own.len(), plain.gaussians), (0, 1, raw.gaussians.pick(&[1])));
     }
 }

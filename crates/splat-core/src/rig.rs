@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 
 use super::camera::Camera;
-use super::schedule::{Picture, Schedule};
+use super::schedule::{FrameView, ViewSchedule};
 use crate::error::{Error, Result};
 
 /// Part of a data set.
@@ -54,11 +54,11 @@ const TIME_TOLERANCE: f64 = 1e-6;
 
 impl Rig {
     /// Bytes per distinct camera: the camera, its copy in a schedule, and an entry in a table during reading.
-    pub const CAMERA_BYTES: u64 = 2 * size_of::<Camera>() as u64 + 16;
+    pub const BYTES_PER_CAMERA: u64 = 2 * size_of::<Camera>() as u64 + 16;
 
     /// Bytes per view without its camera and file name: the view, entries in two tables during reading, and three times
     /// its entry in a schedule.
-    pub const SHOT_BYTES: u64 = size_of::<Shot>() as u64 + 32 + 3 * 40;
+    pub const BYTES_PER_VIEW: u64 = size_of::<Shot>() as u64 + 32 + 3 * 40;
 
     /// Bytes per file name beside its text, for the allocator.
     pub const NAME_BYTES: u64 = 32;
@@ -67,7 +67,7 @@ impl Rig {
     pub fn bytes(&self) -> u64 {
         let names = self.shots.iter().filter_map(|shot| shot.image.as_ref());
         let names: u64 = names.map(|image| image.as_os_str().len() as u64 + Rig::NAME_BYTES).sum();
-        Rig::CAMERA_BYTES * self.cameras.len() as u64 + Rig::SHOT_BYTES * self.shots.len() as u64 + names
+        Rig::BYTES_PER_CAMERA * self.cameras.len() as u64 + Rig::BYTES_PER_VIEW * self.shots.len() as u64 + names
     }
 
     /// Returns the distinct times of all views, increasing. Empty if no view has a time.
@@ -102,7 +102,7 @@ impl Rig {
     ///
     /// # Errors
     /// [`Error::Usage`] if no frame has the time of a view.
-    pub fn schedule(&self, frame_times: &[f64], split: Option<Split>) -> Result<Schedule> {
+    pub fn schedule(&self, frame_times: &[f64], split: Option<Split>) -> Result<ViewSchedule> {
         let (mut timed, mut timeless) = (Vec::new(), Vec::new());
         for (place, shot) in self.shots.iter().enumerate() {
             if split.is_none_or(|split| split == shot.split) {
@@ -117,7 +117,7 @@ impl Rig {
             places.sort_unstable();
             places.iter().map(|&place| (self.shots[place].view, self.shots[place].camera)).collect()
         };
-        let mut schedule = Schedule::new(self.cameras.clone());
+        let mut schedule = ViewSchedule::new(self.cameras.clone());
         for of_one_frame in timed.chunk_by(|a, b| a.0 == b.0) {
             schedule.push(of_one_frame[0].0 - schedule.frames(), &views_of(timeless.clone()));
             schedule.push(
@@ -144,7 +144,7 @@ impl Rig {
 
     /// Returns the path of the photograph of `picture`, if the camera file names one. `frame_times` as in
     /// [`Rig::schedule`].
-    pub fn image(&self, picture: Picture, frame_times: &[f64]) -> Option<&Path> {
+    pub fn image(&self, picture: FrameView, frame_times: &[f64]) -> Option<&Path> {
         let shows = |shot: &&Shot| {
             let frame = || self.frame_of(shot, frame_times).ok();
             (shot.view, shot.camera) == (picture.view, picture.camera)

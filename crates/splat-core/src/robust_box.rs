@@ -2,7 +2,7 @@
 
 use glam::DVec3;
 
-use crate::Column;
+use crate::AttributeValues;
 
 /// Box between the 1st and the 99th percentile of the positions along each axis. A few floaters do not enlarge it.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -18,7 +18,7 @@ pub struct RobustBox {
 impl RobustBox {
     /// Computes the box of `position` (`[3, N]`). Percentiles are nearest ranks over the finite values. An axis without
     /// finite values gets 0.
-    pub fn from_positions(position: &Column) -> RobustBox {
+    pub fn from_positions(position: &AttributeValues) -> RobustBox {
         let mut found = RobustBox { low: DVec3::ZERO, middle: DVec3::ZERO, high: DVec3::ZERO };
         for axis in 0..3 {
             let mut values: Vec<f32> = position.plane(axis).iter().copied().filter(|x| x.is_finite()).collect();
@@ -49,7 +49,7 @@ mod tests {
 
     #[test]
     fn floaters_and_nan_do_not_enlarge_the_box() {
-        let mut position = Column::zeros(3, 1000);
+        let mut position = AttributeValues::zeros(3, 1000);
         for i in 0..1000 {
             position.set_row(i, [i as f32, 2.0, -(i as f32)]);
         }
@@ -62,7 +62,7 @@ mod tests {
 
     #[test]
     fn extent_of_an_empty_or_flat_scene_is_one() {
-        assert_eq!(RobustBox::from_positions(&Column::zeros(3, 0)).extent(), 1.0);
-        assert_eq!(RobustBox::from_positions(&Column::zeros(3, 7)).extent(), 1.0);
+        assert_eq!(RobustBox::from_positions(&AttributeValues::zeros(3, 0)).extent(), 1.0);
+        assert_eq!(RobustBox::from_positions(&AttributeValues::zeros(3, 7)).extent(), 1.0);
     }
 }

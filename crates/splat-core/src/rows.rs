@@ -44,7 +44,7 @@ pub enum Statistic {
 
 /// Accessors of the array of a statistic, by value type: for reading and for writing.
 #[derive(Debug, Clone, Copy)]
-pub enum Values {
+pub enum StatisticAccess {
     /// Array of real numbers.
     F64(fn(&Rows) -> &Vec<f64>, fn(&mut Rows) -> &mut Vec<f64>),
     /// Array of frame counts.
@@ -57,7 +57,7 @@ struct Declaration {
     column: &'static str,
     meaning: &'static str,
     property: &'static str,
-    values: Values,
+    values: StatisticAccess,
 }
 
 impl Statistic {
@@ -66,7 +66,7 @@ impl Statistic {
 
     /// Returns the declaration of this statistic: the single place to describe a new one.
     const fn declaration(self) -> Declaration {
-        use Values::{F64, U32};
+        use StatisticAccess::{F64, U32};
         match self {
             Statistic::D => Declaration {
                 name: "D",
@@ -148,15 +148,15 @@ impl Statistic {
     }
 
     /// Returns the accessors of the values.
-    pub const fn values(self) -> Values {
+    pub const fn values(self) -> StatisticAccess {
         self.declaration().values
     }
 
     /// Returns the bytes per Gaussian.
     pub const fn bytes(self) -> usize {
         match self.values() {
-            Values::F64(..) => size_of::<f64>(),
-            Values::U32(..) => size_of::<u32>(),
+            StatisticAccess::F64(..) => size_of::<f64>(),
+            StatisticAccess::U32(..) => size_of::<u32>(),
         }
     }
 }
@@ -210,8 +210,8 @@ impl Rows {
     pub fn append(&mut self, next: &mut Rows) {
         for statistic in Statistic::ALL {
             match statistic.values() {
-                Values::F64(_, values) => values(self).append(values(next)),
-                Values::U32(_, values) => values(self).append(values(next)),
+                StatisticAccess::F64(_, values) => values(self).append(values(next)),
+                StatisticAccess::U32(_, values) => values(self).append(values(next)),
             }
         }
         self.flags.append(&mut next.flags);
@@ -221,8 +221,8 @@ impl Rows {
     pub fn clear(&mut self, i: usize) {
         for statistic in Statistic::ALL {
             match statistic.values() {
-                Values::F64(_, values) => values(self).get_mut(i).into_iter().for_each(|value| *value = 0.0),
-                Values::U32(_, values) => values(self).get_mut(i).into_iter().for_each(|value| *value = 0),
+                StatisticAccess::F64(_, values) => values(self).get_mut(i).into_iter().for_each(|value| *value = 0.0),
+                StatisticAccess::U32(_, values) => values(self).get_mut(i).into_iter().for_each(|value| *value = 0),
             }
         }
     }
@@ -246,8 +246,8 @@ mod tests {
         let mut rows = Rows::default();
         for (k, statistic) in Statistic::ALL.into_iter().enumerate() {
             match statistic.values() {
-                Values::F64(_, values) => values(&mut rows).push(k as f64),
-                Values::U32(_, values) => values(&mut rows).push(k as u32),
+                StatisticAccess::F64(_, values) => values(&mut rows).push(k as f64),
+                StatisticAccess::U32(_, values) => values(&mut rows).push(k as u32),
             }
         }
         let mut all = Rows::default();

@@ -9,7 +9,7 @@ use super::camera::Camera;
 /// Memory: 16 bytes per run of frames with equal views, and 8 bytes per view of a run. Memory grows with the number of
 /// images that the camera file names, not with the number of frames.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
-pub struct Schedule {
+pub struct ViewSchedule {
     /// Distinct cameras.
     pub cameras: Vec<Camera>,
     runs: Vec<ViewRun>,
@@ -29,26 +29,26 @@ struct ViewRun {
 
 /// View of one frame: the image of one camera at one frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Picture {
+pub struct FrameView {
     /// Index of the frame in the sequence.
     pub frame: usize,
     /// View number.
     pub view: u32,
-    /// Index of the camera in [`Schedule::cameras`].
+    /// Index of the camera in [`ViewSchedule::cameras`].
     pub camera: u32,
 }
 
-impl Picture {
+impl FrameView {
     /// Returns the name `tNNN_vNN` of frame and view number, with more digits where needed.
     pub fn name(&self) -> String {
         format!("t{:03}_v{:02}", self.frame, self.view)
     }
 }
 
-impl Schedule {
+impl ViewSchedule {
     /// Creates a schedule of `cameras` without frames.
-    pub fn new(cameras: Vec<Camera>) -> Schedule {
-        Schedule { cameras, ..Schedule::default() }
+    pub fn new(cameras: Vec<Camera>) -> ViewSchedule {
+        ViewSchedule { cameras, ..ViewSchedule::default() }
     }
 
     /// Appends `count` frames that have the given views: pairs (view number, camera index).
@@ -81,7 +81,7 @@ impl Schedule {
         self.views_of_run(self.runs.partition_point(|run| run.frame <= frame) - 1)
     }
 
-    /// Iterates over [`Schedule::views`] of all frames.
+    /// Iterates over [`ViewSchedule::views`] of all frames.
     pub fn iter(&self) -> impl Iterator<Item = &[(u32, u32)]> {
         (0..self.runs.len()).flat_map(|run| std::iter::repeat_n(self.views_of_run(run), self.run_length(run)))
     }
@@ -92,7 +92,7 @@ impl Schedule {
     }
 
     /// Returns the maximum number of views of a frame.
-    pub fn most_views(&self) -> usize {
+    pub fn max_views_per_frame(&self) -> usize {
         (0..self.runs.len()).map(|run| self.views_of_run(run).len()).max().unwrap_or(0)
     }
 
@@ -133,7 +133,7 @@ mod tests {
             (0, &[(3, 3)]),
             (2, &[]),
         ];
-        let mut schedule = Schedule::default();
+        let mut schedule = ViewSchedule::default();
         let mut expected: Vec<&[(u32, u32)]> = Vec::new();
         for (count, views) in pushed {
             schedule.push(count, views);
@@ -141,15 +141,15 @@ mod tests {
         }
         assert_eq!(schedule.iter().collect::<Vec<_>>(), expected);
         assert!(expected.iter().enumerate().all(|(frame, views)| schedule.views(frame) == *views));
-        assert_eq!((schedule.frames(), schedule.pairs(), schedule.most_views()), (10, 10, 2));
+        assert_eq!((schedule.frames(), schedule.pairs(), schedule.max_views_per_frame()), (10, 10, 2));
         assert_eq!((schedule.runs.len(), schedule.used()), (5, vec![0, 1]));
-        assert_eq!((Schedule::default().frames(), Schedule::default().pairs()), (0, 0));
+        assert_eq!((ViewSchedule::default().frames(), ViewSchedule::default().pairs()), (0, 0));
     }
 
     #[test]
     fn bytes_cover_one_camera_per_frame() {
         for (frames, views) in [(1, 1), (1000, 1), (1025, 3), (70_000, 2)] {
-            let mut schedule = Schedule::default();
+            let mut schedule = ViewSchedule::default();
             for frame in 0..frames {
                 let views_of_frame: Vec<(u32, u32)> = (0..views).map(|view| (view, frame)).collect();
                 schedule.push(1, &views_of_frame);
@@ -157,7 +157,7 @@ mod tests {
             let held =
                 schedule.runs.capacity() * size_of::<ViewRun>() + schedule.views.capacity() * size_of::<(u32, u32)>();
             // The first allocation of a vector has a capacity of four.
-            let counted = Schedule::bytes(frames.max(4).into(), views.into());
+            let counted = ViewSchedule::bytes(frames.max(4).into(), views.into());
             assert!(held as u64 <= counted, "{frames} frames of {views}: {held} bytes, counted {counted}");
             assert!(schedule.runs.len() == frames as usize && counted <= 2 * (held as u64).max(96), "{held} {counted}");
         }

@@ -1,6 +1,6 @@
 //! Application of deltas and masks: state = raw·mask + delta, its inverse, and its derivative.
 
-use splat_core::{Column, Columns, Gaussians, Jacobian};
+use splat_core::{AttributeValues, Attributes, Gaussians, Jacobian};
 
 /// Deltas and masks of a block of Gaussians at one time.
 ///
@@ -14,7 +14,7 @@ pub struct Deltas {
     /// Mask of each Gaussian `[N]`; `None` if every mask is 1.
     pub mask: Option<Vec<f32>>,
     /// Requested attributes that the field changes.
-    pub active: Columns,
+    pub active: Attributes,
     /// Whether the rotation delta is a factor.
     pub multiply_rotation: bool,
 }
@@ -23,11 +23,16 @@ impl Deltas {
     /// Creates an empty block for Gaussians of SH degree `sh_degree`, to be filled by
     /// [`Field::deltas`](super::Field::deltas).
     pub fn new(sh_degree: usize) -> Self {
-        Deltas { delta: Gaussians::zeros(0, sh_degree), mask: None, active: Columns::empty(), multiply_rotation: false }
+        Deltas {
+            delta: Gaussians::zeros(0, sh_degree),
+            mask: None,
+            active: Attributes::empty(),
+            multiply_rotation: false,
+        }
     }
 
     /// Starts a block of `rows` Gaussians: resizes the `active` attributes and stores the arguments.
-    pub(super) fn begin(&mut self, rows: usize, active: Columns, multiply_rotation: bool) {
+    pub(super) fn begin(&mut self, rows: usize, active: Attributes, multiply_rotation: bool) {
         for column in active.iter() {
             self.delta.column_mut(column).resize(rows);
         }
@@ -36,19 +41,19 @@ impl Deltas {
     }
 
     /// Computes the state of `raw` in the attributes `want` into `state`, which is resized in these attributes.
-    pub fn apply(&self, raw: &Gaussians, want: Columns, state: &mut Gaussians) {
+    pub fn apply(&self, raw: &Gaussians, want: Attributes, state: &mut Gaussians) {
         for column in want.iter() {
             let from = raw.column(column);
             let to = state.column_mut(column);
             to.resize(from.len());
             if !self.active.contains(column) {
                 to.planes_mut().copy_from_slice(from.planes());
-            } else if column == Columns::ROTATION && self.multiply_rotation {
+            } else if column == Attributes::ROTATION && self.multiply_rotation {
                 for i in 0..from.len() {
                     to.set_row(i, unit(product(from.row(i), self.delta.rotation.row(i))));
                 }
             } else {
-                let mask = self.mask.as_deref().filter(|_| column != Columns::ROTATION);
+                let mask = self.mask.as_deref().filter(|_| column != Attributes::ROTATION);
                 let delta = self.delta.column(column);
                 for c in 0..from.width() {
                     let planes = to.plane_mut(c).iter_mut().zip(from.plane(c)).zip(delta.plane(c));
@@ -65,10 +70,10 @@ impl Deltas {
     ///
     /// Attributes whose state changes by the same amount as the raw value get no values. Values that are not finite
     /// become 0. `rotation` holds the raw quaternions.
-    pub(super) fn jacobian(&self, rotation: &Column, out: &mut Jacobian) {
+    pub(super) fn jacobian(&self, rotation: &AttributeValues, out: &mut Jacobian) {
         for column in self.active.iter() {
-            if column == Columns::ROTATION && self.multiply_rotation {
-                *out.column_mut(column) = Column::zeros(16, rotation.len());
+            if column == Attributes::ROTATION && self.multiply_rotation {
+                *out.column_mut(column) = AttributeValues::zeros(16, rotation.len());
                 for i in 0..rotation.len() {
                     let (raw, delta) = (rotation.row(i), self.delta.rotation.row(i));
                     for component in 0..4 {
@@ -79,8 +84,8 @@ impl Deltas {
                         }
                     }
                 }
-            } else if let Some(mask) = self.mask.as_ref().filter(|_| column != Columns::ROTATION) {
-                *out.column_mut(column) = Column::from_planes(1, mask.iter().copied().map(finite).collect());
+            } else if let Some(mask) = self.mask.as_ref().filter(|_| column != Attributes::ROTATION) {
+                *out.column_mut(column) = AttributeValues::from_planes(1, mask.iter().copied().map(finite).collect());
             }
         }
     }
@@ -89,14 +94,14 @@ impl Deltas {
     ///
     /// Exact up to rounding; a rotation is recovered up to its length. If a mask or a rotation delta is zero, no raw
     /// value leads to `state` and the result is not finite.
-    pub fn solve(&self, state: &Gaussians, want: Columns, raw: &mut Gaussians) {
+    pub fn solve(&self, state: &Gaussians, want: Attributes, raw: &mut Gaussians) {
         for column in want.iter() {
             let from = state.column(column);
             let to = raw.column_mut(column);
             to.resize(from.len());
             if !self.active.contains(column) {
                 to.planes_mut().copy_from_slice(from.planes());
-            } else if column == Columns::ROTATION && self.multiply_rotation {
+            } else if column == Attributes::ROTATION && self.multiply_rotation {
                 for i in 0..from.len() {
                     let delta: [f32; 4] = self.delta.rotation.row(i);
                     let square: f32 = delta.iter().map(|x| x * x).sum();
@@ -104,7 +109,7 @@ impl Deltas {
                     to.set_row(i, product(from.row(i), [w, -x, -y, -z]));
                 }
             } else {
-                let mask = self.mask.as_deref().filter(|_| column != Columns::ROTATION);
+                let mask = self.mask.as_deref().filter(|_| column != Attributes::ROTATION);
                 for c in 0..from.width() {
                     let delta = self.delta.column(column).plane(c);
                     for (i, to) in to.plane_mut(c).iter_mut().enumerate() {

@@ -8,7 +8,7 @@
 use std::path::Path;
 
 use splat_core::error::{Error, Result};
-use splat_core::{Column, Columns, Gaussians};
+use splat_core::{AttributeValues, Attributes, Gaussians};
 
 use super::deltas::Deltas;
 use super::linear::{CacheLine, LANES, Linear};
@@ -20,7 +20,7 @@ use super::voxel::VoxelMask;
 #[derive(Debug, Clone, PartialEq)]
 pub struct FieldConfig {
     /// Attributes whose heads are on (their flags `no_dx`, `no_ds`, `no_dr`, `no_do`, `no_dshs` are false).
-    pub active: Columns,
+    pub active: Attributes,
     /// Whether a head on the hidden features gives the mask. Takes precedence over `empty_voxel`.
     pub static_mlp: bool,
     /// Whether a voxel grid gives the mask.
@@ -48,7 +48,7 @@ pub(super) enum Mask {
 #[derive(Debug, Clone)]
 pub(super) struct Head {
     /// Attribute that the head deforms; `None` for the mask of `static_mlp`.
-    pub(super) column: Option<Columns>,
+    pub(super) column: Option<Attributes>,
     pub(super) hidden: Linear,
     pub(super) output: Linear,
 }
@@ -78,7 +78,7 @@ pub struct Prepared {
 #[derive(Debug, Clone)]
 enum PreparedInput {
     Planes(PreparedPlanes),
-    Position(Column),
+    Position(AttributeValues),
 }
 
 /// Reusable buffers for the activations of one reader.
@@ -90,12 +90,12 @@ pub struct Scratch {
 }
 
 /// Returns the name of an attribute's head in the state dict, and the flag in `cfg_args` that turns it on.
-fn head_name(column: Columns) -> (&'static str, &'static str) {
+fn head_name(column: Attributes) -> (&'static str, &'static str) {
     match column {
-        Columns::POSITION => ("pos_deform", "no_dx=False"),
-        Columns::LOG_SCALE => ("scales_deform", "no_ds=False"),
-        Columns::ROTATION => ("rotations_deform", "no_dr=False"),
-        Columns::OPACITY => ("opacity_deform", "no_do=False"),
+        Attributes::POSITION => ("pos_deform", "no_dx=False"),
+        Attributes::LOG_SCALE => ("scales_deform", "no_ds=False"),
+        Attributes::ROTATION => ("rotations_deform", "no_dr=False"),
+        Attributes::OPACITY => ("opacity_deform", "no_do=False"),
         _ => ("shs_deform", "no_dshs=False"),
     }
 }
@@ -148,7 +148,7 @@ impl Field {
     }
 
     /// Returns the attributes that change with time.
-    pub fn active(&self) -> Columns {
+    pub fn active(&self) -> Attributes {
         self.config.active
     }
 
@@ -175,7 +175,7 @@ impl Field {
     }
 
     /// Computes the time-independent part for Gaussians at canonical `position` `[3, N]`.
-    pub fn prepare(&self, position: &Column) -> Prepared {
+    pub fn prepare(&self, position: &AttributeValues) -> Prepared {
         Prepared {
             rows: position.len(),
             input: match &self.planes {
@@ -198,7 +198,7 @@ impl Field {
         &self,
         prepared: &Prepared,
         time: f64,
-        want: Columns,
+        want: Attributes,
         scratch: &mut Scratch,
         out: &mut Deltas,
     ) -> Result<()> {
@@ -211,14 +211,14 @@ impl Field {
         if let Some(head) = self.heads.iter().find(|head| {
             head.column.is_some_and(|c| want.contains(c) && out.delta.column(c).width() != head.output.outputs)
         }) {
-            let name = head.column.map_or("mask", Columns::name);
+            let name = head.column.map_or("mask", Attributes::name);
             return Err(Error::internal(format!(
                 "the deformation field has {} values of {name}, and the output another number",
                 head.output.outputs
             )));
         }
         out.begin(prepared.rows, want, self.config.apply_rotation);
-        let masked = !want.difference(Columns::ROTATION).is_empty();
+        let masked = !want.difference(Attributes::ROTATION).is_empty();
         match (&self.mask, &prepared.voxel) {
             (Mask::None, _) => out.mask = None,
             (Mask::Head, _) => out.mask = masked.then(|| vec![0.0; prepared.rows]),

@@ -10,7 +10,7 @@ use super::deltas::{Deltas, finite};
 use super::field::{Field, Head, Mask, Scratch, add_frequencies, position_time_features};
 use super::linear::{CacheLine, LANES, Linear};
 use splat_core::error::{Error, Result};
-use splat_core::{Column, Columns, Gaussians, Jacobian};
+use splat_core::{AttributeValues, Attributes, Gaussians, Jacobian};
 
 /// Activations and derivatives of one group of Gaussians.
 #[derive(Default)]
@@ -38,7 +38,7 @@ impl Field {
     ///
     /// # Errors
     /// `time` is not finite.
-    pub fn jacobian(&self, raw: &Gaussians, time: f64, want: Columns) -> Result<Jacobian> {
+    pub fn jacobian(&self, raw: &Gaussians, time: f64, want: Attributes) -> Result<Jacobian> {
         if !time.is_finite() {
             return Err(Error::internal(format!(
                 "time of a deformation field: expected a finite number, found {time}"
@@ -47,14 +47,14 @@ impl Field {
         let want = self.config.active & want;
         let mut found = Jacobian::default();
         if let Mask::None = self.mask {
-            let head = self.heads.iter().find(|head| head.column == Some(Columns::POSITION));
-            if let Some(head) = head.filter(|_| want.contains(Columns::POSITION)) {
-                *found.column_mut(Columns::POSITION) = self.position_jacobian(head, &raw.position, time as f32);
+            let head = self.heads.iter().find(|head| head.column == Some(Attributes::POSITION));
+            if let Some(head) = head.filter(|_| want.contains(Attributes::POSITION)) {
+                *found.column_mut(Attributes::POSITION) = self.position_jacobian(head, &raw.position, time as f32);
             }
         }
         let held = match self.mask {
-            Mask::None if self.config.apply_rotation => want & Columns::ROTATION,
-            Mask::None => Columns::empty(),
+            Mask::None if self.config.apply_rotation => want & Attributes::ROTATION,
+            Mask::None => Attributes::empty(),
             Mask::Head | Mask::Voxel(_) => want,
         };
         if !held.is_empty() {
@@ -66,8 +66,8 @@ impl Field {
     }
 
     /// Computes ∂state/∂raw of positions, `[9, N]`.
-    fn position_jacobian(&self, head: &Head, position: &Column, time: f32) -> Column {
-        let mut out = Column::zeros(9, position.len());
+    fn position_jacobian(&self, head: &Head, position: &AttributeValues, time: f32) -> AttributeValues {
+        let mut out = AttributeValues::zeros(9, position.len());
         #[cfg(target_arch = "x86_64")]
         if std::arch::is_x86_feature_detected!("avx2") && std::arch::is_x86_feature_detected!("fma") {
             // SAFETY: AVX2 and FMA were detected on the line above.
@@ -81,14 +81,26 @@ impl Field {
     /// [`Field::position_jacobian_by_group`] compiled for AVX2 and FMA.
     #[cfg(target_arch = "x86_64")]
     #[target_feature(enable = "avx2,fma")]
-    fn position_jacobian_by_group_fma(&self, head: &Head, position: &Column, time: f32, out: &mut Column) {
+    fn position_jacobian_by_group_fma(
+        &self,
+        head: &Head,
+        position: &AttributeValues,
+        time: f32,
+        out: &mut AttributeValues,
+    ) {
         self.position_jacobian_by_group::<true>(head, position, time, out);
     }
 
     /// Computes ∂state/∂raw of positions group by group into `out`. Inlined with all callees into one copy per
     /// instruction set.
     #[inline(always)]
-    fn position_jacobian_by_group<const FMA: bool>(&self, head: &Head, position: &Column, time: f32, out: &mut Column) {
+    fn position_jacobian_by_group<const FMA: bool>(
+        &self,
+        head: &Head,
+        position: &AttributeValues,
+        time: f32,
+        out: &mut AttributeValues,
+    ) {
         let lines = self.planes.as_ref().map_or(Vec::new(), |planes| planes.lines(time));
         let mut group = JacobianGroup::default();
         for start in (0..position.len()).step_by(LANES) {

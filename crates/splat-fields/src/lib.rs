@@ -43,7 +43,7 @@ mod voxel;
 pub use deltas::Deltas;
 pub use field::{Field, FieldConfig, Prepared, Scratch};
 pub use network::{Encoded, Network, PredictedMotion};
-pub use planes::{Box3, Tap, rows_before_zero, tap};
+pub use planes::{Box3, Tap, tap, unread_rows};
 pub use tensors::{Tensor, Tensors};
 
 /// Compiles the example of the README.

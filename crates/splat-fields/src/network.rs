@@ -15,7 +15,7 @@ use std::path::Path;
 use super::linear::{CacheLine, LANES, Linear};
 use super::tensors::{Lookup, Tensors};
 use splat_core::error::{Error, Result};
-use splat_core::{Column, Columns};
+use splat_core::{AttributeValues, Attributes};
 
 /// Number of octaves in the encoding of a position.
 const POSITION_OCTAVES: usize = 10;
@@ -44,7 +44,7 @@ struct NetworkLayer {
 /// Linear output layer of one attribute, or of three of its components.
 #[derive(Debug, Clone)]
 struct NetworkHead {
-    column: Columns,
+    column: Attributes,
     /// Component of the attribute that the first output belongs to.
     plane: usize,
     output: Linear,
@@ -64,15 +64,15 @@ pub struct Encoded {
 pub struct PredictedMotion {
     /// Position offset `[3]`, scene units. For networks that predict screw motions `[6]`: the screw parameters w, then
     /// v.
-    pub warp: Column,
+    pub warp: AttributeValues,
     /// Quaternion offset `[4]`, wxyz.
-    pub rotation: Column,
+    pub rotation: AttributeValues,
     /// Scale offset `[3]`, scene units.
-    pub scaling: Column,
+    pub scaling: AttributeValues,
     /// Opacity offset `[1]`.
-    pub opacity: Column,
+    pub opacity: AttributeValues,
     /// Offset of the SH coefficients of degree 0, `[3]`.
-    pub color: Column,
+    pub color: AttributeValues,
 }
 
 /// Activations of one group of Gaussians.
@@ -88,12 +88,12 @@ struct NetworkScratch {
 
 impl PredictedMotion {
     /// Returns the outputs of the head of an attribute.
-    fn column_mut(&mut self, which: Columns) -> &mut Column {
+    fn column_mut(&mut self, which: Attributes) -> &mut AttributeValues {
         match which {
-            Columns::POSITION => &mut self.warp,
-            Columns::ROTATION => &mut self.rotation,
-            Columns::LOG_SCALE => &mut self.scaling,
-            Columns::OPACITY => &mut self.opacity,
+            Attributes::POSITION => &mut self.warp,
+            Attributes::ROTATION => &mut self.rotation,
+            Attributes::LOG_SCALE => &mut self.scaling,
+            Attributes::OPACITY => &mut self.opacity,
             _ => &mut self.color,
         }
     }
@@ -167,35 +167,35 @@ impl Network {
         }
 
         let mut heads = Vec::new();
-        let mut add = |column: Columns, plane: usize, layer: &str, outputs: usize, why: &str| -> Result<()> {
+        let mut add = |column: Attributes, plane: usize, layer: &str, outputs: usize, why: &str| -> Result<()> {
             let output = load(layer, width, Some(outputs), why)?;
             heads.push(NetworkHead { column, plane, output });
             Ok(())
         };
         if has("branch_w") {
-            add(Columns::POSITION, 0, "branch_w", 3, "rotation axis of a screw motion")?;
-            add(Columns::POSITION, 3, "branch_v", 3, "translation of a screw motion")?;
+            add(Attributes::POSITION, 0, "branch_w", 3, "rotation axis of a screw motion")?;
+            add(Attributes::POSITION, 3, "branch_v", 3, "translation of a screw motion")?;
         } else {
-            add(Columns::POSITION, 0, "gaussian_warp", 3, "position offset")?;
+            add(Attributes::POSITION, 0, "gaussian_warp", 3, "position offset")?;
         }
-        add(Columns::ROTATION, 0, "gaussian_rotation", 4, "rotation offset")?;
-        add(Columns::LOG_SCALE, 0, "gaussian_scaling", 3, "scale offset")?;
+        add(Attributes::ROTATION, 0, "gaussian_rotation", 4, "rotation offset")?;
+        add(Attributes::LOG_SCALE, 0, "gaussian_scaling", 3, "scale offset")?;
         if has("gaussian_opacity") {
-            add(Columns::OPACITY, 0, "gaussian_opacity", 1, "opacity offset")?;
+            add(Attributes::OPACITY, 0, "gaussian_opacity", 1, "opacity offset")?;
         }
         if has("gaussian_color") {
-            add(Columns::SH, 0, "gaussian_color", 3, "color offset")?;
+            add(Attributes::SH, 0, "gaussian_color", 3, "color offset")?;
         }
         Ok(Network { octaves, time, layers, heads })
     }
 
     /// Returns the attributes that have a head.
-    pub fn active(&self) -> Columns {
+    pub fn active(&self) -> Attributes {
         self.heads.iter().map(|head| head.column).collect()
     }
 
     /// Returns whether positions move by screw motions. [`PredictedMotion::warp`] then holds w and v.
-    pub fn has_screws(&self) -> bool {
+    pub fn predicts_screw_motion(&self) -> bool {
         self.heads.iter().any(|head| head.plane > 0)
     }
 
@@ -210,7 +210,7 @@ impl Network {
     /// Sines and cosines of 2ᵏ times the f32 position are exact to f32. They are computed in f64 for the position and
     /// doubled by the double-angle formulas. Each doubling doubles an error of 1e-16, which gives 1e-13 at the last
     /// octave.
-    pub fn encode(&self, position: &Column) -> Encoded {
+    pub fn encode(&self, position: &AttributeValues) -> Encoded {
         let rows = position.len();
         let mut values = vec![CacheLine([0.0; LANES]); rows.div_ceil(LANES) * POSITION_INPUTS];
         for (axis, row) in (0..3).flat_map(|axis| (0..rows).map(move |row| (axis, row))) {
@@ -228,13 +228,13 @@ impl Network {
     ///
     /// # Errors
     /// `time` is not finite.
-    pub fn motion(&self, encoded: &Encoded, time: f64, want: Columns, out: &mut PredictedMotion) -> Result<()> {
+    pub fn motion(&self, encoded: &Encoded, time: f64, want: Attributes, out: &mut PredictedMotion) -> Result<()> {
         let time = checked_time(time)?;
         for head in self.heads.iter().filter(|head| want.contains(head.column)) {
             let column = out.column_mut(head.column);
             let width = head.plane + head.output.outputs;
             if column.width() < width {
-                *column = Column::zeros(width, encoded.rows);
+                *column = AttributeValues::zeros(width, encoded.rows);
             }
             column.resize(encoded.rows);
         }
@@ -253,11 +253,11 @@ impl Network {
     ///
     /// # Errors
     /// `time` is not finite.
-    pub fn slopes(&self, position: &Column, time: f64) -> Result<Column> {
+    pub fn slopes(&self, position: &AttributeValues, time: f64) -> Result<AttributeValues> {
         let time = checked_time(time)?;
         let encoded = self.encode(position);
-        let outputs = if self.has_screws() { 6 } else { 3 };
-        let mut out = Column::zeros(3 * outputs, encoded.rows);
+        let outputs = if self.predicts_screw_motion() { 6 } else { 3 };
+        let mut out = AttributeValues::zeros(3 * outputs, encoded.rows);
         #[cfg(target_arch = "x86_64")]
         if std::arch::is_x86_feature_detected!("avx2") && std::arch::is_x86_feature_detected!("fma") {
             // SAFETY: AVX2 and FMA were detected on the line above.
@@ -271,20 +271,20 @@ impl Network {
     /// [`Network::evaluate`] compiled for AVX2 and FMA.
     #[cfg(target_arch = "x86_64")]
     #[target_feature(enable = "avx2,fma")]
-    fn evaluate_fma(&self, encoded: &Encoded, time: f32, want: Columns, out: &mut PredictedMotion) {
+    fn evaluate_fma(&self, encoded: &Encoded, time: f32, want: Attributes, out: &mut PredictedMotion) {
         self.evaluate::<true>(encoded, time, want, out);
     }
 
     /// [`Network::differentiate`] compiled for AVX2 and FMA.
     #[cfg(target_arch = "x86_64")]
     #[target_feature(enable = "avx2,fma")]
-    fn differentiate_fma(&self, encoded: &Encoded, time: f32, out: &mut Column) {
+    fn differentiate_fma(&self, encoded: &Encoded, time: f32, out: &mut AttributeValues) {
         self.differentiate::<true>(encoded, time, out);
     }
 
     /// Evaluates the heads `want` into `out`. Inlined with all callees into one copy per instruction set.
     #[inline(always)]
-    fn evaluate<const FMA: bool>(&self, encoded: &Encoded, time: f32, want: Columns, out: &mut PredictedMotion) {
+    fn evaluate<const FMA: bool>(&self, encoded: &Encoded, time: f32, want: Attributes, out: &mut PredictedMotion) {
         let (encoded_time, mut scratch) = (self.encode_time::<FMA>(time), NetworkScratch::default());
         for (group, position_encoding) in encoded.values.chunks_exact(POSITION_INPUTS).enumerate() {
             let NetworkScratch { input, last, spare } = &mut scratch;
@@ -324,7 +324,7 @@ impl Network {
 
     /// Computes the derivatives of the position heads into `out`: one forward pass, and one backward pass per output.
     #[inline(always)]
-    fn differentiate<const FMA: bool>(&self, encoded: &Encoded, time: f32, out: &mut Column) {
+    fn differentiate<const FMA: bool>(&self, encoded: &Encoded, time: f32, out: &mut AttributeValues) {
         let encoded_time = self.encode_time::<FMA>(time);
         let encodings = POSITION_INPUTS + encoded_time.len();
         let mut activations: Vec<Vec<CacheLine>> = vec![Vec::new(); self.layers.len()];
@@ -345,7 +345,7 @@ impl Network {
             }
             let start = group * LANES;
             let lanes = LANES.min(encoded.rows - start);
-            let heads = self.heads.iter().filter(|head| head.column == Columns::POSITION);
+            let heads = self.heads.iter().filter(|head| head.column == Attributes::POSITION);
             for (head, component) in heads.flat_map(|head| (0..head.output.outputs).map(move |o| (head, o))) {
                 gradient.clear();
                 gradient.resize(head.output.padded_outputs(), CacheLine([0.0; LANES]));

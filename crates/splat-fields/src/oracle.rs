@@ -1,7 +1,7 @@
 //! Slow, independent evaluation of a field in f64, one Gaussian at a time, directly from the definition.
 
 use crate::{FieldConfig, Tensors};
-use splat_core::{Column, Columns, Gaussians};
+use splat_core::{AttributeValues, Attributes, Gaussians};
 
 /// Raw or deformed parameters of one Gaussian.
 #[derive(Debug, Clone, PartialEq)]
@@ -21,7 +21,7 @@ pub struct Parameters {
 impl Parameters {
     /// Returns the parameters of Gaussian `i`.
     pub fn from_row(raw: &Gaussians, i: usize) -> Parameters {
-        let values = |column: &Column| (0..column.width()).map(|c| f64::from(column.plane(c)[i])).collect();
+        let values = |column: &AttributeValues| (0..column.width()).map(|c| f64::from(column.plane(c)[i])).collect();
         Parameters {
             position: values(&raw.position),
             rotation: values(&raw.rotation),
@@ -147,12 +147,12 @@ impl Oracle<'_> {
         } else {
             1.0
         };
-        let deform = |column: Columns, name: &str, raw: &[f64]| -> Vec<f64> {
+        let deform = |column: Attributes, name: &str, raw: &[f64]| -> Vec<f64> {
             if !config.active.contains(column) {
                 return raw.to_vec();
             }
             let delta = self.head(name, &hidden);
-            if column != Columns::ROTATION {
+            if column != Attributes::ROTATION {
                 return raw.iter().zip(&delta).map(|(raw, delta)| raw * mask + delta).collect();
             }
             if !config.apply_rotation {
@@ -164,11 +164,11 @@ impl Oracle<'_> {
             vec![q.w, q.x, q.y, q.z]
         };
         Parameters {
-            position: deform(Columns::POSITION, "pos_deform", &raw.position),
-            rotation: deform(Columns::ROTATION, "rotations_deform", &raw.rotation),
-            log_scale: deform(Columns::LOG_SCALE, "scales_deform", &raw.log_scale),
-            opacity_logit: deform(Columns::OPACITY, "opacity_deform", &raw.opacity_logit),
-            sh: deform(Columns::SH, "shs_deform", &raw.sh),
+            position: deform(Attributes::POSITION, "pos_deform", &raw.position),
+            rotation: deform(Attributes::ROTATION, "rotations_deform", &raw.rotation),
+            log_scale: deform(Attributes::LOG_SCALE, "scales_deform", &raw.log_scale),
+            opacity_logit: deform(Attributes::OPACITY, "opacity_deform", &raw.opacity_logit),
+            sh: deform(Attributes::SH, "shs_deform", &raw.sh),
         }
     }
 }

@@ -8,7 +8,7 @@
 //! the time of a frame, so each time plane is first interpolated along time into a line. A Gaussian then interpolates
 //! between two points of that line.
 
-use splat_core::Column;
+use splat_core::AttributeValues;
 use splat_core::error::Result;
 
 use super::linear::{CacheLine, LANES};
@@ -148,7 +148,7 @@ pub fn tap(u: f32, size: usize) -> Tap {
 ///
 /// Rows are counted along the third extent of the tensor `name` of shape `shape`. Returns 0 for tensors that are not
 /// time planes. Time is not mapped to [−1, 1], so about half of each time plane is never read.
-pub fn rows_before_zero(name: &str, shape: &[usize]) -> usize {
+pub fn unread_rows(name: &str, shape: &[usize]) -> usize {
     let place = name.strip_prefix(GRIDS).and_then(|rest| rest.split_once('.')?.1.parse().ok());
     match (place, shape) {
         (Some(place), &[1, _, rows, _]) if rows > 0 && TEMPORAL.contains(&place) => tap(0.0, rows).low as usize,
@@ -203,7 +203,7 @@ impl Planes {
     }
 
     /// Computes the time-independent part for Gaussians at canonical `position` `[3, N]`.
-    pub(super) fn prepare(&self, position: &Column) -> PreparedPlanes {
+    pub(super) fn prepare(&self, position: &AttributeValues) -> PreparedPlanes {
         let rows = position.len();
         let width = self.width();
         let mut prepared =

@@ -3,7 +3,7 @@
 pub mod deep;
 
 use crate::{FieldConfig, Tensor, Tensors};
-use splat_core::Columns;
+use splat_core::Attributes;
 
 /// Pseudo-random values in [−1, 1): the upper bits of a linear congruential generator with the given state.
 pub struct Noise(pub u64);
@@ -25,7 +25,7 @@ const CHANNELS: usize = 5;
 /// Returns a configuration in which every attribute deforms and all options are off.
 pub fn plain() -> FieldConfig {
     FieldConfig {
-        active: Columns::all(),
+        active: Attributes::all(),
         static_mlp: false,
         empty_voxel: false,
         grid_pe: 0,

@@ -3,20 +3,20 @@ use std::path::Path;
 use super::*;
 use crate::oracle::{Oracle, Parameters};
 use crate::synthetic::{Noise, plain, tensors};
-use splat_core::{Column, Columns, Gaussians, Gradients};
+use splat_core::{AttributeValues, Attributes, Gaussians, Gradients};
 
 /// Returns random raw Gaussians, some of them outside the box of the field.
 fn random_gaussians(len: usize) -> Gaussians {
     let mut noise = Noise(99);
     let mut gaussians = Gaussians::zeros(len, 3);
-    for column in Columns::all().iter() {
+    for column in Attributes::all().iter() {
         gaussians.column_mut(column).planes_mut().iter_mut().for_each(|x| *x = 2.0 * noise.next());
     }
     gaussians
 }
 
 /// Returns state and deltas of `raw` at `time` in the attributes `want`.
-fn states(field: &Field, raw: &Gaussians, time: f64, want: Columns) -> (Gaussians, Deltas) {
+fn states(field: &Field, raw: &Gaussians, time: f64, want: Attributes) -> (Gaussians, Deltas) {
     let mut deltas = Deltas::new(3);
     field.deltas(&field.prepare(&raw.position), time, want, &mut Scratch::default(), &mut deltas).unwrap();
     let mut state = Gaussians::zeros(0, 3);
@@ -30,7 +30,7 @@ fn build(config: &FieldConfig, depth: usize) -> Field {
 }
 
 /// Returns all components of Gaussian `i`.
-fn values(column: &Column, i: usize) -> Vec<f64> {
+fn values(column: &AttributeValues, i: usize) -> Vec<f64> {
     (0..column.width()).map(|c| f64::from(column.plane(c)[i])).collect()
 }
 
@@ -41,7 +41,7 @@ fn assert_matches_oracle(what: &str, config: FieldConfig, depth: usize) {
     let field = build(&config, depth);
     let raw = random_gaussians(40);
     for time in [0.0, 0.37, 1.0] {
-        let (state, _) = states(&field, &raw, time, Columns::all());
+        let (state, _) = states(&field, &raw, time, Attributes::all());
         for i in 0..raw.len() {
             let expected = oracle.state(&Parameters::from_row(&raw, i), time);
             for (column, expected) in [
@@ -94,11 +94,11 @@ fn every_trunk_depth_matches_the_f64_oracle() {
 
 #[test]
 fn attributes_without_a_head_are_raw_and_unmasked() {
-    for column in Columns::all().iter() {
-        let config = FieldConfig { active: Columns::all().difference(column), static_mlp: true, ..plain() };
+    for column in Attributes::all().iter() {
+        let config = FieldConfig { active: Attributes::all().difference(column), static_mlp: true, ..plain() };
         assert_matches_oracle(&format!("without {}", column.name()), config, 1);
     }
-    assert_matches_oracle("no head at all", FieldConfig { active: Columns::empty(), ..plain() }, 1);
+    assert_matches_oracle("no head at all", FieldConfig { active: Attributes::empty(), ..plain() }, 1);
 }
 
 #[test]
@@ -106,15 +106,17 @@ fn states_do_not_depend_on_block_or_requested_attributes() {
     let config = FieldConfig { static_mlp: true, ..plain() };
     let field = build(&config, 2);
     let raw = random_gaussians(1100);
-    let (all, _) = states(&field, &raw, 0.6, Columns::all());
+    let (all, _) = states(&field, &raw, 0.6, Attributes::all());
     for (start, len) in [(0, 1), (3, 7), (255, 2), (250, 513), (1099, 1)] {
         let mut part = Gaussians::zeros(len, 3);
-        for column in Columns::all().iter() {
+        for column in Attributes::all().iter() {
             for c in 0..raw.column(column).width() {
                 part.column_mut(column).plane_mut(c).copy_from_slice(&raw.column(column).plane(c)[start..start + len]);
             }
         }
-        for want in [Columns::all(), Columns::POSITION, Columns::OPACITY | Columns::SH, Columns::ROTATION] {
+        for want in
+            [Attributes::all(), Attributes::POSITION, Attributes::OPACITY | Attributes::SH, Attributes::ROTATION]
+        {
             let (state, _) = states(&field, &part, 0.6, want);
             for column in want.iter() {
                 for c in 0..state.column(column).width() {
@@ -140,13 +142,13 @@ fn solve_inverts_apply() {
     for apply_rotation in [false, true] {
         let field = build(&FieldConfig { static_mlp: true, apply_rotation, ..plain() }, 1);
         let raw = random_gaussians(50);
-        let (state, deltas) = states(&field, &raw, 0.4, Columns::all());
+        let (state, deltas) = states(&field, &raw, 0.4, Attributes::all());
         let mask = deltas.mask.as_ref().unwrap();
         let mut solved = Gaussians::zeros(0, 3);
-        deltas.solve(&state, Columns::all(), &mut solved);
+        deltas.solve(&state, Attributes::all(), &mut solved);
         let mut again = Gaussians::zeros(0, 3);
-        deltas.apply(&solved, Columns::all(), &mut again);
-        for column in Columns::all().iter() {
+        deltas.apply(&solved, Attributes::all(), &mut again);
+        for column in Attributes::all().iter() {
             for (i, mask) in mask.iter().enumerate() {
                 let (got, expected) = (values(again.column(column), i), values(state.column(column), i));
                 for (got, expected) in got.into_iter().zip(expected) {
@@ -167,12 +169,12 @@ fn solve_inverts_apply() {
 fn nan_position_affects_no_other_gaussian() {
     let field = build(&FieldConfig { empty_voxel: true, ..plain() }, 1);
     let raw = random_gaussians(20);
-    let (clean, _) = states(&field, &raw, 0.5, Columns::all());
+    let (clean, _) = states(&field, &raw, 0.5, Attributes::all());
     let mut broken = raw.clone();
     for (i, value) in [(4, f32::NAN), (5, f32::INFINITY), (6, f32::NEG_INFINITY), (7, f32::MAX)] {
         broken.position.set_row(i, [value; 3]);
     }
-    let (state, _) = states(&field, &broken, 0.5, Columns::all());
+    let (state, _) = states(&field, &broken, 0.5, Attributes::all());
     assert!(state.position.row::<3>(4).iter().all(|x| x.is_nan()) && state.opacity_logit.row::<1>(4)[0].is_nan());
     for i in (0..20).filter(|i| !(4..8).contains(i)) {
         assert_eq!(state.position.row::<3>(i), clean.position.row::<3>(i), "Gaussian {i}");
@@ -184,13 +186,13 @@ fn a_zero_quaternion_product_stays_zero() {
     let field = build(&FieldConfig { apply_rotation: true, ..plain() }, 1);
     let mut raw = random_gaussians(3);
     raw.rotation.set_row(1, [0.0; 4]);
-    assert_eq!(states(&field, &raw, 0.5, Columns::all()).0.rotation.row::<4>(1), [0.0; 4]);
+    assert_eq!(states(&field, &raw, 0.5, Attributes::all()).0.rotation.row::<4>(1), [0.0; 4]);
 }
 
 #[test]
 fn an_empty_block_is_empty() {
     let field = build(&plain(), 1);
-    assert!(states(&field, &Gaussians::zeros(0, 3), 0.5, Columns::all()).0.is_empty());
+    assert!(states(&field, &Gaussians::zeros(0, 3), 0.5, Attributes::all()).0.is_empty());
 }
 
 /// Returns the error message of a field built from changed tensors.
@@ -248,7 +250,7 @@ fn weights_that_are_not_finite_are_refused() {
 
 #[test]
 fn unused_tensors_may_have_any_content() {
-    let config = FieldConfig { active: Columns::POSITION, ..plain() };
+    let config = FieldConfig { active: Attributes::POSITION, ..plain() };
     let mut tensors = tensors(&config, 1);
     tensors.insert("timenet.0.weight".into(), Tensor { shape: vec![1], data: vec![f32::NAN] });
     tensors.insert("deformation_net.shs_deform.1.weight".into(), Tensor { shape: vec![], data: vec![f32::NAN] });
@@ -260,26 +262,26 @@ fn times_that_are_not_finite_are_refused() {
     let field = build(&plain(), 1);
     let prepared = field.prepare(&random_gaussians(1).position);
     let error = field
-        .deltas(&prepared, f64::NAN, Columns::all(), &mut Scratch::default(), &mut Deltas::new(3))
+        .deltas(&prepared, f64::NAN, Attributes::all(), &mut Scratch::default(), &mut Deltas::new(3))
         .expect_err("must be refused");
     assert_contains(&error.to_string(), &["NaN"]);
 }
 
 /// Returns the values of an attribute for writing.
-fn column_mut(parameters: &mut Parameters, column: Columns) -> &mut Vec<f64> {
+fn column_mut(parameters: &mut Parameters, column: Attributes) -> &mut Vec<f64> {
     match column {
-        Columns::POSITION => &mut parameters.position,
-        Columns::ROTATION => &mut parameters.rotation,
-        Columns::LOG_SCALE => &mut parameters.log_scale,
-        Columns::OPACITY => &mut parameters.opacity_logit,
+        Attributes::POSITION => &mut parameters.position,
+        Attributes::ROTATION => &mut parameters.rotation,
+        Attributes::LOG_SCALE => &mut parameters.log_scale,
+        Attributes::OPACITY => &mut parameters.opacity_logit,
         _ => &mut parameters.sh,
     }
 }
 
 /// Returns derivatives with respect to the state that are random in `columns` and 0 in other attributes.
-fn noisy_gradients(len: usize, columns: Columns) -> Gradients {
+fn noisy_gradients(len: usize, columns: Attributes) -> Gradients {
     let mut noise = Noise(5);
-    let mut gradients = Gradients::new(len, Columns::all(), 3);
+    let mut gradients = Gradients::new(len, Attributes::all(), 3);
     for column in columns.iter() {
         gradients.column_mut(column).planes_mut().iter_mut().for_each(|x| *x = noise.next());
     }
@@ -295,7 +297,7 @@ fn pulled_back(field: &Field, raw: &Gaussians, time: f64, gradients: &Gradients)
 
 /// Asserts that the derivatives of each attribute's state with respect to its own raw values match finite differences
 /// of the oracle.
-fn assert_derivatives_match_oracle(what: &str, config: FieldConfig, depth: usize, columns: Columns) {
+fn assert_derivatives_match_oracle(what: &str, config: FieldConfig, depth: usize, columns: Attributes) {
     let tensors = tensors(&config, depth);
     let oracle = Oracle { tensors: &tensors, config: &config };
     let (field, raw) = (build(&config, depth), random_gaussians(40));
@@ -323,26 +325,27 @@ fn assert_derivatives_match_oracle(what: &str, config: FieldConfig, depth: usize
                     "{what}, {} {c} of Gaussian {i} at {time}: got {got}, expected {expected} ± {tolerance}",
                     column.name()
                 );
-                clipped += usize::from(column == Columns::POSITION && got == weights[c] && got != 0.0);
+                clipped += usize::from(column == Attributes::POSITION && got == weights[c] && got != 0.0);
             }
         }
     }
-    let planes = columns.contains(Columns::POSITION) && !config.no_grid && config.active.contains(Columns::POSITION);
+    let planes =
+        columns.contains(Attributes::POSITION) && !config.no_grid && config.active.contains(Attributes::POSITION);
     assert!(!planes || clipped > 10, "{what}: only {clipped} coordinates lie outside the box");
 }
 
 #[test]
 fn derivatives_match_finite_differences_for_every_flag() {
-    let all = Columns::all();
+    let all = Attributes::all();
     assert_derivatives_match_oracle("plain", plain(), 1, all);
-    assert_derivatives_match_oracle("depth 3", plain(), 3, Columns::POSITION);
-    assert_derivatives_match_oracle("grid_pe", FieldConfig { grid_pe: 3, ..plain() }, 2, Columns::POSITION);
-    assert_derivatives_match_oracle("no_grid", FieldConfig { no_grid: true, ..plain() }, 2, Columns::POSITION);
+    assert_derivatives_match_oracle("depth 3", plain(), 3, Attributes::POSITION);
+    assert_derivatives_match_oracle("grid_pe", FieldConfig { grid_pe: 3, ..plain() }, 2, Attributes::POSITION);
+    assert_derivatives_match_oracle("no_grid", FieldConfig { no_grid: true, ..plain() }, 2, Attributes::POSITION);
     assert_derivatives_match_oracle("apply_rotation", FieldConfig { apply_rotation: true, ..plain() }, 1, all);
-    let fixed = FieldConfig { active: all.difference(Columns::POSITION | Columns::SH), ..plain() };
+    let fixed = FieldConfig { active: all.difference(Attributes::POSITION | Attributes::SH), ..plain() };
     assert_derivatives_match_oracle("without two heads", fixed, 1, all);
     // Under a mask the Jacobian of positions neglects the field.
-    let masked = all.difference(Columns::POSITION);
+    let masked = all.difference(Attributes::POSITION);
     assert_derivatives_match_oracle(
         "static_mlp",
         FieldConfig { static_mlp: true, apply_rotation: true, ..plain() },
@@ -356,12 +359,12 @@ fn derivatives_match_finite_differences_for_every_flag() {
 fn derivative_of_masked_positions_is_the_mask() {
     let field = build(&FieldConfig { empty_voxel: true, ..plain() }, 1);
     let raw = random_gaussians(40);
-    let (_, deltas) = states(&field, &raw, 0.3, Columns::all());
-    let by_state = noisy_gradients(raw.len(), Columns::POSITION);
+    let (_, deltas) = states(&field, &raw, 0.3, Attributes::all());
+    let by_state = noisy_gradients(raw.len(), Attributes::POSITION);
     let by_raw = pulled_back(&field, &raw, 0.3, &by_state);
     for (i, mask) in deltas.mask.unwrap().into_iter().enumerate() {
-        let expected = by_state.column(Columns::POSITION).row::<3>(i).map(|x| mask * x);
-        assert_eq!(by_raw.column(Columns::POSITION).row(i), expected, "Gaussian {i}");
+        let expected = by_state.column(Attributes::POSITION).row::<3>(i).map(|x| mask * x);
+        assert_eq!(by_raw.column(Attributes::POSITION).row(i), expected, "Gaussian {i}");
     }
 }
 
@@ -369,15 +372,15 @@ fn derivative_of_masked_positions_is_the_mask() {
 fn derivatives_do_not_depend_on_blocks() {
     let field = build(&FieldConfig { apply_rotation: true, ..plain() }, 2);
     let raw = random_gaussians(300);
-    let whole = field.jacobian(&raw, 0.6, Columns::all()).unwrap();
+    let whole = field.jacobian(&raw, 0.6, Attributes::all()).unwrap();
     for block in [1, 16, 37] {
         let rows: Vec<u32> = (0..300).collect();
         for ids in rows.chunks(block) {
-            let found = field.jacobian(&raw.pick(ids), 0.6, Columns::all()).unwrap();
+            let found = field.jacobian(&raw.pick(ids), 0.6, Attributes::all()).unwrap();
             assert!(found == whole.pick(ids), "blocks of {block}");
         }
     }
-    assert!(field.jacobian(&raw, 0.6, Columns::SH).unwrap() == Default::default());
+    assert!(field.jacobian(&raw, 0.6, Attributes::SH).unwrap() == Default::default());
 }
 
 #[test]
@@ -389,8 +392,8 @@ fn derivatives_at_odd_positions_are_finite() {
             raw.position.set_row(i, [value; 3]);
             raw.rotation.set_row(i, [0.0; 4]);
         }
-        let by_raw = pulled_back(&field, &raw, 0.6, &noisy_gradients(8, Columns::all()));
-        for column in Columns::all().iter() {
+        let by_raw = pulled_back(&field, &raw, 0.6, &noisy_gradients(8, Attributes::all()));
+        for column in Attributes::all().iter() {
             assert!(by_raw.column(column).planes().iter().all(|x| x.is_finite()), "{}", column.name());
         }
     }

@@ -1,6 +1,6 @@
 //! Mask of `empty_voxel`: a scalar grid over the box of the scene, sampled at canonical positions.
 
-use splat_core::Column;
+use splat_core::AttributeValues;
 use splat_core::error::{Error, Result};
 
 use super::tensors::Lookup;
@@ -38,7 +38,7 @@ impl VoxelMask {
     }
 
     /// Returns the mask of every Gaussian: trilinear interpolation, corners aligned, zero outside the box.
-    pub(super) fn sample(&self, position: &Column) -> Vec<f32> {
+    pub(super) fn sample(&self, position: &AttributeValues) -> Vec<f32> {
         (0..position.len()).map(|i| self.sample_one(position.row(i))).collect()
     }
 

@@ -184,7 +184,7 @@ pub const UNLIMITED_BYTES: u64 = 1 << 62;
 /// Text that the process writes to standard error before it ends because a mapped file was truncated: `before`, the
 /// path, `after`.
 #[derive(Debug, Clone, Copy)]
-pub struct CutShortMessage {
+pub struct TruncatedMapMessage {
     /// Text before the path.
     pub before: &'static str,
     /// Text in place of a path that is unknown.

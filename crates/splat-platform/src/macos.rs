@@ -5,7 +5,7 @@ use std::mem::{MaybeUninit, size_of};
 
 use rustix::process::{Resource, getrlimit};
 
-use crate::{CutShortMessage, LimitSource, MemoryLimit, MemoryLimits};
+use crate::{LimitSource, MemoryLimit, MemoryLimits, TruncatedMapMessage};
 
 /// Returns `None`: macOS does not tell whether reading the byte at `offset` needs disk access.
 pub fn is_cached(_file: &File, _offset: u64) -> Option<bool> {
@@ -13,7 +13,7 @@ pub fn is_cached(_file: &File, _offset: u64) -> Option<bool> {
 }
 
 /// Does nothing. macOS does not tell a process which file a page belongs to, so SIGBUS ends the process.
-pub fn report_cut_short_maps(_message: CutShortMessage) {}
+pub fn report_cut_short_maps(_message: TruncatedMapMessage) {}
 
 /// Returns the physical memory of the machine and the limits that `ulimit` sets for the process.
 pub fn memory_limits() -> MemoryLimits {

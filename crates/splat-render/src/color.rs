@@ -6,7 +6,7 @@
 use std::ops::Range;
 
 use super::convention::BLOCK;
-use splat_core::{Gaussians, HIGHEST_DEGREE, SH_C0, sh_coefficients};
+use splat_core::{Gaussians, MAX_SH_DEGREE, SH_C0, sh_coefficients};
 
 /// Red, green and blue of one block.
 pub(super) type Colors = [[f32; BLOCK]; 3];
@@ -45,7 +45,7 @@ pub(super) fn evaluate(gaussians: &Gaussians, ids: Range<usize>, center: [f64; 3
 /// Returns the number of SH coefficients per channel that are read.
 pub(super) fn coefficients(gaussians: &Gaussians) -> usize {
     let fits = |&degree: &usize| 3 * sh_coefficients(degree) <= gaussians.sh.width();
-    (0..=HIGHEST_DEGREE).rev().find(fits).map_or(0, sh_coefficients)
+    (0..=MAX_SH_DEGREE).rev().find(fits).map_or(0, sh_coefficients)
 }
 
 /// Returns the unit vector from `center` to `position`, and one over their distance.

@@ -5,7 +5,7 @@
 //! clamped at 0. The shift is undone with the opacity, which is the render of constant 1.
 
 use super::render;
-use splat_core::{Camera, Column, Gaussians, harmonic};
+use splat_core::{AttributeValues, Camera, Gaussians, harmonic};
 
 /// Computes Σ w·f over the Gaussians of each pixel, where w is the weight with which colors are blended.
 ///
@@ -14,10 +14,10 @@ use splat_core::{Camera, Column, Gaussians, harmonic};
 ///
 /// # Panics
 /// If the numbers of features and Gaussians differ.
-pub fn blend_features(gaussians: &Gaussians, features: &Column, camera: &Camera) -> Vec<f32> {
+pub fn blend_features(gaussians: &Gaussians, features: &AttributeValues, camera: &Camera) -> Vec<f32> {
     let (planes, pixels) = (features.width(), camera.width as usize * camera.height as usize);
     assert_eq!(features.len(), gaussians.len(), "expected as many features as Gaussians");
-    let mut state = Gaussians { sh: Column::zeros(3, gaussians.len()), ..gaussians.clone() };
+    let mut state = Gaussians { sh: AttributeValues::zeros(3, gaussians.len()), ..gaussians.clone() };
     state.sh.planes_mut().fill(harmonic(1.0));
     let opacity = render(&state, camera, [0.0; 3]).data;
     let mut blended = vec![0.0; planes * pixels];
@@ -74,8 +74,8 @@ mod tests {
     }
 
     /// Returns feature planes with values in [−3, 3).
-    fn features(planes: usize) -> Column {
-        let mut filled = Column::zeros(planes, 40);
+    fn features(planes: usize) -> AttributeValues {
+        let mut filled = AttributeValues::zeros(planes, 40);
         filled.planes_mut().iter_mut().enumerate().for_each(|(k, x)| *x = 6.0 * ((k as f32 * 0.618_034).fract() - 0.5));
         filled
     }
@@ -91,7 +91,7 @@ mod tests {
         let mut colors = features(3);
         colors.planes_mut().iter_mut().for_each(|x| *x = x.abs());
         let harmonics = colors.planes().iter().map(|&x| harmonic(x.into())).collect();
-        state.sh = Column::from_planes(3, harmonics);
+        state.sh = AttributeValues::from_planes(3, harmonics);
         let expected = render(&state, &camera, [0.0; 3]).data;
         assert!(expected.iter().any(|&x| x > 0.5));
         let off = largest_difference(&blend_features(&state, &colors, &camera), expected.iter().copied());
@@ -101,7 +101,7 @@ mod tests {
     #[test]
     fn blending_is_linear_in_features_of_either_sign() {
         let (state, camera) = scene();
-        let blend = |features: &Column| blend_features(&state, features, &camera);
+        let blend = |features: &AttributeValues| blend_features(&state, features, &camera);
         let (plain, mut other) = (features(7), features(7));
         let blended = blend(&plain);
         assert_eq!(blended.len(), 7 * 33 * 20);

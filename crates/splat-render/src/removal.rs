@@ -47,7 +47,7 @@ impl RemovalError {
 
     /// Returns the indices of `count` Gaussians, increasing: first those that are `fixed`, then those with the largest
     /// removal error. Ties go to the lower index.
-    pub fn most_missed(&self, count: usize, fixed: impl Fn(usize) -> bool) -> Vec<u32> {
+    pub fn top_by_error(&self, count: usize, fixed: impl Fn(usize) -> bool) -> Vec<u32> {
         let mut ids: Vec<u32> = (0..self.len() as u32).collect();
         // A stable sort keeps ties in index order.
         ids.sort_by_key(|&id| std::cmp::Reverse((fixed(id as usize), self.sum[id as usize])));

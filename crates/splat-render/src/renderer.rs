@@ -298,7 +298,7 @@ mod tests {
     use glam::{DMat3, DVec3};
 
     use super::*;
-    use splat_core::{Columns, Gradients};
+    use splat_core::{Attributes, Gradients};
 
     /// Returns 3000 Gaussians of all sizes, and a camera among them whose image does not end at a tile edge.
     fn scene() -> (Gaussians, Camera) {
@@ -333,7 +333,7 @@ mod tests {
         renderer.contribution(&scene, &camera, NonZeroU32::MIN, &mut seen);
         let mut errors = RemovalError::new(scene.len(), 0.1);
         renderer.removal_error(&scene, &camera, [0.3; 3], &mut errors);
-        let mut gradients = Gradients::new(scene.len(), Columns::all(), 0);
+        let mut gradients = Gradients::new(scene.len(), Attributes::all(), 0);
         let loss = |image: &Image| (0.0, image.clone());
         renderer.gradient(&scene, &camera, [0.3; 3], loss, &mut gradients);
         (renderer.render(&scene, &camera, [0.3; 3]), seen, errors, gradients)

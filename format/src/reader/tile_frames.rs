@@ -38,7 +38,7 @@ enum Counted {
 
 /// Byte ranges of tiles that were read in place and whose pages wait for [`Reader::release`].
 #[derive(Debug, Default)]
-pub struct Touched {
+pub struct TouchedPages {
     ranges: Vec<Range<u64>>,
     bytes: u64,
 }
@@ -56,7 +56,7 @@ impl Reader {
         at: TileId,
         buffer: &mut TileBuffer,
         frames: &mut TileFrames,
-        touched: Option<&mut Touched>,
+        touched: Option<&mut TouchedPages>,
     ) -> Result<()> {
         let (index, tile) = self.record(at)?;
         // Set at the end: after an error `frames` holds no tile.
@@ -71,7 +71,7 @@ impl Reader {
             None => None,
         };
         match (tile.encoding, mapped) {
-            (Encoding::Raw, mapped) => {
+            (Encoding::StoredParams, mapped) => {
                 let verified = match mapped {
                     Some(bytes) => self.verify_in_place(index, &tile, bytes)?,
                     None => self.verify_raw(index, &tile, &mut buffer.stored)?,
@@ -112,7 +112,7 @@ impl Reader {
         let plane = plane_len(&self.layout, &tile);
         assert!(out.len() == plane, "{} values for a frame of {tile:?}", out.len());
         match tile.encoding {
-            Encoding::Raw => {
+            Encoding::StoredParams => {
                 self.count_frame(frames, frame, 4 * plane);
                 let (offset, bytes) = (frame_offset(&tile, frame, plane), bytemuck::cast_slice_mut(&mut *out));
                 match frames.in_place {
@@ -136,7 +136,7 @@ impl Reader {
     pub fn frame<'a>(&'a self, frames: &mut TileFrames, frame: usize, buffer: &'a mut Vec<f32>) -> Result<&'a [f32]> {
         let (tile, stored) = self.loaded_frame(frames, frame);
         let plane = plane_len(&self.layout, &tile);
-        if tile.encoding == Encoding::Raw && frames.in_place && cfg!(target_endian = "little") {
+        if tile.encoding == Encoding::StoredParams && frames.in_place && cfg!(target_endian = "little") {
             let bytes = self.file.in_place(frame_offset(&tile, stored, plane), 4 * plane as u64)?;
             if let Ok(values) = bytemuck::try_cast_slice(bytes) {
                 self.count_frame(frames, stored, bytes.len());
@@ -161,7 +161,7 @@ impl Reader {
     }
 
     /// Releases the pages of tiles that were read in place, so that they no longer count as memory of this process.
-    pub fn release(&self, touched: &mut Touched) {
+    pub fn release(&self, touched: &mut TouchedPages) {
         touched.bytes = 0;
         touched.ranges.sort_unstable_by_key(|range| range.start);
         let mut merged: Range<u64> = 0..0;
@@ -215,18 +215,18 @@ impl TileFrames {
 
     /// Returns whether the loaded tile is raw and read in place, from the map.
     pub fn is_in_place(&self) -> bool {
-        self.in_place && self.tile.is_some_and(|tile| tile.encoding == Encoding::Raw)
+        self.in_place && self.tile.is_some_and(|tile| tile.encoding == Encoding::StoredParams)
     }
 }
 
-impl Touched {
+impl TouchedPages {
     /// Returns the number of bytes of the map that wait to be released.
     pub fn bytes(&self) -> u64 {
         self.bytes
     }
 
     /// Moves all ranges of `other` to this list.
-    pub fn append(&mut self, other: &mut Touched) {
+    pub fn append(&mut self, other: &mut TouchedPages) {
         self.ranges.append(&mut other.ranges);
         self.bytes += std::mem::take(&mut other.bytes);
     }

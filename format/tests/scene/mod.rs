@@ -3,7 +3,9 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use gseq::{ColumnSpec, Compression, Layout, Reader, TileBuffer, TileFrames, TileId, Touched, Writer, encode_tile};
+use gseq::{
+    ColumnSpec, Compression, Layout, Reader, TileBuffer, TileFrames, TileId, TouchedPages, Writer, encode_tile,
+};
 
 /// Creates a temporary folder, in memory if the system has one there: these tests sync thousands of files, which costs
 /// milliseconds each on a disk.
@@ -163,7 +165,7 @@ impl Scene {
                 assert!(got == bits, "{id:?}, in place {in_place}: wrong data");
             }
             for in_place in [true, false] {
-                let (mut one_by_one, mut touched) = (TileFrames::default(), Touched::default());
+                let (mut one_by_one, mut touched) = (TileFrames::default(), TouchedPages::default());
                 reader.load(id, &mut buffer, &mut one_by_one, in_place.then_some(&mut touched))?;
                 let (mut values, mut frame_buffer) = (vec![0.0; (width * len) as usize], Vec::new());
                 for (frame, bits) in bits.chunks_exact(values.len()).enumerate() {

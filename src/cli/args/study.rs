@@ -6,7 +6,7 @@ use clap::Args;
 
 use super::values::parse_ratio;
 use super::{Background, CameraFile, Earlier, Input, RecipeFlags};
-use splatsieve::diagnostics::precision::Turned;
+use splatsieve::diagnostics::precision::Knob;
 use splatsieve::evaluation::method::Method;
 
 /// `sweep`
@@ -60,7 +60,7 @@ pub(in crate::cli) struct PrecisionArgs {
     /// `percentiles`; f32 and f64 `sums`; radius and passes of `merging`; steps and views of `refining`; threads and memory of the
     /// `machine` [default: all; long inputs without the last three, which take whole runs]
     #[arg(long, value_name = "KNOBS", value_delimiter = ',',
-          value_parser = clap::builder::PossibleValuesParser::new(Turned::ALL.map(Turned::name)))]
+          value_parser = clap::builder::PossibleValuesParser::new(Knob::ALL.map(Knob::name)))]
     pub(in crate::cli) knobs: Vec<String>,
     /// Fraction of the Gaussians that every setting keeps
     #[arg(long, value_name = "FRACTION", default_value = "0.3", value_parser = parse_ratio)]

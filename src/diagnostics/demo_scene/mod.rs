@@ -17,7 +17,7 @@ use std::ops::Range;
 use glam::DVec3;
 
 use crate::error::{Error, Result};
-use crate::model::{Camera, Columns, Gaussians, Rig, SequenceInfo, Shot, Split};
+use crate::model::{Attributes, Camera, Gaussians, Rig, SequenceInfo, Shot, Split};
 use crate::source::{BlockReader, FrameSource, Ids};
 use bodies::{BodyLayout, DemoGaussian};
 
@@ -64,7 +64,7 @@ impl Scene {
             count,
             times: (0..frames).map(|frame| frame as f64 / last).collect(),
             sh_degree: SH_DEGREE,
-            varying: Columns::POSITION | Columns::ROTATION | Columns::OPACITY,
+            varying: Attributes::POSITION | Attributes::ROTATION | Attributes::OPACITY,
         };
         Scene { layout: BodyLayout::new(count), info }
     }
@@ -118,30 +118,30 @@ struct Reader<'a> {
 }
 
 impl BlockReader for Reader<'_> {
-    fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
+    fn read(&mut self, frame: usize, want: Attributes, out: &mut Gaussians) -> Result<()> {
         let Some(&time) = self.times.get(frame) else {
             return Err(Error::internal(format!("demo scene: no frame {frame}, it has {}", self.times.len())));
         };
         out.resize(self.parts.len());
-        let moving = want.intersects(Columns::POSITION | Columns::ROTATION | Columns::OPACITY);
+        let moving = want.intersects(Attributes::POSITION | Attributes::ROTATION | Attributes::OPACITY);
         for (i, part) in self.parts.iter().enumerate() {
             if moving {
                 let now = part.at(time);
-                if want.contains(Columns::POSITION) {
+                if want.contains(Attributes::POSITION) {
                     out.position.set_row(i, now.position.as_vec3().to_array());
                 }
-                if want.contains(Columns::ROTATION) {
+                if want.contains(Attributes::ROTATION) {
                     let q = now.rotation;
                     out.rotation.set_row(i, [q.w, q.x, q.y, q.z].map(|x| x as f32));
                 }
-                if want.contains(Columns::OPACITY) {
+                if want.contains(Attributes::OPACITY) {
                     out.opacity_logit.set_row(i, [now.opacity_logit as f32]);
                 }
             }
-            if want.contains(Columns::LOG_SCALE) {
+            if want.contains(Attributes::LOG_SCALE) {
                 out.log_scale.set_row(i, part.log_scale);
             }
-            if want.contains(Columns::SH) {
+            if want.contains(Attributes::SH) {
                 out.sh.set_row(i, part.sh);
             }
         }

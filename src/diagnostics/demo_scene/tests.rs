@@ -1,13 +1,13 @@
 //! The demo scene is what its bodies claim.
 
 use super::*;
-use crate::model::Column;
+use crate::model::AttributeValues;
 
 const ALPHA_MIN: f64 = 0.01;
 
 fn frame(scene: &Scene, ids: Ids<'_>, frame: usize) -> Gaussians {
     let mut out = Gaussians::zeros(0, SH_DEGREE);
-    scene.open(ids).unwrap().read(frame, Columns::all(), &mut out).unwrap();
+    scene.open(ids).unwrap().read(frame, Attributes::all(), &mut out).unwrap();
     out
 }
 
@@ -21,7 +21,7 @@ fn usual() -> Scene {
     Scene::new(Scene::COUNT, Scene::FRAMES)
 }
 
-fn point(column: &Column, i: usize) -> DVec3 {
+fn point(column: &AttributeValues, i: usize) -> DVec3 {
     DVec3::from_array(column.row::<3>(i).map(f64::from))
 }
 
@@ -29,7 +29,7 @@ fn opacity(state: &Gaussians, i: usize) -> f64 {
     1.0 / (1.0 + (-f64::from(state.opacity_logit.row::<1>(i)[0])).exp())
 }
 
-fn bits(column: &Column) -> Vec<u32> {
+fn bits(column: &AttributeValues) -> Vec<u32> {
     column.planes().iter().map(|x| x.to_bits()).collect()
 }
 
@@ -44,7 +44,7 @@ fn gaussian_and_frame_give_the_same_bits_in_any_block() {
         let picked = frame(&scene, Ids::List(&some), t);
         let check = |ids: &[usize], part: &Gaussians| {
             assert_eq!(part.len(), ids.len());
-            for column in Columns::all().iter() {
+            for column in Attributes::all().iter() {
                 let (whole, part) = (whole.column(column), part.column(column));
                 for c in 0..whole.width() {
                     for (i, &id) in ids.iter().enumerate() {
@@ -70,7 +70,7 @@ fn scene_of_any_size_is_finite_with_unit_rotations() {
         assert_eq!(DemoBody::ALL.iter().map(|&body| scene.members(body).len()).sum::<usize>(), count);
         for t in 0..frames {
             let state = frame(&scene, Ids::Range(0..count), t);
-            for column in Columns::all().iter() {
+            for column in Attributes::all().iter() {
                 assert!(state.column(column).planes().iter().all(|x| x.is_finite()), "{} of {count}", column.name());
             }
             for i in 0..count {
@@ -88,7 +88,7 @@ fn still_bodies_do_not_change_by_a_bit_and_constant_columns_never_do() {
         let film = film(&scene, body);
         let still =
             matches!(body, DemoBody::Wall | DemoBody::Double | DemoBody::Buried | DemoBody::Dust | DemoBody::Wire);
-        for column in Columns::all().iter() {
+        for column in Attributes::all().iter() {
             let constant = film.iter().all(|state| bits(state.column(column)) == bits(film[0].column(column)));
             let must = still || !scene.info().varying.contains(column);
             assert!(constant || !must, "{body:?} {}", column.name());
@@ -246,10 +246,10 @@ fn every_camera_sees_the_moving_things_and_none_a_buried_one_before_the_wall() {
 fn only_wanted_columns_are_written() {
     let scene = Scene::new(100, 2);
     let mut out = Gaussians::zeros(100, SH_DEGREE);
-    scene.open(Ids::Range(0..100)).unwrap().read(1, Columns::OPACITY | Columns::SH, &mut out).unwrap();
+    scene.open(Ids::Range(0..100)).unwrap().read(1, Attributes::OPACITY | Attributes::SH, &mut out).unwrap();
     let whole = frame(&scene, Ids::Range(0..100), 1);
     assert_eq!((&out.opacity_logit, &out.sh), (&whole.opacity_logit, &whole.sh));
-    for column in [Columns::POSITION, Columns::ROTATION, Columns::LOG_SCALE] {
+    for column in [Attributes::POSITION, Attributes::ROTATION, Attributes::LOG_SCALE] {
         assert!(out.column(column).planes().iter().all(|&x| x == 0.0), "{}", column.name());
     }
 }
@@ -260,7 +260,7 @@ fn what_the_scene_does_not_have_is_refused() {
     assert!(scene.open(Ids::Range(5..11)).err().unwrap().to_string().contains("no Gaussian 10"));
     assert!(scene.open(Ids::List(&[3, 99])).err().unwrap().to_string().contains("no Gaussian 99"));
     let mut out = Gaussians::zeros(0, SH_DEGREE);
-    let error = scene.open(Ids::Range(0..10)).unwrap().read(2, Columns::all(), &mut out).unwrap_err();
+    let error = scene.open(Ids::Range(0..10)).unwrap().read(2, Attributes::all(), &mut out).unwrap_err();
     assert!(error.to_string().contains("no frame 2"));
 }
 

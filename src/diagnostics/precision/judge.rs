@@ -4,11 +4,11 @@ use rayon::prelude::*;
 
 use crate::error::Result;
 use crate::metrics::psnr;
-use crate::model::{Camera, Columns, Picture};
-use crate::passes::{Batch, Subject, show};
+use crate::model::{Attributes, Camera, FrameView};
+use crate::passes::{Batch, RenderedSource, show};
 use crate::render::{Image, render};
 use crate::scene::Scene;
-use crate::scene::pictures::{PictureSet, pictures};
+use crate::scene::pictures::{ViewSet, pictures};
 use crate::source::Ids;
 
 /// Maximum number of views to judge by.
@@ -18,7 +18,7 @@ const PICTURES: usize = 24;
 ///
 /// Memory: 12 bytes for every pixel of at most 24 views.
 pub(super) struct Judge {
-    pictures: Vec<Picture>,
+    pictures: Vec<FrameView>,
     originals: Vec<Image>,
 }
 
@@ -38,11 +38,11 @@ impl Judge {
     /// # Errors
     /// Fails if the cameras have no views or if a frame cannot be read.
     pub(super) fn new(scene: &Scene) -> Result<Judge> {
-        let all = pictures(&scene.rig, &scene.source().info().times, PictureSet::HeldOut)?;
+        let all = pictures(&scene.rig, &scene.source().info().times, ViewSet::HeldOut)?;
         let count = all.len().min(PICTURES);
-        let pictures: Vec<Picture> = (0..count).map(|k| all[(2 * k + 1) * all.len() / (2 * count)]).collect();
+        let pictures: Vec<FrameView> = (0..count).map(|k| all[(2 * k + 1) * all.len() / (2 * count)]).collect();
         let mut originals = Vec::with_capacity(count);
-        render_views(scene, Subject::all(scene.source()), &pictures, |image| originals.push(image))?;
+        render_views(scene, RenderedSource::all(scene.source()), &pictures, |image| originals.push(image))?;
         Ok(Judge { pictures, originals })
     }
 
@@ -61,7 +61,7 @@ impl Judge {
     /// # Errors
     /// Fails if a frame cannot be read.
     pub(super) fn quality(&self, scene: &Scene, kept: &[u32]) -> Result<JudgedQuality> {
-        let subject = Subject { source: scene.source(), ids: Some(Ids::List(kept)), columns: Columns::all() };
+        let subject = RenderedSource { source: scene.source(), ids: Some(Ids::List(kept)), columns: Attributes::all() };
         let mut originals = self.originals.iter();
         let mut found = Vec::with_capacity(self.originals.len());
         render_views(scene, subject, &self.pictures, |image| {
@@ -81,7 +81,12 @@ impl JudgedQuality {
 }
 
 /// Renders `pictures` of `subject` and passes the images to `take` in order.
-fn render_views(scene: &Scene, subject: Subject<'_>, pictures: &[Picture], mut take: impl FnMut(Image)) -> Result<()> {
+fn render_views(
+    scene: &Scene,
+    subject: RenderedSource<'_>,
+    pictures: &[FrameView],
+    mut take: impl FnMut(Image),
+) -> Result<()> {
     let cameras: &[Camera] = &scene.schedule.cameras;
     show([subject], cameras, pictures, Batch::of_frame(&scene.limits), |views| {
         let images: Vec<Image> =

@@ -25,7 +25,7 @@ use crate::files::atomic::{Kind, MARKER, Replace, StagedFolder, check_target};
 use crate::files::names::name_of;
 use crate::journal::Journal;
 use crate::memory_plan::{Budget, Verbosity, Workload};
-use crate::model::{Rows, Schedule};
+use crate::model::{Rows, ViewSchedule};
 use crate::outputs::kind::check_folder_name;
 use crate::pipeline::planning::InputMeta;
 use crate::pipeline::stages::measure::Measure;
@@ -35,14 +35,14 @@ use crate::pruning::score::UserOverrides;
 use crate::recipe::Recipe;
 use crate::report::precision::{PAGE, page};
 use crate::scene::{InputOptions, Scene, open_scene};
-use crate::statistics::pass::Scanned;
+use crate::statistics::pass::ScanResult;
 use crate::statistics::score::Scores;
 use crate::statistics::score::sketch::MOST_BITS;
 use judge::Judge;
 
 /// Group of settings that is varied, called a knob.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Turned {
+pub enum Knob {
     /// First pass over the views: number of views, and strides of pixels, views and frames.
     Look,
     /// Pruning rounds: views per round, and the fraction that a round leaves.
@@ -59,43 +59,36 @@ pub enum Turned {
     Machine,
 }
 
-impl Turned {
+impl Knob {
     /// Knobs in the order of the pipeline.
-    pub const ALL: [Turned; 7] = [
-        Turned::Look,
-        Turned::Rounds,
-        Turned::Percentiles,
-        Turned::Sums,
-        Turned::Merging,
-        Turned::Refining,
-        Turned::Machine,
-    ];
+    pub const ALL: [Knob; 7] =
+        [Knob::Look, Knob::Rounds, Knob::Percentiles, Knob::Sums, Knob::Merging, Knob::Refining, Knob::Machine];
 
     /// Returns the name on the command line and in the results.
     pub fn name(self) -> &'static str {
         match self {
-            Turned::Look => "look",
-            Turned::Rounds => "rounds",
-            Turned::Percentiles => "percentiles",
-            Turned::Sums => "sums",
-            Turned::Merging => "merging",
-            Turned::Refining => "refining",
-            Turned::Machine => "machine",
+            Knob::Look => "look",
+            Knob::Rounds => "rounds",
+            Knob::Percentiles => "percentiles",
+            Knob::Sums => "sums",
+            Knob::Merging => "merging",
+            Knob::Refining => "refining",
+            Knob::Machine => "machine",
         }
     }
 
     /// Returns the reason why the scene or the recipe may have no settings for this knob.
     fn needs(self) -> &'static str {
         match self {
-            Turned::Sums => "sums over frames need three frames",
-            Turned::Refining => "the recipe refines nothing",
+            Knob::Sums => "sums over frames need three frames",
+            Knob::Refining => "the recipe refines nothing",
             _ => "the recipe ranks by no views",
         }
     }
 
     /// Returns whether each setting of the knob is a whole run.
     fn needs_whole_runs(self) -> bool {
-        matches!(self, Turned::Merging | Turned::Refining | Turned::Machine)
+        matches!(self, Knob::Merging | Knob::Refining | Knob::Machine)
     }
 }
 
@@ -107,7 +100,7 @@ pub struct PrecisionOptions {
     /// Recipe from which every setting starts.
     pub recipe: Recipe,
     /// Knobs to vary; `None`: all, but knobs with whole runs only if the model is short enough.
-    pub knobs: Option<Vec<Turned>>,
+    pub knobs: Option<Vec<Knob>>,
     /// Number of Gaussians that every setting keeps.
     pub target: Target,
     /// Maximum number of frames whose views are used for ranking, evenly from first to last.
@@ -142,7 +135,7 @@ struct Bench<'a> {
     /// Workload with all views.
     work: Workload,
     recipe: &'a Recipe,
-    scanned: Scanned,
+    scanned: ScanResult,
     judge: Judge,
     /// Number of Gaussians that every setting keeps.
     kept: usize,
@@ -272,11 +265,11 @@ fn open_with_cameras(input: &InputOptions) -> Result<Scene> {
 
 /// Returns the requested knobs; by default all, but for a long model without those that need whole runs, which is added
 /// to `notes`.
-fn chosen_knobs(options: &PrecisionOptions, gaussians: usize, frames: usize, notes: &mut Vec<String>) -> Vec<Turned> {
-    let mut knobs = Turned::ALL.to_vec();
+fn chosen_knobs(options: &PrecisionOptions, gaussians: usize, frames: usize, notes: &mut Vec<String>) -> Vec<Knob> {
+    let mut knobs = Knob::ALL.to_vec();
     knobs.retain(|knob| options.knobs.as_ref().is_none_or(|asked| asked.contains(knob)));
     let is_long = gaussians as u64 * frames as u64 > MAX_STATES_OF_WHOLE_RUNS;
-    let (left_out, chosen): (Vec<Turned>, Vec<Turned>) =
+    let (left_out, chosen): (Vec<Knob>, Vec<Knob>) =
         knobs.into_iter().partition(|knob| options.knobs.is_none() && is_long && knob.needs_whole_runs());
     if !left_out.is_empty() {
         let names: Vec<&str> = left_out.iter().map(|knob| knob.name()).collect();
@@ -301,28 +294,28 @@ fn write_files(found: &PrecisionDiagram, folder: &Path) -> Result<()> {
 
 impl Bench<'_> {
     /// Runs all settings of a knob; `None` if the scene or the recipe has none.
-    fn measure_knob(&self, knob: Turned) -> Result<Option<PrecisionKnob>> {
+    fn measure_knob(&self, knob: Knob) -> Result<Option<PrecisionKnob>> {
         match knob {
-            Turned::Look => self.look(),
-            Turned::Rounds => self.rounds(),
-            Turned::Percentiles => self.percentiles().map(Some),
-            Turned::Sums => self.sums(),
-            Turned::Merging => self.merging().map(Some),
-            Turned::Refining => self.refining(),
-            Turned::Machine => self.machine().map(Some),
+            Knob::Look => self.look(),
+            Knob::Rounds => self.rounds(),
+            Knob::Percentiles => self.percentiles().map(Some),
+            Knob::Sums => self.sums(),
+            Knob::Merging => self.merging().map(Some),
+            Knob::Refining => self.refining(),
+            Knob::Machine => self.machine().map(Some),
         }
     }
 }
 
 /// Returns the schedule with the views of at most `most` (at least one) of the frames that have views, evenly from
 /// first to last.
-fn thin_frames(mut schedule: Schedule, most: usize) -> Schedule {
+fn thin_frames(mut schedule: ViewSchedule, most: usize) -> ViewSchedule {
     let seen = schedule.iter().filter(|views| !views.is_empty()).count();
     let most = most.max(1);
     if seen <= most {
         return schedule;
     }
-    let mut thinned = Schedule::new(std::mem::take(&mut schedule.cameras));
+    let mut thinned = ViewSchedule::new(std::mem::take(&mut schedule.cameras));
     let (mut place, mut kept) = (0, 0);
     for views in schedule.iter() {
         let wanted = !views.is_empty() && kept < most && place == (2 * kept + 1) * seen / (2 * most);
@@ -337,19 +330,19 @@ fn thin_frames(mut schedule: Schedule, most: usize) -> Schedule {
 /// the next.
 fn thinned_bytes(work: &Workload, most: usize) -> u64 {
     let most = most.max(1) as u64;
-    if work.frames <= most { 0 } else { Schedule::bytes(2 * most, work.views) }
+    if work.frames <= most { 0 } else { ViewSchedule::bytes(2 * most, work.views) }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::model::{Columns, SequenceInfo};
+    use crate::model::{Attributes, SequenceInfo};
     use crate::models::MemoryProfile;
 
     #[test]
     fn thinning_keeps_even_frames_with_all_views() {
         let frames_kept = |frames: usize, most: usize| -> Vec<usize> {
-            let mut schedule = Schedule::default();
+            let mut schedule = ViewSchedule::default();
             for frame in 0..frames {
                 schedule.push(1, if frame % 2 == 0 { &[(0, 0), (1, 1)] } else { &[] });
             }
@@ -364,8 +357,8 @@ mod tests {
 
     #[test]
     fn thinned_schedules_are_counted_in_memory() {
-        let info = SequenceInfo { count: 1, times: vec![0.0; 1000], sh_degree: 0, varying: Columns::empty() };
-        let work = Workload { views: 3, ..Workload::new(&info, MemoryProfile::of_tiles(1)) };
+        let info = SequenceInfo { count: 1, times: vec![0.0; 1000], sh_degree: 0, varying: Attributes::empty() };
+        let work = Workload { views: 3, ..Workload::new(&info, MemoryProfile::for_tiles(1)) };
         assert_eq!((thinned_bytes(&work, 1000), thinned_bytes(&work, 5000)), (0, 0));
         // Two runs of 16 bytes, and a pair of 8 for every view.
         assert!(thinned_bytes(&work, 60) >= 60 * (2 * 16 + 3 * 8));

@@ -19,7 +19,7 @@ use crate::pruning::visible::Visible;
 use crate::pruning::{Overrides, select};
 use crate::recipe::{self, Recipe};
 use crate::statistics::score::sketch::MOST_BITS;
-use crate::statistics::score::{Graded, PercentilePasses, Scores, score_by};
+use crate::statistics::score::{PercentilePasses, Quantity, Scores, score_with_passes};
 
 /// Numbers of views of the first pass or a round that are tried, up to the number of existing views.
 const PICTURES_TRIED: [usize; 9] = [6, 12, 25, 50, 100, 200, 400, 800, 1600];
@@ -71,7 +71,7 @@ impl Bench<'_> {
         let last = (all as f64, 1.0 / all.max(1) as f64);
         let mut curves = vec![self.pass_curve("look_pictures", counts, (last, &finest, &cost), Some(own as f64))?];
         let frames_with_views = self.scene.schedule.iter().filter(|views| !views.is_empty()).count();
-        let views = self.scene.schedule.most_views();
+        let views = self.scene.schedule.max_views_per_frame();
         type SetStride = fn(&mut recipe::ScanParams, NonZeroU32);
         let strides: [(&str, usize, SetStride); 3] = [
             ("pixel_stride", usize::MAX, |scan, stride| scan.pixel_stride = stride),
@@ -91,7 +91,7 @@ impl Bench<'_> {
                 "The first pass over the views: contributions C and W of every Gaussian from some of the views, and \
                     which Gaussians the scores based on these keep, before any pruning round."
                     .to_owned(),
-            source: Source::Discretisation,
+            source: Source::Discretization,
             curves,
         }))
     }
@@ -155,7 +155,7 @@ impl Bench<'_> {
         let own_pictures = own.round_pictures.min(most);
         let mut by_pictures = Vec::new();
         for count in tried(PICTURES_TRIED.into_iter().filter(|&count| count < most).chain([own_pictures, most])) {
-            let select = recipe::Select { round_pictures: count, ..own.clone() };
+            let select = recipe::SelectParams { round_pictures: count, ..own.clone() };
             by_pictures.push(self.rank_by(&scored, &select, count as f64, 1.0 / count as f64)?);
         }
         let mut fractions: Vec<f64> = FRACTIONS.into_iter().chain([own.round_fraction]).filter(|&f| f < 1.0).collect();
@@ -163,7 +163,7 @@ impl Bench<'_> {
         fractions.dedup();
         let mut by_fraction = Vec::new();
         for fraction in fractions {
-            let select = recipe::Select { round_fraction: fraction, ..own.clone() };
+            let select = recipe::SelectParams { round_fraction: fraction, ..own.clone() };
             by_fraction.push(self.rank_by(&scored, &select, fraction, -fraction.ln())?);
         }
         let own = (Some(own_pictures as f64), Some(own.round_fraction));
@@ -176,13 +176,13 @@ impl Bench<'_> {
             about:
                 "Pruning rounds, each ranked by removal error: views of each round, and the fraction that each leaves."
                     .to_owned(),
-            source: Source::Discretisation,
+            source: Source::Discretization,
             curves,
         }))
     }
 
     /// Ranks by the rounds of `select`, and measures the cost.
-    fn rank_by(&self, scored: &Scored, select: &recipe::Select, value: f64, step: f64) -> Result<TriedRanking> {
+    fn rank_by(&self, scored: &Scored, select: &recipe::SelectParams, value: f64, step: f64) -> Result<TriedRanking> {
         let rounds = Rounds::from_recipe(select, None);
         let rank = || {
             let order = match &rounds {
@@ -201,7 +201,7 @@ impl Bench<'_> {
         let rows = scored.rows()?;
         let frames = self.scene.source().info().times.len();
         let by = |passes: PercentilePasses| -> Result<(Scores, Cost)> {
-            self.repeats.measure(|| Ok(score_by(passes, &rows, frames, &self.recipe.score)), || Ok(()))
+            self.repeats.measure(|| Ok(score_with_passes(passes, &rows, frames, &self.recipe.score)), || Ok(()))
         };
         let (exact, cost) = by(PercentilePasses::Two)?;
         let staying = scored.selection.counts.kept;
@@ -227,7 +227,7 @@ impl Bench<'_> {
         Ok(PrecisionKnob {
             name: "percentiles".to_owned(),
             about: "Percentiles from one pass over the values: mantissa bits of the histogram's keys.".to_owned(),
-            source: Source::Discretisation,
+            source: Source::Discretization,
             curves: vec![curve],
         })
     }
@@ -276,7 +276,7 @@ fn relative_error(count: usize, expected: usize) -> f64 {
 /// skipped, because their values differ themselves.
 fn worst_percentile_error(scores: &Scores, exact: &Scores) -> f64 {
     let pairs = scores.terms.iter().zip(&exact.terms);
-    let pairs = pairs.filter(|(term, _)| !matches!(term.of, Graded::Static | Graded::Dynamic));
+    let pairs = pairs.filter(|(term, _)| !matches!(term.of, Quantity::Static | Quantity::Dynamic));
     let errors = pairs.flat_map(|(rough, exact)| {
         [(rough.norm.p1, exact.norm.p1), (rough.norm.p99, exact.norm.p99)]
             .map(|(rough, exact)| if exact == 0.0 { 0.0 } else { (rough / exact - 1.0).abs() })

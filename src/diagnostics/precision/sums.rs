@@ -10,7 +10,7 @@ use num_traits::Float;
 use super::Bench;
 use crate::error::Result;
 use crate::evaluation::precision::{PrecisionCurve, PrecisionKnob, PrecisionSetting, Source, relative_l2};
-use crate::model::{Columns, Flags, Gaussians, Schedule, opacity};
+use crate::model::{Attributes, Flags, Gaussians, ViewSchedule, opacity};
 use crate::passes::FrameReaders;
 use crate::recipe::{self, MotionParams, Recipe};
 use crate::source::{BlockReader, Ids, ReadPlan};
@@ -99,7 +99,7 @@ impl Bench<'_> {
         let count = ids.len().min(GAUSSIANS);
         let ids: Vec<u32> = (0..count).map(|k| ids[k * ids.len() / count]).collect();
         let shown: Vec<usize> = (0..frames).step_by(every).collect();
-        let columns = Columns::POSITION | Columns::OPACITY;
+        let columns = Attributes::POSITION | Attributes::OPACITY;
         let mut reader = FrameReaders::open(source, Ids::List(&ids), NEEDED, &ReadPlan::new(shown.iter().copied()))?;
         let mut states = Vec::with_capacity(shown.len());
         for frame in shown {
@@ -210,9 +210,9 @@ fn sum_statistics<T: Float, S: Sum<T>>(states: &[Decoded], frames_played: usize)
 }
 
 /// Computes D, κ and V with the scan itself; all Gaussians count as alive.
-fn scan_statistics(states: &[Gaussians], frames_played: usize, changed: Columns) -> Result<SummedStatistics> {
+fn scan_statistics(states: &[Gaussians], frames_played: usize, changed: Attributes) -> Result<SummedStatistics> {
     let times: Vec<f64> = (0..frames_played).map(|k| k as f64).collect();
-    let mut schedule = Schedule::default();
+    let mut schedule = ViewSchedule::default();
     schedule.push(frames_played, &[]);
     let scan = recipe::ScanParams { alpha_min: 0.0, motion: MotionParams::Runs, ..Recipe::preset("default")?.scan };
     let plan = ScanPlan::new(&scan, &times, &schedule)?;

@@ -6,7 +6,7 @@ use super::case::{Case, LargestError};
 use crate::deform::oracle::{Oracle, Parameters};
 use crate::deform::synthetic::{Noise, plain, tensors};
 use crate::deform::{Deltas, Field, FieldConfig, Scratch};
-use crate::model::{Columns, Gaussians};
+use crate::model::{Attributes, Gaussians};
 
 /// Compares states with the definition, relative to 1 + |value|; the bound allows some 60 roundings in f32.
 pub(super) fn states() -> Case {
@@ -24,9 +24,9 @@ pub(super) fn states() -> Case {
             let prepared = field.prepare(&raw.position);
             for time in [0.0, 0.37, 1.0] {
                 let mut deltas = Deltas::new(3);
-                field.deltas(&prepared, time, Columns::all(), &mut Scratch::default(), &mut deltas)?;
+                field.deltas(&prepared, time, Attributes::all(), &mut Scratch::default(), &mut deltas)?;
                 let mut state = Gaussians::zeros(0, 3);
-                deltas.apply(&raw, Columns::all(), &mut state);
+                deltas.apply(&raw, Attributes::all(), &mut state);
                 for i in 0..raw.len() {
                     let got = Parameters::from_row(&state, i).values();
                     let oracle = Oracle { tensors: &tensors, config: &config };
@@ -48,9 +48,9 @@ pub(super) fn derivative() -> Case {
         let field = Field::new(&tensors, config.clone(), 3, Path::new("made up"))?;
         let oracle = Oracle { tensors: &tensors, config: &config };
         let raw = random_gaussians(40);
-        let found = field.jacobian(&raw, time, Columns::POSITION)?;
+        let found = field.jacobian(&raw, time, Attributes::POSITION)?;
         let mut worst = LargestError::default();
-        worst.same(&found.column(Columns::POSITION).width(), &9);
+        worst.same(&found.column(Attributes::POSITION).width(), &9);
         for i in 0..raw.len() {
             for input in 0..3 {
                 let [low, high] = [-step, step].map(|step| {
@@ -60,7 +60,7 @@ pub(super) fn derivative() -> Case {
                 });
                 for output in 0..3 {
                     let expected = (high[output] - low[output]) / (2.0 * step);
-                    let got = f64::from(found.column(Columns::POSITION).plane(3 * output + input)[i]);
+                    let got = f64::from(found.column(Attributes::POSITION).plane(3 * output + input)[i]);
                     worst.near(got, expected, 1.0 + expected.abs());
                 }
             }
@@ -73,7 +73,7 @@ pub(super) fn derivative() -> Case {
 fn random_gaussians(count: usize) -> Gaussians {
     let mut noise = Noise(99);
     let mut random_gaussians = Gaussians::zeros(count, 3);
-    for column in random_gaussians.columns_mut(Columns::all()) {
+    for column in random_gaussians.columns_mut(Attributes::all()) {
         column.planes_mut().iter_mut().for_each(|x| *x = 2.0 * noise.next());
     }
     random_gaussians

@@ -8,7 +8,7 @@ use crate::error::{Error, Result};
 use crate::merging::moments::{Ellipsoid, WeightedGaussian, align_axes, moments};
 use crate::merging::proxy::{Importance, merge_state, weights};
 use crate::merging::{Survivors, run};
-use crate::model::{Columns, Gaussians};
+use crate::model::{Attributes, Gaussians};
 use crate::recipe::{MergeParams, Placement, ProxyOpacity, Recipe};
 
 /// Compares moments with Σ formed in f64, relative to its largest entry; a dozen parts lose some 1e-15.
@@ -61,7 +61,7 @@ pub(super) fn proxy() -> Case {
         let importance = Importance { ids: &rows, coverage: &coverage, visibility: &visibility };
         let members: Vec<(u32, f64)> = rows.into_iter().zip(weights(&rows, &importance, &states)).collect();
         let recipe = MergeParams { placement: Placement::Mean, ..recipe(ProxyOpacity::Union)? };
-        let found = merge_state(&members, &states, 2, &recipe, Columns::all());
+        let found = merge_state(&members, &states, 2, &recipe, Attributes::all());
 
         let mut worst = LargestError::default();
         let parts: Vec<WeightedGaussian> = (0..5).map(|i| part(&states, i, seen[i] / total)).collect();
@@ -105,7 +105,7 @@ pub(super) fn duplicates() -> Case {
             let mut sorted = members;
             sorted.sort_unstable();
             worst.same(&sorted[..], &[&rows[..8], &rows[8..]]);
-            for column in (Columns::POSITION | Columns::LOG_SCALE | Columns::SH).iter() {
+            for column in (Attributes::POSITION | Attributes::LOG_SCALE | Attributes::SH).iter() {
                 worst.same(merged.proxies.column(column).planes(), states.column(column).pick(&[0]).planes());
             }
             let logit = f64::from(merged.proxies.opacity_logit.planes().first().copied().unwrap_or(f32::NAN));

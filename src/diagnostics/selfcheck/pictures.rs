@@ -7,9 +7,9 @@ use glam::DVec3;
 
 use super::case::{Case, LargestError};
 use super::made::clouds::{Random, camera, plain_camera, scene, single};
-use super::oracle::picture::{blended, decided, picture};
+use super::oracle::picture::{blended, picture, render_blended};
 use crate::metrics::{psnr, ssim};
-use crate::model::{Camera, Columns, Gaussians, Gradients};
+use crate::model::{Attributes, Camera, Gaussians, Gradients};
 use crate::render::{Contribution, Image, RemovalError, Renderer, render};
 
 const BACKGROUND: [f32; 3] = [0.1, 0.9, 0.4];
@@ -76,12 +76,12 @@ pub(super) fn removal() -> Case {
         let mut found = RemovalError::new(scene.len(), 0.0);
         Renderer::new().removal_error(&scene, &camera, BACKGROUND, &mut found);
         let all = blended(&scene, &camera);
-        let whole = decided(&scene, &camera, BACKGROUND, &all);
+        let whole = render_blended(&scene, &camera, BACKGROUND, &all);
         let mut worst = LargestError::default();
         for i in 0..scene.len() {
             let others: Vec<Vec<usize>> =
                 all.iter().map(|ids| ids.iter().copied().filter(|&id| id != i).collect()).collect();
-            let without = decided(&scene, &camera, BACKGROUND, &others);
+            let without = render_blended(&scene, &camera, BACKGROUND, &others);
             let values = whole.as_flattened().iter().zip(without.as_flattened());
             let expected: f64 = values.map(|(a, b)| (a - b).powi(2)).sum();
             worst.near(found.sum[i] as f64 * RemovalError::UNIT, expected, 1.0 + expected);
@@ -126,7 +126,7 @@ pub(super) fn gradients() -> Case {
         let mut random = Random(103);
         let target: Vec<f64> = (0..3 * doubtful.len()).map(|_| random.draw().into()).collect();
         let residual = |at: usize, value: f64| if doubtful[at / 3] { 0.0 } else { value - target[at] };
-        let mut found = Gradients::new(scene.len(), Columns::all(), 3);
+        let mut found = Gradients::new(scene.len(), Attributes::all(), 3);
         let slope = |image: &Image| {
             let data = image.data.iter().enumerate().map(|(at, &x)| residual(at, x.into()) as f32).collect();
             (0.0, Image { data, ..*image })
@@ -136,12 +136,12 @@ pub(super) fn gradients() -> Case {
         // The blended Gaussians are fixed beforehand, so that the loss has no steps.
         let blended = blended(&scene, &camera);
         let loss = |changed: &Gaussians| -> f64 {
-            let pixels = decided(changed, &camera, BACKGROUND, &blended);
+            let pixels = render_blended(changed, &camera, BACKGROUND, &blended);
             let squares = pixels.as_flattened().iter().enumerate().map(|(at, &x)| residual(at, x).powi(2));
             0.5 * squares.sum::<f64>()
         };
         let mut worst = LargestError::default();
-        for column in Columns::all().iter() {
+        for column in Attributes::all().iter() {
             let got = found.column(column).planes();
             let mut largest: Vec<usize> = (0..got.len()).collect();
             largest.sort_by(|&a, &b| got[b].abs().total_cmp(&got[a].abs()));

@@ -2,7 +2,7 @@
 
 use super::case::{Case, LargestError};
 use super::made::clouds::Random;
-use crate::model::Column;
+use crate::model::AttributeValues;
 use crate::model::RobustBox;
 use crate::statistics::score::FloatSketch;
 
@@ -29,7 +29,7 @@ pub(super) fn robust_box() -> Case {
         for count in [1, 100, 1003] {
             let axes = [7, 8, 9].map(|seed| (0..count).map(|i| values(count)[(i * seed) % count] as f32).collect());
             let axes: [Vec<f32>; 3] = axes;
-            let found = RobustBox::from_positions(&Column::from_planes(3, axes.concat()));
+            let found = RobustBox::from_positions(&AttributeValues::from_planes(3, axes.concat()));
             for (axis, values) in axes.iter().enumerate() {
                 let values: Vec<f64> = values.iter().map(|&x| x.into()).collect();
                 for (got, p) in [(found.low, 1), (found.middle, 50), (found.high, 99)] {

@@ -8,7 +8,7 @@ use super::case::{Case, LargestError};
 use super::made::clouds::{Random, camera};
 use super::oracle::statistics::{OracleRow, row};
 use crate::error::Result;
-use crate::model::{Camera, Columns, Gaussians, Rows, Schedule};
+use crate::model::{Attributes, Camera, Gaussians, Rows, ViewSchedule};
 use crate::recipe::{MotionParams, Recipe, ScanParams};
 use crate::statistics::{BlockScan, ScanPlan};
 
@@ -139,7 +139,7 @@ pub(super) fn projected_area() -> Case {
     Case::new("projected area", "C, Vis: full matrices, f64 (px)", 1e-9, || {
         let frames = random_frames(500, 3);
         let cameras = vec![camera(320, 256), camera(40, 300)];
-        let mut schedule = Schedule::new(cameras);
+        let mut schedule = ViewSchedule::new(cameras);
         schedule.push(frames.len(), &[(0, 0), (1, 1)]);
         let recipe = recipe(MotionParams::Runs)?;
         let got = scan(&frames, &schedule, &recipe)?;
@@ -171,7 +171,7 @@ pub(super) fn needle_on_screen() -> Case {
             rotation: DMat3::IDENTITY,
             translation: DVec3::ZERO,
         };
-        let mut schedule = Schedule::new(vec![camera]);
+        let mut schedule = ViewSchedule::new(vec![camera]);
         schedule.push(1, &[(0, 0)]);
         let mut worst = LargestError::default();
         for (turn, length) in [(0.1f32, 1e2f64), (0.4, 1e3), (0.9, 1e4), (1.3, 1e5)] {
@@ -264,26 +264,26 @@ fn recipe(motion: MotionParams) -> Result<ScanParams> {
     Ok(ScanParams { motion, ..Recipe::preset("default")?.scan })
 }
 
-fn without_views(frames: usize) -> Schedule {
-    let mut schedule = Schedule::default();
+fn without_views(frames: usize) -> ViewSchedule {
+    let mut schedule = ViewSchedule::default();
     schedule.push(frames, &[]);
     schedule
 }
 
 /// Returns the statistics of evenly spaced frames.
-fn scan(frames: &[Gaussians], schedule: &Schedule, recipe: &ScanParams) -> Result<Rows> {
+fn scan(frames: &[Gaussians], schedule: &ViewSchedule, recipe: &ScanParams) -> Result<Rows> {
     let times: Vec<f64> = (0..frames.len()).map(|t| t as f64).collect();
     scan_at(&times, frames, schedule, recipe)
 }
 
 /// Returns the statistics of frames at `times`; reports unchanged opacities to the scan, as sources do.
-fn scan_at(times: &[f64], frames: &[Gaussians], schedule: &Schedule, recipe: &ScanParams) -> Result<Rows> {
+fn scan_at(times: &[f64], frames: &[Gaussians], schedule: &ViewSchedule, recipe: &ScanParams) -> Result<Rows> {
     let plan = ScanPlan::new(recipe, times, schedule)?;
     let mut block = BlockScan::new(frames.first().map_or(0, Gaussians::len), 0, &plan);
     for (t, (frame, views)) in frames.iter().zip(schedule.iter()).enumerate() {
         let cameras: Vec<&Camera> = views.iter().map(|&(_, camera)| &schedule.cameras[camera as usize]).collect();
         let stays = t > 0 && frame.opacity_logit == frames[t - 1].opacity_logit;
-        let changed = if stays { Columns::all().difference(Columns::OPACITY) } else { Columns::all() };
+        let changed = if stays { Attributes::all().difference(Attributes::OPACITY) } else { Attributes::all() };
         block.frame(t, frame, &cameras, changed);
     }
     Ok(block.finish().rows)

@@ -16,7 +16,7 @@ use crate::error::{Error, Result};
 use crate::files::atomic::ScratchFolder;
 use crate::files::container::Container;
 use crate::limits::ReadLimit;
-use crate::model::{Columns, Gaussians, SequenceInfo};
+use crate::model::{Attributes, Gaussians, SequenceInfo};
 use crate::outputs::bounds::{Bounds, MaxError};
 use crate::outputs::container::{Packing, write_container};
 use crate::source::{BlockReader, FrameSource, Ids};
@@ -26,7 +26,7 @@ pub(super) fn container() -> Case {
     Case::new("container", "values of 70 frames: the same bits", 0.0, || {
         let mut worst = LargestError::default();
         let written = MemoryFrames::new();
-        for compression in [Compression::Raw, Compression::Zstd(1)] {
+        for compression in [Compression::StoredParams, Compression::Zstd(1)] {
             compare_round_trip(&written, compression, |got, expected, _| {
                 worst.same(&got.to_bits(), &expected.to_bits())
             })?;
@@ -40,7 +40,7 @@ pub(super) fn bounded_container() -> Case {
     Case::new("container in bounds", "values: within 1 bound of theirs", 1.0, || {
         let mut worst = LargestError::default();
         let mut written = MemoryFrames::new();
-        for column in written.frames.iter_mut().flat_map(|frame| frame.columns_mut(Columns::all())) {
+        for column in written.frames.iter_mut().flat_map(|frame| frame.columns_mut(Attributes::all())) {
             column.planes_mut().iter_mut().filter(|x| !x.is_finite()).for_each(|x| *x = 0.0);
         }
         let requested = ["position=1e-3", "rotation=2e-3", "log_scale=0.01", "opacity_logit=0.02", "sh=0.005"];
@@ -127,7 +127,7 @@ fn used_attributes(content: &Content) -> usize {
 fn compare_round_trip(
     written: &MemoryFrames,
     packing: impl Into<Packing>,
-    mut compare: impl FnMut(f32, f32, Columns),
+    mut compare: impl FnMut(f32, f32, Attributes),
 ) -> Result<()> {
     let folder = ScratchFolder::new(&std::env::temp_dir())?;
     let path = folder.path().join("made.gseq");
@@ -136,8 +136,8 @@ fn compare_round_trip(
     let mut reader = container.open(Ids::Range(0..written.info.count))?;
     let mut state = Gaussians::zeros(0, written.info.sh_degree);
     for (frame, expected) in written.frames.iter().enumerate() {
-        reader.read(frame, Columns::all(), &mut state)?;
-        for column in Columns::all().iter() {
+        reader.read(frame, Attributes::all(), &mut state)?;
+        for column in Attributes::all().iter() {
             // A missing value counts as NaN.
             let got = state.column(column).planes().iter().copied().chain(repeat(f32::NAN));
             let values = got.zip(expected.column(column).planes());
@@ -175,7 +175,7 @@ impl MemoryFrames {
             now.clone()
         };
         let frames = (0..times).map(&mut frame).collect();
-        let varying = Columns::POSITION | Columns::ROTATION | Columns::OPACITY;
+        let varying = Attributes::POSITION | Attributes::ROTATION | Attributes::OPACITY;
         let times = (0..times).map(|t| t as f64).collect();
         MemoryFrames { info: SequenceInfo { count, times, sh_degree: 1, varying }, frames }
     }
@@ -197,7 +197,7 @@ struct StoredRows<'a> {
 }
 
 impl BlockReader for StoredRows<'_> {
-    fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
+    fn read(&mut self, frame: usize, want: Attributes, out: &mut Gaussians) -> Result<()> {
         for column in want.iter() {
             *out.column_mut(column) = self.frames[frame].column(column).pick(&self.rows);
         }

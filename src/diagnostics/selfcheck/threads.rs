@@ -9,7 +9,7 @@ use crate::diagnostics::demo::DemoOptions;
 use crate::error::{Error, Result};
 use crate::files::atomic::{Replace, ScratchFolder};
 use crate::memory_plan::Budget;
-use crate::model::{Columns, Gradients};
+use crate::model::{Attributes, Gradients};
 use crate::pipeline::Target;
 use crate::progress::Events;
 use crate::recipe::Recipe;
@@ -48,7 +48,7 @@ fn run_on(threads: usize) -> Result<(Vec<u8>, Gradients)> {
         let path = output.join("compressed.gseq");
         let bytes = fs::read(&path).map_err(Error::io("read", &path))?;
         let scene = scene(31, 3000, 1);
-        let mut gradients = Gradients::new(scene.len(), Columns::all(), 1);
+        let mut gradients = Gradients::new(scene.len(), Attributes::all(), 1);
         let loss = |picture: &Image| (0.0, picture.clone());
         Renderer::on_all_threads().gradient(&scene, &camera(80, 60), [0.5; 3], loss, &mut gradients);
         Ok((bytes, gradients))

@@ -147,7 +147,8 @@ fn impossible_targets_are_refused() {
     assert!(refusal(&base.path().join("file/out"), Kind::File, &[], Replace::Never).contains("is not a folder"));
     for nameless in ["", "/", ".."] {
         assert!(
-            refusal(Path::new(nameless), Kind::Folder, &[], Replace::Existing).contains("cannot be the name of an output"),
+            refusal(Path::new(nameless), Kind::Folder, &[], Replace::Existing)
+                .contains("cannot be the name of an output"),
             "{nameless}"
         );
     }

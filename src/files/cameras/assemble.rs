@@ -88,11 +88,11 @@ impl Assembly {
         if total > MAX_IMAGES {
             return Err(Error::input(file, "", format!("at most {MAX_IMAGES} images"), total.to_string()));
         }
-        self.memory_counter.take(file, "", &format!("{count} images"), Rig::SHOT_BYTES * count as u64)?;
+        self.memory_counter.take(file, "", &format!("{count} images"), Rig::BYTES_PER_VIEW * count as u64)?;
         self.rig.shots.reserve_exact(count);
         // Usually either every camera is new or few are. Reserved memory that stays unused costs nothing, but copying
         // the list would.
-        let affordable = self.memory_counter.limit.bytes() / 4 / Rig::CAMERA_BYTES;
+        let affordable = self.memory_counter.limit.bytes() / 4 / Rig::BYTES_PER_CAMERA;
         self.rig.cameras.reserve_exact(count.min(affordable.min(1 << 20) as usize));
         self.files.push((file.to_owned(), self.rig.shots.len()));
         self.taken = 0;
@@ -125,7 +125,7 @@ impl Assembly {
         let camera = match found {
             Some(camera) => camera,
             None => {
-                self.memory_counter.take(path, &place(Some(frame)), "the cameras", Rig::CAMERA_BYTES)?;
+                self.memory_counter.take(path, &place(Some(frame)), "the cameras", Rig::BYTES_PER_CAMERA)?;
                 if cameras.len() == cameras.capacity() {
                     // The old list and the new one exist at the same time while one is copied to the other.
                     let more = (cameras.len() / 4).max(64);

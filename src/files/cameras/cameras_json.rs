@@ -27,7 +27,7 @@ use super::fields::{CameraFields, place};
 use super::image_list::each_image;
 use super::times::{self, Times};
 use crate::error::Result;
-use crate::files::json::small::Small;
+use crate::files::json::small::SmallValue;
 use crate::files::names::shown_name;
 use crate::limits::ReadLimit;
 use crate::model::{Camera, Rig, Split};
@@ -38,7 +38,7 @@ const IMAGE_KEYS: [&str; 11] = ["w2c", "split", "width", "height", "fx", "fy", "
 const CAMERA_KEYS: [&str; 7] = ["width", "height", "fx", "fy", "img_name", "rotation", "position"];
 
 /// Reads this project's own format. `outline` holds the keys outside the list of images.
-pub(super) fn load_per_image(file: &Path, outline: &Small, memory: ReadLimit) -> Result<Rig> {
+pub(super) fn load_per_image(file: &Path, outline: &SmallValue, memory: ReadLimit) -> Result<Rig> {
     let shared = CameraFields::new(file, None, outline)?;
     let background = shared.optional_vector("background")?;
     if background.is_some_and(|rgb| rgb.iter().any(|c| !(0.0..=1.0).contains(c))) {
@@ -92,7 +92,7 @@ pub(super) fn load_per_camera(file: &Path, count: usize, options: &CameraOptions
         let mut names: Vec<Box<str>> = Vec::new();
         each_image(file, None, &["img_name"], |index, camera| {
             let name = match camera.get("img_name") {
-                Some(Small::Text(name)) => name.clone(),
+                Some(SmallValue::Text(name)) => name.clone(),
                 _ => "".into(),
             };
             assembly.memory_counter().take(file, &place(Some(index)), "the names of images", name.len() as u64 + 96)?;

@@ -6,7 +6,7 @@ use glam::{DMat3, DVec3};
 
 use super::MAX_SIDE_PX;
 use crate::error::{Error, Result};
-use crate::files::json::small::{Object, Small};
+use crate::files::json::small::{Object, SmallValue};
 
 /// Description of a pose matrix in error messages.
 pub(super) const POSE: &str = "3 or 4 rows of 4 finite numbers";
@@ -25,16 +25,16 @@ impl<'a> CameraFields<'a> {
     ///
     /// # Errors
     /// `value` is not an object.
-    pub(super) fn new(path: &'a Path, frame: Option<usize>, value: &'a Small) -> Result<Self> {
+    pub(super) fn new(path: &'a Path, frame: Option<usize>, value: &'a SmallValue) -> Result<Self> {
         match value {
-            Small::Object(map) => Ok(CameraFields { path, frame, map }),
+            SmallValue::Object(map) => Ok(CameraFields { path, frame, map }),
             other => Err(Error::input(path, place(frame), "an object", other.describe())),
         }
     }
 
     /// Returns an error about the value of `key`.
     pub(super) fn wrong(&self, key: &str, expected: impl Into<String>) -> Error {
-        let found = self.map.get(key).map_or_else(|| "nothing".to_owned(), Small::describe);
+        let found = self.map.get(key).map_or_else(|| "nothing".to_owned(), SmallValue::describe);
         let place = match self.frame {
             Some(frame) => format!("frame {frame}, key \"{key}\""),
             None => format!("key \"{key}\""),
@@ -45,7 +45,7 @@ impl<'a> CameraFields<'a> {
     /// Returns a finite number, or `None` if the key is missing or null.
     pub(super) fn optional_number(&self, key: &str) -> Result<Option<f64>> {
         match self.map.get(key) {
-            None | Some(Small::Null) => Ok(None),
+            None | Some(SmallValue::Null) => Ok(None),
             Some(value) => match value.as_f64().filter(|number| number.is_finite()) {
                 Some(number) => Ok(Some(number)),
                 None => Err(self.wrong(key, "a finite number")),
@@ -78,8 +78,8 @@ impl<'a> CameraFields<'a> {
     /// Returns a text, or `None` if the key is missing or null.
     pub(super) fn optional_text(&self, key: &str) -> Result<Option<&'a str>> {
         match self.map.get(key) {
-            None | Some(Small::Null) => Ok(None),
-            Some(Small::Text(text)) => Ok(Some(text)),
+            None | Some(SmallValue::Null) => Ok(None),
+            Some(SmallValue::Text(text)) => Ok(Some(text)),
             Some(_) => Err(self.wrong(key, "a text")),
         }
     }
@@ -87,7 +87,7 @@ impl<'a> CameraFields<'a> {
     /// Returns a whole number that fits 32 bits, or `None` if the key is missing or null.
     pub(super) fn optional_index(&self, key: &str) -> Result<Option<u32>> {
         match self.map.get(key) {
-            None | Some(Small::Null) => Ok(None),
+            None | Some(SmallValue::Null) => Ok(None),
             Some(value) => match value.as_u64().and_then(|number| u32::try_from(number).ok()) {
                 Some(number) => Ok(Some(number)),
                 None => Err(self.wrong(key, "a whole number, 0 or more")),
@@ -107,7 +107,7 @@ impl<'a> CameraFields<'a> {
     /// Returns three numbers, or `None` if the key is missing or null.
     pub(super) fn optional_vector(&self, key: &str) -> Result<Option<[f64; 3]>> {
         match self.map.get(key) {
-            None | Some(Small::Null) => Ok(None),
+            None | Some(SmallValue::Null) => Ok(None),
             Some(value) => numbers(value).map(Some).ok_or_else(|| self.wrong(key, "3 finite numbers")),
         }
     }
@@ -119,14 +119,14 @@ impl<'a> CameraFields<'a> {
 
     /// Returns a row-major 3 × 3 matrix.
     pub(super) fn matrix3(&self, key: &str) -> Result<DMat3> {
-        let rows = self.map.get(key).and_then(Small::elements).filter(|rows| rows.len() == 3);
+        let rows = self.map.get(key).and_then(SmallValue::elements).filter(|rows| rows.len() == 3);
         rows.and_then(|rows| Some(from_rows([numbers(&rows[0])?, numbers(&rows[1])?, numbers(&rows[2])?])))
             .ok_or_else(|| self.wrong(key, "3 rows of 3 finite numbers"))
     }
 
     /// Returns the rotation and translation of a row-major 3 × 4 or 4 × 4 pose `[R | t]`.
     pub(super) fn pose(&self, key: &str) -> Result<(DMat3, DVec3)> {
-        let rows = self.map.get(key).and_then(Small::elements).filter(|rows| matches!(rows.len(), 3 | 4));
+        let rows = self.map.get(key).and_then(SmallValue::elements).filter(|rows| matches!(rows.len(), 3 | 4));
         let rows: Option<Vec<[f64; 4]>> = rows.and_then(|rows| rows.iter().map(numbers).collect());
         let rows = rows.ok_or_else(|| self.wrong(key, POSE))?;
         if rows.get(3).is_some_and(|last| *last != [0.0, 0.0, 0.0, 1.0]) {
@@ -141,7 +141,7 @@ impl<'a> CameraFields<'a> {
     /// Returns the number of elements of the list_len under `key`.
     pub(super) fn list_len(&self, key: &str) -> Result<usize> {
         match self.map.get(key) {
-            Some(Small::List(_, total)) => Ok(*total),
+            Some(SmallValue::List(_, total)) => Ok(*total),
             _ => Err(self.wrong(key, "a list")),
         }
     }
@@ -153,8 +153,8 @@ pub(super) fn place(frame: Option<usize>) -> String {
 }
 
 /// Returns the elements of a list_len of exactly `W` finite numbers.
-fn numbers<const W: usize>(value: &Small) -> Option<[f64; W]> {
-    let elements: &[Small; W] = value.elements()?.try_into().ok()?;
+fn numbers<const W: usize>(value: &SmallValue) -> Option<[f64; W]> {
+    let elements: &[SmallValue; W] = value.elements()?.try_into().ok()?;
     let mut out = [0.0; W];
     for (to, from) in out.iter_mut().zip(elements) {
         *to = from.as_f64().filter(|number| number.is_finite())?;

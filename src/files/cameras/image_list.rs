@@ -3,9 +3,9 @@
 use std::path::Path;
 
 use crate::error::{Error, Result};
-use crate::files::json::lists::{Ask, each_element};
-use crate::files::json::small::{Keep, Small};
-use crate::files::json::{Stopped, read};
+use crate::files::json::lists::{ListSelection, each_element};
+use crate::files::json::small::{Keep, SmallValue};
+use crate::files::json::{ParseAbort, read};
 
 /// Keys by which a document is recognized, and keys that hold for all of its images.
 const OUTLINE_KEYS: [&str; 14] = [
@@ -31,16 +31,16 @@ const MAX_ELEMENTS: usize = 4;
 ///
 /// # Errors
 /// The file is not valid JSON.
-pub(super) fn outline(file: &Path) -> Result<Small> {
-    read(file, &Stopped::default(), Keep { wanted: &OUTLINE_KEYS, elements: MAX_ELEMENTS })
+pub(super) fn outline(file: &Path) -> Result<SmallValue> {
+    read(file, &ParseAbort::default(), Keep { wanted: &OUTLINE_KEYS, elements: MAX_ELEMENTS })
 }
 
 /// Reads the keys `wanted` of a small document.
 ///
 /// # Errors
 /// The file is not valid JSON.
-pub(super) fn read_keys(file: &Path, wanted: &[&str]) -> Result<Small> {
-    read(file, &Stopped::default(), Keep { wanted, elements: MAX_ELEMENTS })
+pub(super) fn read_keys(file: &Path, wanted: &[&str]) -> Result<SmallValue> {
+    read(file, &ParseAbort::default(), Keep { wanted, elements: MAX_ELEMENTS })
 }
 
 /// Passes every element of the list under `key`, or of the document itself if `key` is `None`, to `take`, with its
@@ -52,10 +52,10 @@ pub(super) fn each_image(
     file: &Path,
     key: Option<&str>,
     wanted: &[&str],
-    mut take: impl FnMut(usize, &Small) -> Result<()>,
+    mut take: impl FnMut(usize, &SmallValue) -> Result<()>,
 ) -> Result<()> {
     let mut next = 0;
-    each_element(file, Ask { keys: key.as_slice(), nested: false, wanted }, |at, element| {
+    each_element(file, ListSelection { keys: key.as_slice(), nested: false, wanted }, |at, element| {
         if at.index != next {
             let place = format!("key \"{}\"", key.unwrap_or_default());
             return Err(Error::input(file, place, "this key once", "twice"));

@@ -14,8 +14,8 @@ use super::fields::{CameraFields, POSE, place};
 use super::image_list::outline;
 use crate::error::ShowPath;
 use crate::error::{Error, Result};
-use crate::files::json::lists::{Ask, JsonPlace, each_element};
-use crate::files::json::small::Small;
+use crate::files::json::lists::{JsonPlace, ListSelection, each_element};
+use crate::files::json::small::SmallValue;
 use crate::files::names::shown_name;
 use crate::limits::ReadLimit;
 use crate::model::{Camera, Rig, Split};
@@ -27,8 +27,8 @@ const FILES: [(&str, Split); 2] = [("train_meta.json", Split::Train), ("test_met
 const KEYS: [&str; 4] = ["k", "w2c", "fn", "cam_id"];
 
 /// Returns whether a document is in this format.
-pub(super) fn is_meta_json(outline: &Small) -> bool {
-    ["k", "w2c"].iter().all(|key| matches!(outline.get(key), Some(Small::List(..))))
+pub(super) fn is_meta_json(outline: &SmallValue) -> bool {
+    ["k", "w2c"].iter().all(|key| matches!(outline.get(key), Some(SmallValue::List(..))))
 }
 
 /// Reads `file`, and the other file of the sequence beside it if `with_others` is set.
@@ -139,23 +139,23 @@ fn add(assembly: &mut Assembly, file: &Path, split: Split) -> Result<usize> {
         KeyedValues::<u32>::BYTES,
     ];
     let (mut used, mut next) = (0, [0; KEYS.len()]);
-    let ask = Ask { keys: &KEYS, nested: true, wanted: &[] };
+    let ask = ListSelection { keys: &KEYS, nested: true, wanted: &[] };
     each_element(file, ask, |JsonPlace { key, index, inner }, value| {
         let name = KEYS[key];
         if index != next[key] {
             return Err(Error::input(file, format!("key \"{name}\""), "this key once", "twice"));
         }
-        let text = if let Small::Text(text) = &value { text.len() as u64 } else { 0 };
+        let text = if let SmallValue::Text(text) = &value { text.len() as u64 } else { 0 };
         let taken = if inner.is_some() { bytes[key] + text } else { 3 * size_of::<usize>() as u64 };
         assembly.memory_counter().take(file, &place(Some(index)), "its cameras", taken)?;
         used += taken;
         if inner.is_some() {
-            let entry = Small::of_entry(name, value);
+            let entry = SmallValue::from_entry(name, value);
             return tables.take(CameraFields::new(file, Some(index), &entry)?, key);
         }
         next[key] += 1;
         match value {
-            Small::List(..) => tables.end(key),
+            SmallValue::List(..) => tables.end(key),
             other if key == 0 => {
                 return Err(Error::input(
                     file,

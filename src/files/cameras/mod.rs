@@ -34,7 +34,7 @@ use std::path::{Path, PathBuf};
 
 use crate::error::ShowPath;
 use crate::error::{Error, Result};
-use crate::files::json::small::Small;
+use crate::files::json::small::SmallValue;
 use crate::limits::ReadLimit;
 use crate::model::Rig;
 
@@ -188,14 +188,14 @@ enum Kind {
 }
 
 /// Returns the format of a JSON camera file, recognized by the keys in its `outline`.
-fn kind(outline: &Small) -> Option<Kind> {
-    if let Small::List(_, count) = outline {
+fn kind(outline: &SmallValue) -> Option<Kind> {
+    if let SmallValue::List(_, count) = outline {
         return Some(Kind::PerCamera(*count));
     }
     if meta_json::is_meta_json(outline) {
         return Some(Kind::PerFrame);
     }
-    let Small::List(first, _) = outline.get("frames")? else { return None };
+    let SmallValue::List(first, _) = outline.get("frames")? else { return None };
     let first = first.first()?;
     if first.get("w2c").is_some() {
         Some(Kind::PerImage)

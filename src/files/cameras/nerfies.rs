@@ -21,8 +21,8 @@ use super::fields::CameraFields;
 use super::image_list::read_keys;
 use crate::error::{Error, Result, quoted};
 use crate::files::image::measure;
-use crate::files::json::lists::{Ask, JsonPlace, each_element, each_entry};
-use crate::files::json::small::Small;
+use crate::files::json::lists::{JsonPlace, ListSelection, each_element, each_entry};
+use crate::files::json::small::SmallValue;
 use crate::files::names::shown_name;
 use crate::model::{Rig, Split};
 
@@ -72,18 +72,22 @@ fn names(file: &Path, counter: &mut MemoryCounter) -> Result<[Vec<Box<str>>; 3]>
         fields.list_len(LIST_KEYS[2])?;
     }
     let mut names = [const { Vec::new() }; 3];
-    each_element(file, Ask { keys: &LIST_KEYS, nested: false, wanted: &[] }, |JsonPlace { key, index, .. }, name| {
-        if index != names[key].len() {
-            return Err(Error::input(file, format!("key \"{}\"", LIST_KEYS[key]), "this key once", "twice"));
-        }
-        let Small::Text(name) = name else {
-            let place = format!("key \"{}\", element {index}", LIST_KEYS[key]);
-            return Err(Error::input(file, place, "a list of names", name.describe()));
-        };
-        counter.take(file, "", "the names of its images", name.len() as u64 + NAME_BYTES)?;
-        names[key].push(name);
-        Ok(())
-    })?;
+    each_element(
+        file,
+        ListSelection { keys: &LIST_KEYS, nested: false, wanted: &[] },
+        |JsonPlace { key, index, .. }, name| {
+            if index != names[key].len() {
+                return Err(Error::input(file, format!("key \"{}\"", LIST_KEYS[key]), "this key once", "twice"));
+            }
+            let SmallValue::Text(name) = name else {
+                let place = format!("key \"{}\", element {index}", LIST_KEYS[key]);
+                return Err(Error::input(file, place, "a list of names", name.describe()));
+            };
+            counter.take(file, "", "the names of its images", name.len() as u64 + NAME_BYTES)?;
+            names[key].push(name);
+            Ok(())
+        },
+    )?;
     Ok(names)
 }
 

@@ -19,7 +19,7 @@ use super::image_list::{each_image, outline};
 use super::{CameraOptions, Clock};
 use crate::error::{Result, ShowPath};
 use crate::files::image::measure;
-use crate::files::json::small::Small;
+use crate::files::json::small::SmallValue;
 use crate::files::names::shown_name;
 use crate::model::{Rig, Split};
 
@@ -80,7 +80,7 @@ fn others(file: &Path) -> Vec<PathBuf> {
 fn latest_in(file: &Path) -> Result<f64> {
     let mut latest = 0.0;
     each_image(file, Some("frames"), &["time"], |_, frame| {
-        let time = frame.get("time").and_then(Small::as_f64).filter(|time| time.is_finite());
+        let time = frame.get("time").and_then(SmallValue::as_f64).filter(|time| time.is_finite());
         latest = time.map_or(latest, |time| time.max(latest));
         Ok(())
     })?;

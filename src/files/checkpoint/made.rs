@@ -17,13 +17,13 @@ pub(crate) enum Made {
     List(Vec<Made>),
     Dict(Vec<(Made, Made)>),
     Ordered(Vec<(Made, Made)>),
-    Tensor(MadeTensor),
-    Parameter(MadeTensor),
+    Tensor(PickledTensor),
+    Parameter(PickledTensor),
 }
 
 /// Tensor of f32, or of another storage class with these bytes.
 #[derive(Debug, Clone)]
-pub(crate) struct MadeTensor {
+pub(crate) struct PickledTensor {
     pub(crate) class: &'static str,
     /// Number of the storage. A storage named by several tensors is stored once.
     pub(crate) storage: usize,
@@ -35,10 +35,10 @@ pub(crate) struct MadeTensor {
 }
 
 /// Returns a dense f32 tensor in the storage of that number.
-pub(crate) fn tensor(storage: usize, shape: &[usize], values: &[f32]) -> MadeTensor {
+pub(crate) fn tensor(storage: usize, shape: &[usize], values: &[f32]) -> PickledTensor {
     let mut stride = vec![1; shape.len()];
     (1..shape.len()).rev().for_each(|axis| stride[axis - 1] = stride[axis] * shape[axis].max(1));
-    MadeTensor {
+    PickledTensor {
         class: "FloatStorage",
         storage,
         bytes: values.iter().flat_map(|value| value.to_le_bytes()).collect(),
@@ -121,7 +121,7 @@ impl Made {
     }
 }
 
-impl MadeTensor {
+impl PickledTensor {
     /// Appends the pickle of the tensor.
     fn pickle(&self, out: &mut Vec<u8>) {
         let numbers = |values: &[usize]| Made::Tuple(values.iter().map(|&x| Made::Int(x as i64)).collect());

@@ -3,7 +3,7 @@ use std::io::Cursor;
 
 use proptest::prelude::*;
 
-use super::made::{Made, MadeTensor, named, tensor, zip};
+use super::made::{Made, PickledTensor, named, tensor, zip};
 use super::*;
 use crate::files::checkpoint::write::{GaussianRows, write_like};
 
@@ -38,10 +38,10 @@ fn ramp(n: usize) -> Vec<f32> {
 /// Returns a pair of dicts: tensors of four rows, one of them a transposed parameter, a tensor without rows of
 /// Gaussians, two tensors that share a storage, a mask and other values.
 fn model() -> Made {
-    let transposed = MadeTensor { stride: vec![1, 4], ..tensor(1, &[4, 3], &ramp(12)) };
+    let transposed = PickledTensor { stride: vec![1, 4], ..tensor(1, &[4, 3], &ramp(12)) };
     let [first, second] =
-        [0, 12].map(|offset| MadeTensor { offset, shape: vec![4, 3], ..tensor(3, &[4, 3], &ramp(24)) });
-    let mask = MadeTensor { class: "BoolStorage", width: 1, bytes: vec![1, 0, 1, 1], ..tensor(4, &[4], &[]) };
+        [0, 12].map(|offset| PickledTensor { offset, shape: vec![4, 3], ..tensor(3, &[4, 3], &ramp(24)) });
+    let mask = PickledTensor { class: "BoolStorage", width: 1, bytes: vec![1, 0, 1, 1], ..tensor(4, &[4], &[]) };
     Made::Tuple(vec![
         Made::Dict(named(vec![
             ("means", Made::Tensor(tensor(0, &[4, 3], &ramp(12)))),
@@ -90,7 +90,7 @@ fn every_float_type_is_converted_to_f32() {
     let temp = TempCheckpoint::new();
     let checkpoint_of_type = |class, width, bytes: Vec<u8>| {
         let shape = vec![bytes.len() / width];
-        Made::Tensor(MadeTensor { class, width, bytes, ..tensor(0, &shape, &[]) }).file()
+        Made::Tensor(PickledTensor { class, width, bytes, ..tensor(0, &shape, &[]) }).file()
     };
     let le16 = |values: &[u16]| values.iter().flat_map(|value| value.to_le_bytes()).collect::<Vec<u8>>();
     for (class, width, bytes, expected) in [
@@ -227,22 +227,22 @@ fn a_shared_shape_is_refused_if_one_tensor_changes() {
 #[test]
 fn incomplete_tensors_and_files_are_named() {
     let temp = TempCheckpoint::new();
-    let message = |tensor: MadeTensor| {
+    let message = |tensor: PickledTensor| {
         let checkpoint = temp.open(&Made::Tensor(tensor).file()).unwrap();
         checkpoint.float_tensor(checkpoint.pickle().root(), "means").unwrap_err().to_string()
     };
     let valid = || tensor(0, &[4, 3], &ramp(12));
     for wrong in [
-        MadeTensor { shape: vec![5, 3], ..valid() },
-        MadeTensor { offset: 1, ..valid() },
-        MadeTensor { shape: vec![1 << 20, 1 << 10], stride: vec![0, 0], ..valid() },
-        MadeTensor { shape: vec![i32::MAX as usize; 4], stride: vec![i32::MAX as usize; 4], ..valid() },
-        MadeTensor { bytes: Vec::new(), ..valid() },
+        PickledTensor { shape: vec![5, 3], ..valid() },
+        PickledTensor { offset: 1, ..valid() },
+        PickledTensor { shape: vec![1 << 20, 1 << 10], stride: vec![0, 0], ..valid() },
+        PickledTensor { shape: vec![i32::MAX as usize; 4], stride: vec![i32::MAX as usize; 4], ..valid() },
+        PickledTensor { bytes: Vec::new(), ..valid() },
     ] {
         let error = message(wrong);
         assert!(error.contains("means") && error.contains("data/0"), "{error}");
     }
-    let no_rank = message(MadeTensor { stride: vec![1], ..valid() });
+    let no_rank = message(PickledTensor { stride: vec![1], ..valid() });
     assert!(no_rank.contains("_rebuild_tensor_v2"), "{no_rank}");
     // The file of the storage is missing.
     let checkpoint = temp.open(&Made::Tensor(valid()).file()).unwrap();

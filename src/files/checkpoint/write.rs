@@ -73,7 +73,7 @@ pub(crate) fn write_like(checkpoint: &Checkpoint, kept: &[u32], rows: &[Gaussian
     let mut expected: BTreeMap<NodeId, (Vec<usize>, Vec<usize>, usize)> = BTreeMap::new();
     for (key, parts) in &parts {
         let total = parts.iter().map(|part| part.len).sum::<usize>();
-        if total > checkpoint.most_values(key, parts[0].tensor.kind) {
+        if total > checkpoint.max_values(key, parts[0].tensor.kind) {
             return Err(checkpoint.wrong(
                 &format!("data/{key}"),
                 "tensors of about as many values",

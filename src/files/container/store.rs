@@ -4,12 +4,12 @@ use std::ops::{Deref, DerefMut};
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, OnceLock, PoisonError};
 
-use gseq::{Reader, TileBuffer, TileFrames, TileId, Touched};
+use gseq::{Reader, TileBuffer, TileFrames, TileId, TouchedPages};
 
 use super::held::HeldTiles;
 use crate::error::{Error, Result};
 use crate::limits::ReadLimit;
-use crate::model::{Columns, HIGHEST_DEGREE, SequenceInfo, sh_coefficients};
+use crate::model::{Attributes, MAX_SH_DEGREE, SequenceInfo, sh_coefficients};
 use crate::source::Count;
 
 /// Open container with all columns of a Gaussian model.
@@ -17,8 +17,8 @@ pub struct Container {
     pub(super) path: PathBuf,
     pub(super) reader: Reader,
     pub(super) info: SequenceInfo,
-    /// Attributes in the order of [`Columns::all`], each with the index of its column in the container.
-    pub(super) places: Vec<(Columns, u32)>,
+    /// Attributes in the order of [`Attributes::all`], each with the index of its column in the container.
+    pub(super) places: Vec<(Attributes, u32)>,
     /// Decoding buffers, at most one for each thread, shared by all readers.
     pub(super) scratch: Mutex<Vec<TileScratch>>,
     /// Tiles held in memory; created when the first tile may be held.
@@ -61,16 +61,16 @@ impl Container {
         let layout = reader.layout();
         let mut places = Vec::new();
         let mut sh_degree = 0;
-        for column in Columns::all().iter() {
+        for column in Attributes::all().iter() {
             let place = layout.column(column.name()).ok_or_else(|| {
                 let names: Vec<&str> = layout.columns.iter().map(|c| c.name.as_str()).collect();
                 Error::input(path, "columns", format!("a column {}", column.name()), names.join(", "))
             })?;
             let width = layout.columns[place as usize].width as usize;
             let legal = match column {
-                Columns::ROTATION => width == 4,
-                Columns::OPACITY => width == 1,
-                Columns::SH => (0..=HIGHEST_DEGREE).any(|degree| width == 3 * sh_coefficients(degree)),
+                Attributes::ROTATION => width == 4,
+                Attributes::OPACITY => width == 1,
+                Attributes::SH => (0..=MAX_SH_DEGREE).any(|degree| width == 3 * sh_coefficients(degree)),
                 _ => width == 3,
             };
             if !legal {
@@ -82,8 +82,8 @@ impl Container {
                     format!("{width} components"),
                 ));
             }
-            if column == Columns::SH {
-                sh_degree = (0..=HIGHEST_DEGREE).find(|&degree| width == 3 * sh_coefficients(degree)).unwrap_or(0);
+            if column == Attributes::SH {
+                sh_degree = (0..=MAX_SH_DEGREE).find(|&degree| width == 3 * sh_coefficients(degree)).unwrap_or(0);
             }
             places.push((column, place));
         }
@@ -91,7 +91,7 @@ impl Container {
             .ok()
             .filter(|&count| count <= u32::MAX as usize)
             .ok_or_else(|| Error::input(path, "header", "fewer than 2^32 Gaussians", layout.gaussians.to_string()))?;
-        let mut varying = Columns::empty();
+        let mut varying = Attributes::empty();
         for &(column, place) in &places {
             if reader.varies(place) {
                 varying |= column;
@@ -137,7 +137,7 @@ impl Container {
     /// Returns the maximum number of bytes for holding every tile ([`Container::hold_decoded`]). Fewer are used if
     /// tiles of a varying column are constant.
     pub fn decoded_bytes(&self) -> u64 {
-        let values = |&(column, _): &(Columns, u32)| {
+        let values = |&(column, _): &(Attributes, u32)| {
             let frames = if self.info.varying.contains(column) { self.info.times.len() } else { 1 };
             (column.width(self.info.sh_degree) * frames) as u64 * self.info.count as u64
         };
@@ -177,7 +177,7 @@ impl Container {
             },
             |values| {
                 let TileScratch { buffer, frames, .. } = &mut *self.scratch();
-                let mut touched = Touched::default();
+                let mut touched = TouchedPages::default();
                 self.reader.load(at, buffer, frames, Some(&mut touched))?;
                 self.reader.read_frames(frames, values)?;
                 self.reader.release(&mut touched);
@@ -194,14 +194,14 @@ impl Container {
     /// Returns the tiles of `columns` in the given blocks that would have to be read from the file.
     pub(super) fn unheld(
         &self,
-        columns: Columns,
+        columns: Attributes,
         gaussian_block: u32,
         frame_block: u32,
     ) -> impl Iterator<Item = TileId> {
-        let needed = move |&(index, &(column, _)): &(usize, &(Columns, u32))| {
+        let needed = move |&(index, &(column, _)): &(usize, &(Attributes, u32))| {
             columns.contains(column) && !self.is_held(index, gaussian_block, frame_block)
         };
-        let at = move |(_, &(_, column)): (usize, &(Columns, u32))| TileId { column, gaussian_block, frame_block };
+        let at = move |(_, &(_, column)): (usize, &(Attributes, u32))| TileId { column, gaussian_block, frame_block };
         self.places.iter().enumerate().filter(needed).map(at)
     }
 

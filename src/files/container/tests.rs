@@ -20,7 +20,7 @@ struct EncodingSource(SequenceInfo);
 
 impl EncodingSource {
     fn new() -> EncodingSource {
-        let varying = Columns::POSITION | Columns::ROTATION | Columns::OPACITY;
+        let varying = Attributes::POSITION | Attributes::ROTATION | Attributes::OPACITY;
         EncodingSource(SequenceInfo {
             count: COUNT,
             times: (0..FRAMES).map(|t| t as f64).collect(),
@@ -37,21 +37,23 @@ impl EncodingSource {
         (folder, container)
     }
 
-    fn value(column: Columns, id: usize, component: usize, frame: usize) -> f32 {
+    fn value(column: Attributes, id: usize, component: usize, frame: usize) -> f32 {
         let noise = |k: usize| (hash_id(k as u64) >> 32) as u32;
         let key = 64 * id + component;
         let moves = match column {
-            Columns::POSITION if id < GAUSSIAN_BLOCK => return f32::from_bits(noise(key | frame << 32) & 0xbfff_ffff),
-            Columns::POSITION => true,
-            Columns::ROTATION => id < 2 * GAUSSIAN_BLOCK,
-            Columns::OPACITY => frame / FRAME_BLOCK == 1,
+            Attributes::POSITION if id < GAUSSIAN_BLOCK => {
+                return f32::from_bits(noise(key | frame << 32) & 0xbfff_ffff);
+            }
+            Attributes::POSITION => true,
+            Attributes::ROTATION => id < 2 * GAUSSIAN_BLOCK,
+            Attributes::OPACITY => frame / FRAME_BLOCK == 1,
             _ => false,
         };
         (noise(key) as f32 * 1e-9 + if moves { 0.05 * frame as f32 } else { 0.0 }).sin()
     }
 
     /// Returns the values of the columns `want` of `ids` at `frame`, computed from the formula.
-    fn expected(&self, ids: &Ids<'_>, frame: usize, want: Columns) -> Gaussians {
+    fn expected(&self, ids: &Ids<'_>, frame: usize, want: Attributes) -> Gaussians {
         let mut out = Gaussians::zeros(0, 1);
         for column in want.iter() {
             let to = out.column_mut(column);
@@ -80,7 +82,7 @@ impl FrameSource for EncodingSource {
 struct EncodingReader<'a>(&'a EncodingSource, Vec<u32>);
 
 impl BlockReader for EncodingReader<'_> {
-    fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
+    fn read(&mut self, frame: usize, want: Attributes, out: &mut Gaussians) -> Result<()> {
         let source = self.0.expected(&Ids::List(&self.1), frame, want);
         want.iter().for_each(|column| *out.column_mut(column) = source.column(column).clone());
         Ok(())
@@ -103,7 +105,7 @@ fn blocks(scattered: &[u32]) -> [Ids<'_>; 5] {
 fn frames_are_independent_of_order_and_of_held_frames() {
     let source = EncodingSource::new();
     let scattered = [COUNT as u32 - 1, 5, 6, 7, 2000, 4, 1024, 1023];
-    for compression in [Compression::Zstd(1), Compression::Raw] {
+    for compression in [Compression::Zstd(1), Compression::StoredParams] {
         let (_folder, container) = source.pack(compression);
         for ids in blocks(&scattered) {
             for held in [1, 3, FRAME_BLOCK, usize::MAX] {
@@ -111,7 +113,7 @@ fn frames_are_independent_of_order_and_of_held_frames() {
                 reader.expect(&ReadPlan::every().holding(held));
                 for k in 0..3 * FRAMES / 2 {
                     let frame = if k < FRAMES { k } else { hash_id(k as u64) as usize % FRAMES };
-                    let want = if k % 7 == 0 { Columns::all() } else { source.info().varying };
+                    let want = if k % 7 == 0 { Attributes::all() } else { source.info().varying };
                     let mut got = Gaussians::zeros(0, 1);
                     reader.read(frame, want, &mut got).unwrap();
                     let expected = source.expected(&ids, frame, want);
@@ -134,11 +136,11 @@ fn a_reader_keeps_no_more_than_allowed() {
             reader.expect(&ReadPlan::every().holding(held));
             let mut state = Gaussians::zeros(0, 1);
             for frame in 0..FRAMES {
-                reader.read(frame, Columns::all(), &mut state).unwrap();
+                reader.read(frame, Attributes::all(), &mut state).unwrap();
                 let values = |kept: &KeptColumn| match kept {
                     KeptColumn::Nothing => 0,
                     KeptColumn::Tile(_, frames) => frames.memory() / 4,
-                    KeptColumn::Values(kept) => kept.values.capacity(),
+                    KeptColumn::StatisticAccess(kept) => kept.values.capacity(),
                 };
                 let kept: usize = reader.kept.iter().map(values).sum();
                 let frames = match held {
@@ -175,9 +177,12 @@ fn scan(source: &EncodingSource, container: &Container) {
         let mut reader = container.open(ids.clone()).unwrap();
         let mut got = Gaussians::zeros(0, 1);
         for frame in 0..FRAMES {
-            let want = if frame == 0 { Columns::all() } else { source.info().varying };
+            let want = if frame == 0 { Attributes::all() } else { source.info().varying };
             reader.read(frame, want, &mut got).unwrap();
-            assert!(got.position == source.expected(&ids, frame, Columns::POSITION).position, "{ids:?}, frame {frame}");
+            assert!(
+                got.position == source.expected(&ids, frame, Attributes::POSITION).position,
+                "{ids:?}, frame {frame}"
+            );
         }
     });
 }
@@ -185,7 +190,7 @@ fn scan(source: &EncodingSource, container: &Container) {
 #[test]
 fn a_scan_reads_each_stored_byte_once() {
     let source = EncodingSource::new();
-    for compression in [Compression::Zstd(1), Compression::Raw] {
+    for compression in [Compression::Zstd(1), Compression::StoredParams] {
         let (_folder, container) = source.pack(compression);
         assert_eq!(container.reads(), Reads::default());
         let (tiles, bytes) = all_tiles(&container);
@@ -203,7 +208,7 @@ fn each_tile_is_read_once_for_all_planned_frames() {
     let source = EncodingSource::new();
     let scattered = [COUNT as u32 - 1, 5, 6, 7, 2000, 4, 1024, 1023];
     let wanted = [0, 3, 9, 30, 31, 33, 64, 65, 68];
-    for compression in [Compression::Zstd(1), Compression::Raw] {
+    for compression in [Compression::Zstd(1), Compression::StoredParams] {
         for ids in blocks(&scattered) {
             let blocks: std::collections::BTreeSet<usize> = ids.iter().map(|id| id / GAUSSIAN_BLOCK).collect();
             // The three frame blocks have 5, 1 and 3 of these frames. With at most 2 frames decoded together they are
@@ -214,8 +219,8 @@ fn each_tile_is_read_once_for_all_planned_frames() {
                 reader.expect(&ReadPlan::new(wanted).holding(held));
                 let mut got = Gaussians::zeros(0, 1);
                 for frame in wanted {
-                    reader.read(frame, Columns::POSITION, &mut got).unwrap();
-                    assert!(got.position == source.expected(&ids, frame, Columns::POSITION).position);
+                    reader.read(frame, Attributes::POSITION, &mut got).unwrap();
+                    assert!(got.position == source.expected(&ids, frame, Attributes::POSITION).position);
                 }
                 let tiles = container.reads().tiles;
                 assert!(
@@ -232,7 +237,7 @@ fn each_tile_is_read_once_for_all_planned_frames() {
 fn held_tiles_are_read_once_and_have_the_same_values() {
     let source = EncodingSource::new();
     let scattered = [COUNT as u32 - 1, 5, 6, 7, 2000, 4, 1024, 1023];
-    for compression in [Compression::Zstd(1), Compression::Raw] {
+    for compression in [Compression::Zstd(1), Compression::StoredParams] {
         let whole = source.pack(compression).1.decoded_bytes();
         for capacity in [0, whole / 3, whole] {
             let (_folder, container) = source.pack(compression);
@@ -243,8 +248,8 @@ fn held_tiles_are_read_once_and_have_the_same_values() {
                     reader.expect(&wanted);
                     for frame in [0, 7, 8, 40, FRAMES - 1, 7] {
                         let mut got = Gaussians::zeros(0, 1);
-                        reader.read(frame, Columns::all(), &mut got).unwrap();
-                        let expected = source.expected(&ids, frame, Columns::all());
+                        reader.read(frame, Attributes::all(), &mut got).unwrap();
+                        let expected = source.expected(&ids, frame, Attributes::all());
                         assert!(got == expected, "{compression:?}, {ids:?}, {capacity} bytes: frame {frame} is wrong");
                     }
                 }

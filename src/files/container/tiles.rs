@@ -3,11 +3,11 @@
 
 use std::ops::Range;
 
-use gseq::{Encoding, TileFrames, TileId, Touched};
+use gseq::{Encoding, TileFrames, TileId, TouchedPages};
 
 use super::store::{Container, TileScratch};
 use crate::error::{Error, Result, ShowPath};
-use crate::model::{Columns, Gaussians};
+use crate::model::{Attributes, Gaussians};
 use crate::source::{BlockReader, Ids, ReadPlan};
 
 /// Maximum number of bytes of the memory map that a reader touches before it releases pages that it no longer needs.
@@ -27,7 +27,7 @@ pub(super) enum KeptColumn {
     Nothing,
     /// Frame block, and the one tile that holds exactly the reader's Gaussians: decompressed, or raw in the file.
     Tile(u32, TileFrames),
-    Values(FrameValues),
+    StatisticAccess(FrameValues),
 }
 
 /// Values at some frames of a frame block.
@@ -72,9 +72,9 @@ pub(super) struct TileReader<'a> {
     /// Frame block of the raw tiles in `raw_in_use`.
     entered: u32,
     /// Raw tiles in use, to be released when another frame block is entered.
-    raw_in_use: Touched,
+    raw_in_use: TouchedPages,
     /// Tiles that have been decoded, to be released soon.
-    decoded: Touched,
+    decoded: TouchedPages,
 }
 
 impl<'a> TileReader<'a> {
@@ -107,8 +107,8 @@ impl<'a> TileReader<'a> {
             announced_block: None,
             kept: source.places.iter().map(|_| KeptColumn::Nothing).collect(),
             entered: 0,
-            raw_in_use: Touched::default(),
-            decoded: Touched::default(),
+            raw_in_use: TouchedPages::default(),
+            decoded: TouchedPages::default(),
         }
     }
 
@@ -127,7 +127,7 @@ impl<'a> TileReader<'a> {
                 let within = frame % self.source.reader.layout().frame_block as usize;
                 self.source.reader.read_frame(tile, within, out)?;
             }
-            KeptColumn::Values(kept) => {
+            KeptColumn::StatisticAccess(kept) => {
                 let at = kept.place(frame).unwrap_or_default() * out.len();
                 out.copy_from_slice(&kept.values[at..][..out.len()]);
             }
@@ -145,7 +145,7 @@ impl<'a> TileReader<'a> {
         }
         match &self.kept[index] {
             KeptColumn::Tile(of, _) if *of == frame_block => return Ok(true),
-            KeptColumn::Values(values) if values.place(frame).is_some() => return Ok(true),
+            KeptColumn::StatisticAccess(values) if values.place(frame).is_some() => return Ok(true),
             _ => (),
         }
         let (column, place) = self.source.places[index];
@@ -161,7 +161,7 @@ impl<'a> TileReader<'a> {
         }
         if self.whole {
             let at = TileId { column: place, gaussian_block: self.runs[0].gaussian_block, frame_block };
-            let raw = reader.tile_info(at)?.encoding == Encoding::Raw;
+            let raw = reader.tile_info(at)?.encoding == Encoding::StoredParams;
             let all = self.plan.held() >= block.len();
             // A decompressed tile is as large as all of its frames.
             if raw || all && 2 * frames.len() > block.len() {
@@ -184,7 +184,7 @@ impl<'a> TileReader<'a> {
             return Ok(false);
         }
         let mut kept = match std::mem::replace(&mut self.kept[index], KeptColumn::Nothing) {
-            KeptColumn::Values(kept) => kept,
+            KeptColumn::StatisticAccess(kept) => kept,
             _ => FrameValues::default(),
         };
         frames.truncate(self.plan.held());
@@ -197,7 +197,7 @@ impl<'a> TileReader<'a> {
         if constant {
             frames.clear();
         }
-        self.kept[index] = KeptColumn::Values(FrameValues { block, frames, values: kept.values });
+        self.kept[index] = KeptColumn::StatisticAccess(FrameValues { block, frames, values: kept.values });
         Ok(true)
     }
 
@@ -290,7 +290,7 @@ impl<'a> TileReader<'a> {
     /// Tells the operating system, once per frame block, which tiles of the columns `want` come next. Does nothing for
     /// a reader that holds less than a frame block: it decodes a block several times, and read-ahead would evict pages
     /// that it still needs.
-    fn announce_next_tiles(&mut self, frame: usize, want: Columns) {
+    fn announce_next_tiles(&mut self, frame: usize, want: Attributes) {
         let (source, reader) = (self.source, &self.source.reader);
         let frame_block = self.frame_block(frame);
         if self.announced_block == Some(frame_block) || self.plan.held() < reader.layout().frame_block as usize {
@@ -316,7 +316,7 @@ impl<'a> TileReader<'a> {
 }
 
 impl BlockReader for TileReader<'_> {
-    fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
+    fn read(&mut self, frame: usize, want: Attributes, out: &mut Gaussians) -> Result<()> {
         self.check(frame)?;
         if self.len > 0 && !want.is_empty() {
             self.announce_next_tiles(frame, want);
@@ -344,7 +344,7 @@ impl BlockReader for TileReader<'_> {
         self.source.reader.release(&mut self.raw_in_use);
     }
 
-    fn prepare(&mut self, frame: usize, want: Columns) -> Result<()> {
+    fn prepare(&mut self, frame: usize, want: Attributes) -> Result<()> {
         self.check(frame)?;
         if self.len > 0 {
             // The caller of `prepare` fetches the next tiles itself.

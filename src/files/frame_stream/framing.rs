@@ -1,7 +1,7 @@
 //! Conversion of the fixed parts of a frame stream between bytes and values (format/STREAM.md).
 
 use crate::error::quoted;
-use crate::model::{Columns, sh_coefficients};
+use crate::model::{Attributes, sh_coefficients};
 
 /// Versions of the format: in version 1 every frame has the same Gaussians, in version 2 every frame states their
 /// number.
@@ -19,7 +19,7 @@ pub struct StreamHeader {
     /// SH degree, 0 to 3.
     pub sh_degree: usize,
     /// Attributes that are stored with every frame; the others are stored once.
-    pub varying: Columns,
+    pub varying: Attributes,
     /// Whether every frame states its number of Gaussians and Gaussians have no ids across frames (version 2).
     pub is_unlinked: bool,
 }
@@ -35,7 +35,7 @@ pub(crate) enum FrameMark {
 
 /// Description of an illegal field: offset in bytes within its part, expected and found value.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct Illegal {
+pub(crate) struct IllegalField {
     pub(crate) offset: u64,
     pub(crate) expected: String,
     pub(crate) found: String,
@@ -76,9 +76,9 @@ impl StreamHeader {
     ///
     /// # Errors
     /// The first field that violates STREAM.md.
-    pub(crate) fn from_bytes(bytes: &[u8; Self::BYTES]) -> Result<Self, Illegal> {
+    pub(crate) fn from_bytes(bytes: &[u8; Self::BYTES]) -> Result<Self, IllegalField> {
         let illegal = |offset, expected: &str, found: String, hint| {
-            Err(Illegal { offset, expected: expected.to_owned(), found, hint })
+            Err(IllegalField { offset, expected: expected.to_owned(), found, hint })
         };
         if bytes[..8] != Self::MAGIC {
             return illegal(0, "a frame stream (format/STREAM.md)", quoted(&escaped(&bytes[..8])), FOREIGN_OUTPUT);
@@ -96,13 +96,13 @@ impl StreamHeader {
         let Some(count) = usize::try_from(count).ok().filter(|&count| count <= u32::MAX as usize) else {
             return illegal(16, "fewer than 2^32 Gaussians", count.to_string(), "");
         };
-        let Some(varying) = Columns::from_bits(u32_at(bytes, 24)) else {
+        let Some(varying) = Attributes::from_bits(u32_at(bytes, 24)) else {
             return illegal(24, "a set of the five columns", format!("bits {:#x}", u32_at(bytes, 24)), "");
         };
         if is_unlinked && count != 0 {
             return illegal(16, "0 Gaussians in a header of version 2: frames say how many", count.to_string(), "");
         }
-        if is_unlinked && varying != Columns::all() {
+        if is_unlinked && varying != Attributes::all() {
             let found = format!("bits {:#x}", varying.bits());
             return illegal(24, "all five columns with every frame of version 2", found, "");
         }
@@ -141,8 +141,9 @@ impl FrameMark {
         header: &StreamHeader,
         frames: u32,
         before: Option<f64>,
-    ) -> Result<Self, Illegal> {
-        let illegal = |offset, expected: String, found: String, hint| Err(Illegal { offset, expected, found, hint });
+    ) -> Result<Self, IllegalField> {
+        let illegal =
+            |offset, expected: String, found: String, hint| Err(IllegalField { offset, expected, found, hint });
         let index = u32_at(bytes, 4);
         match [bytes[0], bytes[1], bytes[2], bytes[3]] {
             END_MAGIC => {
@@ -196,7 +197,7 @@ const SAME_IN_EVERY_FRAME: &str = "every frame must hold the same Gaussians in t
 
 /// Returns the length of a frame by the header, for messages.
 fn expected_length(header: &StreamHeader) -> String {
-    let names: Vec<&str> = header.varying.iter().map(Columns::name).collect();
+    let names: Vec<&str> = header.varying.iter().map(Attributes::name).collect();
     format!("{} bytes: {} Gaussians of {}", header.frame_bytes(), header.count, names.join(", "))
 }
 

@@ -13,9 +13,9 @@ use std::path::{Path, PathBuf};
 
 use crate::error::{Error, Result};
 use crate::limits::ReadLimit;
-use crate::model::{Column, Columns, Gaussians};
+use crate::model::{AttributeValues, Attributes, Gaussians};
 pub use framing::StreamHeader;
-pub(crate) use framing::{FrameMark, Illegal};
+pub(crate) use framing::{FrameMark, IllegalField};
 
 /// Minimum number of bytes allocated at a time.
 const MIN_ALLOCATION_BYTES: u64 = 1 << 20;
@@ -56,7 +56,7 @@ impl<R: Read> FrameStream<R> {
         }
         let header = StreamHeader::from_bytes(&header).map_err(|illegal| bytes.error(0, None, illegal))?;
         let mut constant = Gaussians::zeros(0, header.sh_degree);
-        let columns = Columns::all().difference(header.varying);
+        let columns = Attributes::all().difference(header.varying);
         let announced = 4 * columns.width(header.sh_degree) as u64 * header.count as u64;
         memory.check(name, "byte 16", &format!("the constant columns of {} Gaussians", header.count), announced)?;
         for column in columns.iter() {
@@ -156,10 +156,10 @@ impl<R: Read> CountingReader<R> {
     }
 
     /// Reads one attribute of `len` Gaussians. Returns false if the stream ends early.
-    fn read_attribute(&mut self, len: usize, column: &mut Column) -> Result<bool> {
+    fn read_attribute(&mut self, len: usize, column: &mut AttributeValues) -> Result<bool> {
         if column.len() != len {
             let Some(planes) = self.read_new_values(len * column.width())? else { return Ok(false) };
-            *column = Column::from_planes(column.width(), planes);
+            *column = AttributeValues::from_planes(column.width(), planes);
             return Ok(true);
         }
         self.read_values(column.planes_mut())
@@ -192,8 +192,8 @@ impl<R: Read> CountingReader<R> {
     }
 
     /// Returns the error for an illegal field of the part that begins at byte `start`.
-    fn error(&self, start: u64, frame: Option<u32>, illegal: Illegal) -> Error {
-        let Illegal { offset, expected, found, hint } = illegal;
+    fn error(&self, start: u64, frame: Option<u32>, illegal: IllegalField) -> Error {
+        let IllegalField { offset, expected, found, hint } = illegal;
         Error::input(&self.name, place(start + offset, frame), expected, found).hint(hint)
     }
 

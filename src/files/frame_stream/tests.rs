@@ -29,7 +29,7 @@ fn states(scene: &Scene) -> Vec<Gaussians> {
     (0..T)
         .map(|t| {
             let mut state = Gaussians::zeros(N, scene.info().sh_degree);
-            reader.read(t, Columns::all(), &mut state).unwrap();
+            reader.read(t, Attributes::all(), &mut state).unwrap();
             state
         })
         .collect()
@@ -78,7 +78,7 @@ fn streams_are_read_bit_for_bit_in_pieces_of_any_size() {
 
 #[test]
 fn nan_bits_and_any_set_of_varying_attributes_survive() {
-    for varying in [Columns::empty(), Columns::all(), Columns::SH] {
+    for varying in [Attributes::empty(), Attributes::all(), Attributes::SH] {
         let mut state = Gaussians::zeros(2, 0);
         for (i, bits) in [0x7fc0_1234, 0x8000_0000, 0xff80_0000, 1].into_iter().enumerate() {
             state.rotation.plane_mut(i)[1] = f32::from_bits(bits);
@@ -97,7 +97,7 @@ fn nan_bits_and_any_set_of_varying_attributes_survive() {
 
 #[test]
 fn a_stream_may_have_no_gaussians_or_no_frames() {
-    let header = StreamHeader { count: 0, sh_degree: 3, varying: Columns::POSITION, is_unlinked: false };
+    let header = StreamHeader { count: 0, sh_degree: 3, varying: Attributes::POSITION, is_unlinked: false };
     for frames in [0, 2] {
         let state = Gaussians::zeros(0, 3);
         let mut bytes = Vec::new();
@@ -199,14 +199,14 @@ fn text_printed_into_the_stream_is_refused() {
 fn a_huge_count_in_the_header_allocates_no_memory() {
     // The header states 2³² − 1 Gaussians, 240 GiB, but no data follows.
     let header =
-        StreamHeader { count: u32::MAX as usize, sh_degree: 3, varying: Columns::POSITION, is_unlinked: false };
+        StreamHeader { count: u32::MAX as usize, sh_degree: 3, varying: Attributes::POSITION, is_unlinked: false };
     let message = refusal(&[&header.to_bytes()[..], &[0; 5000]].concat());
     assert!(message.contains("constant column rotation"), "{message}");
 }
 
 #[test]
 fn the_writer_refuses_illegal_frames() {
-    let header = StreamHeader { count: 3, sh_degree: 0, varying: Columns::POSITION, is_unlinked: false };
+    let header = StreamHeader { count: 3, sh_degree: 0, varying: Attributes::POSITION, is_unlinked: false };
     let state = Gaussians::zeros(3, 0);
     let mut stream = StreamWriter::new(Vec::new(), Path::new("test"), header, &state).unwrap();
     stream.frame(1.0, &state).unwrap();

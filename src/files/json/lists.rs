@@ -6,15 +6,15 @@ use std::path::Path;
 
 use serde::de::{DeserializeSeed, Deserializer, IgnoredAny, MapAccess, SeqAccess, Visitor};
 
-use super::small::{Keep, MAX_ELEMENTS, ShortKey, Small};
-use super::{Stopped, read, read_from};
+use super::small::{Keep, MAX_ELEMENTS, ShortKey, SmallValue};
+use super::{ParseAbort, read, read_from};
 use crate::error::Result;
 use crate::files::open::open_file;
 
 /// Position of a value in a document.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct JsonPlace {
-    /// Index of its key in [`Ask::keys`]; 0 if the document itself is the list.
+    /// Index of its key in [`ListSelection::keys`]; 0 if the document itself is the list.
     pub(crate) key: usize,
     /// Index in the list. Restarts at 0 if a key is repeated; the last list counts.
     pub(crate) index: usize,
@@ -25,7 +25,7 @@ pub(crate) struct JsonPlace {
 
 /// Selection of values to read from a document.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Ask<'a> {
+pub(crate) struct ListSelection<'a> {
     /// Keys of the object under which the lists are; empty if the document itself is the list.
     pub(crate) keys: &'a [&'a str],
     /// Whether the elements of the lists are lists whose elements are wanted.
@@ -38,21 +38,25 @@ pub(crate) struct Ask<'a> {
 ///
 /// # Errors
 /// Fails if `each` fails, and like [`read`].
-pub(crate) fn each_element(path: &Path, ask: Ask<'_>, each: impl FnMut(JsonPlace, Small) -> Result<()>) -> Result<()> {
-    each_in(open_file(path)?, path, ask, each)
+pub(crate) fn each_element(
+    path: &Path,
+    ask: ListSelection<'_>,
+    each: impl FnMut(JsonPlace, SmallValue) -> Result<()>,
+) -> Result<()> {
+    each_element_from(open_file(path)?, path, ask, each)
 }
 
 /// Calls `each` with the elements of the lists selected by `ask` in the document in `file`.
 ///
 /// # Errors
 /// Fails if `each` fails, and like [`read`].
-pub(crate) fn each_in(
+pub(crate) fn each_element_from(
     file: impl Read,
     path: &Path,
-    ask: Ask<'_>,
-    mut each: impl FnMut(JsonPlace, Small) -> Result<()>,
+    ask: ListSelection<'_>,
+    mut each: impl FnMut(JsonPlace, SmallValue) -> Result<()>,
 ) -> Result<()> {
-    let stopped = Stopped::default();
+    let stopped = ParseAbort::default();
     let mut lists = Lists { ask, each: &mut each, stopped: &stopped };
     read_from(file, path, &stopped, Document(&mut lists))
 }
@@ -62,16 +66,20 @@ pub(crate) fn each_in(
 ///
 /// # Errors
 /// Fails if `each` fails, and like [`read`].
-pub(crate) fn each_entry(path: &Path, wanted: &[&str], mut each: impl FnMut(&str, Small) -> Result<()>) -> Result<()> {
-    let stopped = Stopped::default();
+pub(crate) fn each_entry(
+    path: &Path,
+    wanted: &[&str],
+    mut each: impl FnMut(&str, SmallValue) -> Result<()>,
+) -> Result<()> {
+    let stopped = ParseAbort::default();
     read(path, &stopped, Entries { wanted, each: &mut each, stopped: &stopped })
 }
 
 /// State of a reading: the selection, the callback and the slot for its error.
 struct Lists<'a> {
-    ask: Ask<'a>,
-    each: &'a mut dyn FnMut(JsonPlace, Small) -> Result<()>,
-    stopped: &'a Stopped,
+    ask: ListSelection<'a>,
+    each: &'a mut dyn FnMut(JsonPlace, SmallValue) -> Result<()>,
+    stopped: &'a ParseAbort,
 }
 
 /// Visitor methods that ignore values that were not selected.
@@ -183,45 +191,45 @@ struct InnerList<'a, 'b> {
 }
 
 impl<'de> DeserializeSeed<'de> for InnerList<'_, '_> {
-    type Value = Small;
+    type Value = SmallValue;
 
-    fn deserialize<D: Deserializer<'de>>(self, from: D) -> std::result::Result<Small, D::Error> {
+    fn deserialize<D: Deserializer<'de>>(self, from: D) -> std::result::Result<SmallValue, D::Error> {
         from.deserialize_any(self)
     }
 }
 
 impl<'de> Visitor<'de> for InnerList<'_, '_> {
-    type Value = Small;
+    type Value = SmallValue;
 
     fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str("a JSON value")
     }
 
-    fn visit_unit<E>(self) -> std::result::Result<Small, E> {
-        Ok(Small::Null)
+    fn visit_unit<E>(self) -> std::result::Result<SmallValue, E> {
+        Ok(SmallValue::Null)
     }
 
-    fn visit_bool<E>(self, value: bool) -> std::result::Result<Small, E> {
-        Ok(Small::Bool(value))
+    fn visit_bool<E>(self, value: bool) -> std::result::Result<SmallValue, E> {
+        Ok(SmallValue::Bool(value))
     }
 
-    fn visit_i64<E>(self, value: i64) -> std::result::Result<Small, E> {
-        Ok(Small::Number(value.into()))
+    fn visit_i64<E>(self, value: i64) -> std::result::Result<SmallValue, E> {
+        Ok(SmallValue::Number(value.into()))
     }
 
-    fn visit_u64<E>(self, value: u64) -> std::result::Result<Small, E> {
-        Ok(Small::Number(value.into()))
+    fn visit_u64<E>(self, value: u64) -> std::result::Result<SmallValue, E> {
+        Ok(SmallValue::Number(value.into()))
     }
 
-    fn visit_f64<E>(self, _: f64) -> std::result::Result<Small, E> {
-        Ok(Small::Large("a number".into()))
+    fn visit_f64<E>(self, _: f64) -> std::result::Result<SmallValue, E> {
+        Ok(SmallValue::Large("a number".into()))
     }
 
-    fn visit_str<E>(self, _: &str) -> std::result::Result<Small, E> {
-        Ok(Small::Large("a text".into()))
+    fn visit_str<E>(self, _: &str) -> std::result::Result<SmallValue, E> {
+        Ok(SmallValue::Large("a text".into()))
     }
 
-    fn visit_seq<A: SeqAccess<'de>>(self, mut list: A) -> std::result::Result<Small, A::Error> {
+    fn visit_seq<A: SeqAccess<'de>>(self, mut list: A) -> std::result::Result<SmallValue, A::Error> {
         let Lists { ask, stopped, .. } = *self.lists;
         for inner in 0.. {
             let keep = Keep { wanted: ask.wanted, elements: MAX_ELEMENTS };
@@ -229,19 +237,19 @@ impl<'de> Visitor<'de> for InnerList<'_, '_> {
             let at = JsonPlace { inner: Some(inner), ..self.at };
             (self.lists.each)(at, value).map_err(|error| stopped.by::<A::Error>(error))?;
         }
-        Ok(Small::List(Vec::new(), 0))
+        Ok(SmallValue::List(Vec::new(), 0))
     }
 
-    fn visit_map<A: MapAccess<'de>>(self, map: A) -> std::result::Result<Small, A::Error> {
-        IgnoredAny.visit_map(map).map(|IgnoredAny| Small::Large("an object".into()))
+    fn visit_map<A: MapAccess<'de>>(self, map: A) -> std::result::Result<SmallValue, A::Error> {
+        IgnoredAny.visit_map(map).map(|IgnoredAny| SmallValue::Large("an object".into()))
     }
 }
 
 /// Visitor of an object whose entries are selected.
 struct Entries<'a> {
     wanted: &'a [&'a str],
-    each: &'a mut dyn FnMut(&str, Small) -> Result<()>,
-    stopped: &'a Stopped,
+    each: &'a mut dyn FnMut(&str, SmallValue) -> Result<()>,
+    stopped: &'a ParseAbort,
 }
 seed_from_visitor!(Entries<'_>);
 
@@ -275,7 +283,7 @@ mod tests {
 
     fn elements(text: &str, keys: &[&str], nested: bool) -> Vec<(usize, usize, Option<usize>, String)> {
         let mut found = Vec::new();
-        let ask = Ask { keys, nested, wanted: &[] };
+        let ask = ListSelection { keys, nested, wanted: &[] };
         each_element(file(text).path(), ask, |JsonPlace { key, index, inner }, value| {
             found.push((key, index, inner, value.describe()));
             Ok(())
@@ -307,7 +315,7 @@ mod tests {
     #[test]
     fn error_of_the_callback_ends_reading() {
         let file = file("[1, 2, 3");
-        let ask = Ask { keys: &[], nested: false, wanted: &[] };
+        let ask = ListSelection { keys: &[], nested: false, wanted: &[] };
         let error = each_element(file.path(), ask, |at, _| match at.index {
             1 => Err(Error::usage("enough")),
             _ => Ok(()),

@@ -19,13 +19,13 @@ const MAX_VALUES: usize = 64;
 
 /// JSON value, or the part of it that is kept.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) enum Small {
+pub(crate) enum SmallValue {
     Null,
     Bool(bool),
     Number(Number),
     Text(Box<str>),
     /// The first elements of a list, and its length.
-    List(Vec<Small>, usize),
+    List(Vec<SmallValue>, usize),
     Object(Object),
     /// Value too large for a camera file, replaced by a description for messages.
     Large(Box<str>),
@@ -34,18 +34,18 @@ pub(crate) enum Small {
 /// Entries of a JSON object: the wanted ones, and a few others so that messages can describe the object.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub(crate) struct Object {
-    entries: Vec<(Box<str>, Small)>,
+    entries: Vec<(Box<str>, SmallValue)>,
     others: usize,
 }
 
 impl Object {
     /// Returns the value under `key`; the last one if the key is repeated.
-    pub(crate) fn get(&self, key: &str) -> Option<&Small> {
+    pub(crate) fn get(&self, key: &str) -> Option<&SmallValue> {
         self.entries.iter().find(|(name, _)| **name == *key).map(|(_, value)| value)
     }
 
     /// Sets the value under `key`.
-    fn set(&mut self, key: &str, value: Small) {
+    fn set(&mut self, key: &str, value: SmallValue) {
         match self.entries.iter_mut().find(|(name, _)| **name == *key) {
             Some(entry) => entry.1 = value,
             None => self.entries.push((key.into(), value)),
@@ -53,16 +53,16 @@ impl Object {
     }
 }
 
-impl Small {
+impl SmallValue {
     /// Builds an object with one entry.
-    pub(crate) fn of_entry(key: &str, value: Small) -> Small {
-        Small::Object(Object { entries: vec![(key.into(), value)], others: 0 })
+    pub(crate) fn from_entry(key: &str, value: SmallValue) -> SmallValue {
+        SmallValue::Object(Object { entries: vec![(key.into(), value)], others: 0 })
     }
 
     /// Returns the elements of a list if all were kept.
-    pub(crate) fn elements(&self) -> Option<&[Small]> {
+    pub(crate) fn elements(&self) -> Option<&[SmallValue]> {
         match self {
-            Small::List(kept, total) if kept.len() == *total => Some(kept),
+            SmallValue::List(kept, total) if kept.len() == *total => Some(kept),
             _ => None,
         }
     }
@@ -70,7 +70,7 @@ impl Small {
     /// Returns the number as the nearest f64; `None` for other values.
     pub(crate) fn as_f64(&self) -> Option<f64> {
         match self {
-            Small::Number(number) => number.as_f64(),
+            SmallValue::Number(number) => number.as_f64(),
             _ => None,
         }
     }
@@ -78,15 +78,15 @@ impl Small {
     /// Returns a non-negative integer; `None` for other values.
     pub(crate) fn as_u64(&self) -> Option<u64> {
         match self {
-            Small::Number(number) => number.as_u64(),
+            SmallValue::Number(number) => number.as_u64(),
             _ => None,
         }
     }
 
     /// Returns the value under `key` of an object.
-    pub(crate) fn get(&self, key: &str) -> Option<&Small> {
+    pub(crate) fn get(&self, key: &str) -> Option<&SmallValue> {
         match self {
-            Small::Object(object) => object.get(key),
+            SmallValue::Object(object) => object.get(key),
             _ => None,
         }
     }
@@ -95,10 +95,10 @@ impl Small {
     pub(crate) fn describe(&self) -> String {
         const LONGEST: usize = 120;
         match self {
-            Small::List(_, 0) => "an empty list".to_owned(),
-            Small::List(kept, total) if kept.len() < *total => format!("a list of {total}"),
-            Small::Large(what) => what.to_string(),
-            Small::Object(object) if object.entries.len() > 4 => {
+            SmallValue::List(_, 0) => "an empty list".to_owned(),
+            SmallValue::List(kept, total) if kept.len() < *total => format!("a list of {total}"),
+            SmallValue::Large(what) => what.to_string(),
+            SmallValue::Object(object) if object.entries.len() > 4 => {
                 let mut keys: Vec<&str> = object.entries.iter().map(|(key, _)| &**key).collect();
                 keys.sort_unstable();
                 keys.truncate(MAX_KEYS);
@@ -117,21 +117,21 @@ impl Small {
     /// Converts the kept part to a JSON value.
     fn value(&self) -> Value {
         match self {
-            Small::Null => Value::Null,
-            Small::Bool(value) => Value::Bool(*value),
-            Small::Number(number) => Value::Number(number.clone()),
-            Small::Text(text) => Value::String(text.to_string()),
-            Small::List(kept, _) => Value::Array(kept.iter().map(Small::value).collect()),
-            Small::Object(object) => {
+            SmallValue::Null => Value::Null,
+            SmallValue::Bool(value) => Value::Bool(*value),
+            SmallValue::Number(number) => Value::Number(number.clone()),
+            SmallValue::Text(text) => Value::String(text.to_string()),
+            SmallValue::List(kept, _) => Value::Array(kept.iter().map(SmallValue::value).collect()),
+            SmallValue::Object(object) => {
                 let entries = object.entries.iter().map(|(key, value)| (key.to_string(), value.value()));
                 Value::Object(entries.collect::<Map<_, _>>())
             }
-            Small::Large(what) => Value::String(format!("({what})")),
+            SmallValue::Large(what) => Value::String(format!("({what})")),
         }
     }
 }
 
-/// Seed that reads any value as [`Small`].
+/// Seed that reads any value as [`SmallValue`].
 #[derive(Debug)]
 pub(crate) struct Keep<'a> {
     /// Keys of objects that are always kept.
@@ -141,9 +141,9 @@ pub(crate) struct Keep<'a> {
 }
 
 impl<'de> DeserializeSeed<'de> for Keep<'_> {
-    type Value = Small;
+    type Value = SmallValue;
 
-    fn deserialize<D: Deserializer<'de>>(self, from: D) -> Result<Small, D::Error> {
+    fn deserialize<D: Deserializer<'de>>(self, from: D) -> Result<SmallValue, D::Error> {
         from.deserialize_any(NestedValue { keep: &self, remaining: &mut MAX_VALUES.clone(), depth: 0 })
     }
 }
@@ -164,54 +164,54 @@ impl<'a> NestedValue<'a> {
 }
 
 impl<'de> DeserializeSeed<'de> for NestedValue<'_> {
-    type Value = Small;
+    type Value = SmallValue;
 
-    fn deserialize<D: Deserializer<'de>>(self, from: D) -> Result<Small, D::Error> {
+    fn deserialize<D: Deserializer<'de>>(self, from: D) -> Result<SmallValue, D::Error> {
         match self.remaining.checked_sub(1) {
             Some(remaining) => {
                 *self.remaining = remaining;
                 from.deserialize_any(self)
             }
-            None => IgnoredAny::deserialize(from).map(|IgnoredAny| Small::Large("a value of many parts".into())),
+            None => IgnoredAny::deserialize(from).map(|IgnoredAny| SmallValue::Large("a value of many parts".into())),
         }
     }
 }
 
 impl<'de> Visitor<'de> for NestedValue<'_> {
-    type Value = Small;
+    type Value = SmallValue;
 
     fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str("a JSON value")
     }
 
-    fn visit_unit<E>(self) -> Result<Small, E> {
-        Ok(Small::Null)
+    fn visit_unit<E>(self) -> Result<SmallValue, E> {
+        Ok(SmallValue::Null)
     }
 
-    fn visit_bool<E>(self, value: bool) -> Result<Small, E> {
-        Ok(Small::Bool(value))
+    fn visit_bool<E>(self, value: bool) -> Result<SmallValue, E> {
+        Ok(SmallValue::Bool(value))
     }
 
-    fn visit_i64<E>(self, value: i64) -> Result<Small, E> {
-        Ok(Small::Number(value.into()))
+    fn visit_i64<E>(self, value: i64) -> Result<SmallValue, E> {
+        Ok(SmallValue::Number(value.into()))
     }
 
-    fn visit_u64<E>(self, value: u64) -> Result<Small, E> {
-        Ok(Small::Number(value.into()))
+    fn visit_u64<E>(self, value: u64) -> Result<SmallValue, E> {
+        Ok(SmallValue::Number(value.into()))
     }
 
-    fn visit_f64<E>(self, value: f64) -> Result<Small, E> {
-        Ok(Number::from_f64(value).map_or(Small::Null, Small::Number))
+    fn visit_f64<E>(self, value: f64) -> Result<SmallValue, E> {
+        Ok(Number::from_f64(value).map_or(SmallValue::Null, SmallValue::Number))
     }
 
-    fn visit_str<E>(self, text: &str) -> Result<Small, E> {
+    fn visit_str<E>(self, text: &str) -> Result<SmallValue, E> {
         Ok(match text.len() <= MAX_TEXT {
-            true => Small::Text(text.into()),
-            false => Small::Large(format!("a text of {} bytes", text.len()).into()),
+            true => SmallValue::Text(text.into()),
+            false => SmallValue::Large(format!("a text of {} bytes", text.len()).into()),
         })
     }
 
-    fn visit_seq<A: SeqAccess<'de>>(mut self, mut list: A) -> Result<Small, A::Error> {
+    fn visit_seq<A: SeqAccess<'de>>(mut self, mut list: A) -> Result<SmallValue, A::Error> {
         let (mut kept, mut total) = (Vec::new(), 0);
         let most = self.keep.elements;
         while kept.len() < most {
@@ -224,10 +224,10 @@ impl<'de> Visitor<'de> for NestedValue<'_> {
                 total += 1;
             }
         }
-        Ok(Small::List(kept, total))
+        Ok(SmallValue::List(kept, total))
     }
 
-    fn visit_map<A: MapAccess<'de>>(mut self, mut map: A) -> Result<Small, A::Error> {
+    fn visit_map<A: MapAccess<'de>>(mut self, mut map: A) -> Result<SmallValue, A::Error> {
         let mut object = Object::default();
         while let Some(key) = map.next_key_seed(ShortKey)? {
             let is_wanted = self.keep.wanted.contains(&&*key);
@@ -248,7 +248,7 @@ impl<'de> Visitor<'de> for NestedValue<'_> {
             };
             object.set(&key, value);
         }
-        Ok(Small::Object(object))
+        Ok(SmallValue::Object(object))
     }
 }
 
@@ -282,12 +282,12 @@ impl Visitor<'_> for ShortKey {
 mod tests {
     use std::path::Path;
 
-    use super::super::{Stopped, read_from};
+    use super::super::{ParseAbort, read_from};
     use super::*;
 
-    fn kept(text: &str) -> Small {
+    fn kept(text: &str) -> SmallValue {
         let keep = Keep { wanted: &["frames", "w2c"], elements: MAX_ELEMENTS };
-        read_from(text.as_bytes(), Path::new("a"), &Stopped::default(), keep).unwrap()
+        read_from(text.as_bytes(), Path::new("a"), &ParseAbort::default(), keep).unwrap()
     }
 
     #[test]
@@ -306,12 +306,12 @@ mod tests {
         assert_eq!(kept(&many).describe(), "a list of 100000");
         assert_eq!(kept(&many).elements(), None);
         let nested = format!("[{}0]", "[[1,2],[3,4]],".repeat(15));
-        let Small::List(elements, 16) = kept(&nested) else { panic!("a list of 16") };
-        assert!(elements.contains(&Small::Large("a value of many parts".into())));
+        let SmallValue::List(elements, 16) = kept(&nested) else { panic!("a list of 16") };
+        assert!(elements.contains(&SmallValue::Large("a value of many parts".into())));
         assert_eq!(kept(&format!("\"{}\"", "x".repeat(5000))).describe(), "a text of 5000 bytes");
         let keys: Vec<String> = (0..1000).map(|k| format!("\"k{k}\": [1, 2, 3]")).collect();
         let object = kept(&format!("{{{}, \"w2c\": 7}}", keys.join(", ")));
-        assert_eq!(object.get("w2c").and_then(Small::as_u64), Some(7), "a wanted key behind many others");
+        assert_eq!(object.get("w2c").and_then(SmallValue::as_u64), Some(7), "a wanted key behind many others");
         assert!(object.describe().starts_with("an object with the keys k0, k1"));
         let long = kept(&format!("{{\"{}\": 1}}", "k".repeat(1000)));
         assert!(long.describe().len() < 100, "{long:?}");

@@ -20,7 +20,7 @@ const ZIP64_BYTES: usize = 1 << 32;
 
 /// Axis of an array that counts Gaussians.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum ArrayRows {
+pub(crate) enum GaussianAxis {
     /// No axis: the array is copied unchanged.
     None,
     /// Axis 0.
@@ -38,7 +38,7 @@ pub(crate) enum ArrayRows {
 pub(crate) fn write_like(
     template: &Npz,
     kept: &[u32],
-    axis: impl Fn(&NpzArray) -> ArrayRows,
+    axis: impl Fn(&NpzArray) -> GaussianAxis,
     mut change: impl FnMut(&str, usize, &mut [f32]) -> Result<Vec<u32>>,
     path: &Path,
 ) -> Result<()> {
@@ -49,9 +49,9 @@ pub(crate) fn write_like(
         let axis = axis(entry);
         let mut shape = entry.shape.clone();
         match axis {
-            ArrayRows::None => (),
-            ArrayRows::First => shape[0] = kept.len(),
-            ArrayRows::Second => shape[1] = kept.len(),
+            GaussianAxis::None => (),
+            GaussianAxis::First => shape[0] = kept.len(),
+            GaussianAxis::Second => shape[1] = kept.len(),
         }
         let method = if entry.is_compressed { CompressionMethod::Deflated } else { CompressionMethod::Stored };
         let options = FileOptions::default()
@@ -60,7 +60,7 @@ pub(crate) fn write_like(
             .large_file(entry.len().saturating_mul(8) >= ZIP64_BYTES);
         archive.start_file(format!("{}.npy", entry.name), options).map_err(|error| failed(error.into()))?;
         template.read(entry, |values| {
-            if axis == ArrayRows::None {
+            if axis == GaussianAxis::None {
                 archive.write_all(&header(&entry.descr, entry.is_fortran, &shape)).map_err(failed)?;
                 std::io::copy(values, &mut archive).map_err(|error| template.damaged(entry, &error))?;
                 return Ok(());
@@ -70,7 +70,7 @@ pub(crate) fn write_like(
             };
             archive.write_all(&header(&entry.descr, false, &shape)).map_err(failed)?;
             let (frames, rows) = match axis {
-                ArrayRows::Second => (entry.shape[0], &entry.shape[1..]),
+                GaussianAxis::Second => (entry.shape[0], &entry.shape[1..]),
                 _ => (1, &entry.shape[..]),
             };
             let width: usize = rows[1..].iter().product();

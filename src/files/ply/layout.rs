@@ -6,7 +6,7 @@ use std::path::Path;
 
 use super::header::{Element, Property};
 use crate::error::{Error, Result};
-use crate::model::{Columns, HIGHEST_DEGREE, sh_coefficients};
+use crate::model::{Attributes, MAX_SH_DEGREE, sh_coefficients};
 
 /// Natural log of the thickness given to a surfel (2DGS, no `scale_2`), relative to its smaller axis: a thousandth.
 /// Relative, so that results do not depend on the unit of the scene; thin enough to vanish under the rasterizer's 0.3
@@ -50,7 +50,7 @@ impl PlyLayout {
         let rotation = need_all(&["rot_0", "rot_1", "rot_2", "rot_3"])?;
 
         let rest = vertex.properties.iter().filter(|property| property.name.starts_with("f_rest_")).count();
-        let Some(sh_degree) = (0..=HIGHEST_DEGREE).find(|&degree| 3 * (sh_coefficients(degree) - 1) == rest) else {
+        let Some(sh_degree) = (0..=MAX_SH_DEGREE).find(|&degree| 3 * (sh_coefficients(degree) - 1) == rest) else {
             let expected = "0, 9, 24 or 45 properties f_rest_* (degree 0 to 3)";
             return Err(Error::input(path, "element vertex", expected, rest.to_string()));
         };
@@ -65,8 +65,8 @@ impl PlyLayout {
     }
 
     /// Returns the planes of a single attribute.
-    pub(crate) fn planes(&self, column: Columns) -> &[PlaneSource] {
-        let index = Columns::all().iter().take_while(|&one| one != column).count();
+    pub(crate) fn planes(&self, column: Attributes) -> &[PlaneSource] {
+        let index = Attributes::all().iter().take_while(|&one| one != column).count();
         &self.planes[index]
     }
 }

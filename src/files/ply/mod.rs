@@ -30,7 +30,7 @@ use super::map::FileMap;
 use super::open::open_file;
 use crate::error::{Error, Result, ShowPath};
 use crate::limits::ReadLimit;
-use crate::model::{Column, Columns, Gaussians};
+use crate::model::{AttributeValues, Attributes, Gaussians};
 use crate::progress::Events;
 use crate::source::Ids;
 
@@ -172,10 +172,10 @@ impl Ply {
     /// # Errors
     /// The memory limit is exceeded; the file was truncated since it was opened.
     pub(crate) fn whole(&self) -> Result<Gaussians> {
-        let bytes = 4 * Columns::all().width(self.sh_degree()) as u64 * self.count as u64;
+        let bytes = 4 * Attributes::all().width(self.sh_degree()) as u64 * self.count as u64;
         self.memory.check(&self.path, "element vertex", "the Gaussians of the file", bytes)?;
         let mut out = Gaussians::zeros(self.count, self.sh_degree());
-        self.gaussians(0..self.count, Columns::all(), &mut out)?;
+        self.gaussians(0..self.count, Attributes::all(), &mut out)?;
         Ok(out)
     }
 
@@ -205,7 +205,7 @@ impl Ply {
     }
 
     /// Writes the attributes `want` of the Gaussians `range` into `out`, as [`Ply::gather`] does.
-    pub fn gaussians(&self, range: Range<usize>, want: Columns, out: &mut Gaussians) -> Result<()> {
+    pub fn gaussians(&self, range: Range<usize>, want: Attributes, out: &mut Gaussians) -> Result<()> {
         self.gather(&Ids::Range(range), want, out)
     }
 
@@ -214,14 +214,14 @@ impl Ply {
     ///
     /// # Errors
     /// An id beyond the last Gaussian; a file truncated since it was opened.
-    pub fn gather(&self, ids: &Ids<'_>, want: Columns, out: &mut Gaussians) -> Result<()> {
+    pub fn gather(&self, ids: &Ids<'_>, want: Attributes, out: &mut Gaussians) -> Result<()> {
         self.check_unshrunk()?;
         check_ids(&self.path, ids, self.count)?;
         out.resize(ids.len());
         for column in want.iter() {
             let width = self.layout.planes(column).len();
             if out.column(column).width() != width {
-                *out.column_mut(column) = Column::zeros(width, ids.len());
+                *out.column_mut(column) = AttributeValues::zeros(width, ids.len());
             }
         }
         let rows = &self.body.bytes()[self.rows.clone()];
@@ -243,7 +243,9 @@ impl Ply {
                 }
             }
         }
-        if want.contains(Columns::LOG_SCALE) && self.layout.planes(Columns::LOG_SCALE).contains(&PlaneSource::Thin) {
+        if want.contains(Attributes::LOG_SCALE)
+            && self.layout.planes(Attributes::LOG_SCALE).contains(&PlaneSource::Thin)
+        {
             for i in 0..ids.len() {
                 let [a, b, _] = out.log_scale.row::<3>(i);
                 out.log_scale.set_row(i, [a, b, a.min(b) + THIN_LOG_SCALE]);
@@ -271,7 +273,7 @@ impl Ply {
     }
 
     /// Returns the number of bytes of the file that must be read for `rows` Gaussians: all bytes of a text file.
-    pub(crate) fn bytes_of(&self, rows: usize) -> u64 {
+    pub(crate) fn bytes_read_for(&self, rows: usize) -> u64 {
         match &self.body.text {
             None => (rows * self.stride) as u64,
             Some((stored, _)) => *stored,

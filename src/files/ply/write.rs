@@ -13,7 +13,7 @@ use crate::error::{Error, Result, ShowPath};
 use crate::files::ply::{
     PlaneSource, Ply, PlyEncoding, PlyHeader, PlyLayout, Property, Scalar, name_without_bands, read_plane,
 };
-use crate::model::{Columns, Gaussians, HIGHEST_DEGREE, sh_coefficients};
+use crate::model::{Attributes, Gaussians, MAX_SH_DEGREE, sh_coefficients};
 
 /// One row of a smaller PLY.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -25,7 +25,7 @@ pub struct OutRow {
 }
 
 /// Returns the rows to write for the compressed model `reduction`.
-pub fn out_rows(reduction: &CompressedModel) -> Vec<OutRow> {
+pub fn rows_of_model(reduction: &CompressedModel) -> Vec<OutRow> {
     let mut rows: Vec<OutRow> = reduction.kept.iter().map(|&source| OutRow { source, proxy: None }).collect();
     for (proxy, cluster) in reduction.clusters.iter().enumerate() {
         rows[cluster.output as usize].proxy = Some(proxy as u32);
@@ -114,7 +114,7 @@ pub(crate) fn write_rows_like(
 /// The file cannot be written; the SH width belongs to no degree from 0 to 3.
 pub fn write_inria(gaussians: &Gaussians, comments: &[String], path: &Path) -> Result<()> {
     let width = gaussians.sh.width();
-    if !(0..=HIGHEST_DEGREE).any(|degree| 3 * sh_coefficients(degree) == width) {
+    if !(0..=MAX_SH_DEGREE).any(|degree| 3 * sh_coefficients(degree) == width) {
         return Err(Error::internal(format!("{width} SH planes belong to no degree from 0 to 3")));
     }
     let rest = width - 3;
@@ -163,7 +163,7 @@ pub(crate) fn beside(template: &Ply, rows: impl Iterator<Item = u32>) -> Vec<u8>
 }
 
 /// Returns the number of bytes of the extra (non-Gaussian) properties of each row of `template`.
-pub(crate) fn bytes_beside(template: &Ply) -> usize {
+pub(crate) fn extra_bytes_per_row(template: &Ply) -> usize {
     extra_ranges(template.properties(), template.layout()).iter().map(ExactSizeIterator::len).sum()
 }
 
@@ -187,7 +187,7 @@ pub(crate) fn write_rows(
     let layout = PlyLayout::from_element(from, vertex)?;
     let ranges = extra_ranges(&vertex.properties, &layout);
     let width: usize = ranges.iter().map(|range| range.len()).sum();
-    if layout.planes(Columns::SH).len() != cloud.sh.width() || width * cloud.len() != beside.len() {
+    if layout.planes(Attributes::SH).len() != cloud.sh.width() || width * cloud.len() != beside.len() {
         return Err(mismatch("the properties of the rows".to_owned()));
     }
     let big_endian = header.encoding == PlyEncoding::BigEndian;
@@ -212,7 +212,7 @@ pub(crate) fn write_rows(
 /// Returns the byte ranges of a row that hold extra (non-Gaussian) properties.
 fn extra_ranges(properties: &[Property], layout: &PlyLayout) -> Vec<Range<usize>> {
     let mut used: Vec<usize> = Vec::new();
-    for column in Columns::all().iter() {
+    for column in Attributes::all().iter() {
         used.extend(layout.planes(column).iter().filter_map(|plane| match plane {
             PlaneSource::Property(property) => Some(property.offset),
             PlaneSource::Thin => None,
@@ -237,7 +237,7 @@ fn check_rows(template: &Ply, rows: &[OutRow], proxies: &Gaussians, change: &Par
             return Err(Error::internal(message));
         }
     }
-    let planes = template.layout().planes(Columns::SH).len();
+    let planes = template.layout().planes(Attributes::SH).len();
     if !proxies.is_empty() && proxies.sh.width() != planes {
         let width = proxies.sh.width();
         return Err(Error::internal(format!(
@@ -258,7 +258,7 @@ fn check_rows(template: &Ply, rows: &[OutRow], proxies: &Gaussians, change: &Par
 
 /// Replaces the attributes in the bytes of a row by those of a proxy.
 fn replace(row: &mut [u8], layout: &PlyLayout, big_endian: bool, proxies: &Gaussians, proxy: usize) {
-    for column in Columns::all().iter() {
+    for column in Attributes::all().iter() {
         for (c, plane) in layout.planes(column).iter().enumerate() {
             if let PlaneSource::Property(property) = plane {
                 put(row, property, big_endian, proxies.column(column).plane(c)[proxy]);

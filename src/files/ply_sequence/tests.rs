@@ -8,7 +8,7 @@ const N: usize = 7;
 /// Returns a frame state with values that depend on the frame and the position in the plane.
 fn state(frame: usize, count: usize) -> Gaussians {
     let mut out = Gaussians::zeros(count, 1);
-    for column in Columns::all().iter() {
+    for column in Attributes::all().iter() {
         let fill = |(i, value): (usize, &mut f32)| *value = (1000 * frame + i) as f32;
         out.column_mut(column).planes_mut().iter_mut().enumerate().for_each(fill);
     }
@@ -31,15 +31,15 @@ fn frames_come_in_natural_order_at_even_times() {
     let folder = folder(12);
     let sequence = PlySequence::open(folder.path()).unwrap();
     let info = sequence.info();
-    assert_eq!((info.count, info.sh_degree, info.varying), (N, 1, Columns::all()));
+    assert_eq!((info.count, info.sh_degree, info.varying), (N, 1, Attributes::all()));
     assert_eq!(info.times, (0..12).map(|t| t as f64 / 12.0).collect::<Vec<_>>());
     let mut reader = FrameSource::open(&sequence, Ids::Range(0..N)).unwrap();
     let mut out = Gaussians::zeros(0, 1);
     for t in [11, 2, 10, 0] {
-        reader.read(t, Columns::all(), &mut out).unwrap();
+        reader.read(t, Attributes::all(), &mut out).unwrap();
         assert_eq!(out, state(t, N), "frame {t}");
     }
-    assert!(reader.read(12, Columns::all(), &mut out).unwrap_err().to_string().contains("frame 12"));
+    assert!(reader.read(12, Attributes::all(), &mut out).unwrap_err().to_string().contains("frame 12"));
 }
 
 #[test]
@@ -49,11 +49,11 @@ fn any_ids_read_the_same_bits() {
     let whole = state(2, N);
     let mut out = Gaussians::zeros(0, 1);
     let ids = [6, 0, 3, 3];
-    FrameSource::open(&sequence, Ids::List(&ids)).unwrap().read(2, Columns::all(), &mut out).unwrap();
+    FrameSource::open(&sequence, Ids::List(&ids)).unwrap().read(2, Attributes::all(), &mut out).unwrap();
     for (i, &id) in ids.iter().enumerate() {
         assert_eq!(out.sh.row::<12>(i), whole.sh.row::<12>(id as usize));
     }
-    FrameSource::open(&sequence, Ids::Range(2..5)).unwrap().read(2, Columns::POSITION, &mut out).unwrap();
+    FrameSource::open(&sequence, Ids::Range(2..5)).unwrap().read(2, Attributes::POSITION, &mut out).unwrap();
     assert_eq!(out.position.plane(1), &whole.position.plane(1)[2..5]);
     assert!(FrameSource::open(&sequence, Ids::Range(0..N + 1)).is_err());
 }
@@ -65,9 +65,9 @@ fn a_single_file_is_one_constant_frame() {
         [PlySequence::single(&folder.path().join("f_0.ply"), &PlyOptions::default()), PlySequence::open(folder.path())]
     {
         let sequence = sequence.unwrap();
-        assert_eq!((sequence.info().varying, &sequence.info().times[..]), (Columns::empty(), &[0.0][..]));
+        assert_eq!((sequence.info().varying, &sequence.info().times[..]), (Attributes::empty(), &[0.0][..]));
         let mut out = Gaussians::zeros(0, 1);
-        FrameSource::open(&sequence, Ids::Range(0..N)).unwrap().read(0, Columns::all(), &mut out).unwrap();
+        FrameSource::open(&sequence, Ids::Range(0..N)).unwrap().read(0, Attributes::all(), &mut out).unwrap();
         assert_eq!(out, state(0, N));
     }
 }
@@ -91,7 +91,7 @@ fn frames_changed_since_opening_are_named() {
     let sequence = PlySequence::open(folder.path()).unwrap();
     write(folder.path(), "f_1.ply", &state(1, N + 2));
     let mut reader = FrameSource::open(&sequence, Ids::Range(0..N)).unwrap();
-    let message = reader.read(1, Columns::all(), &mut Gaussians::zeros(0, 1)).unwrap_err().to_string();
+    let message = reader.read(1, Attributes::all(), &mut Gaussians::zeros(0, 1)).unwrap_err().to_string();
     assert!(message.contains("f_1.ply") && message.contains("found 9"), "{message}");
 }
 

@@ -48,7 +48,7 @@ fn defects(row: &SplatvGaussian, zero_rotation: ZeroRotation) -> Vec<Defect> {
         (!is_finite(&row.position), NON_FINITE_POSITION),
         (row.width.is_nan() || row.width <= 0.0, INVALID_WIDTH),
         (!others.into_iter().all(is_finite), NON_FINITE_VALUE),
-        (is_unturned(row), unturned),
+        (has_zero_quaternion(row), unturned),
         (row.width == f32::INFINITY, INFINITE_WIDTH),
     ];
     all.into_iter().filter_map(|(is_there, defect)| is_there.then_some(defect)).collect()
@@ -56,7 +56,7 @@ fn defects(row: &SplatvGaussian, zero_rotation: ZeroRotation) -> Vec<Defect> {
 
 /// Returns whether the quaternion of a row is 0 at every time. A quaternion that is 0 at only one instant is not a
 /// defect.
-pub(crate) fn is_unturned(row: &SplatvGaussian) -> bool {
+pub(crate) fn has_zero_quaternion(row: &SplatvGaussian) -> bool {
     row.rotation == [0.0; 4] && row.omega == [0.0; 4]
 }
 
@@ -70,7 +70,7 @@ pub fn inspect(file: &Splatv, zero_rotation: ZeroRotation) -> Result<(Defects, O
     let mut found = Defects::new(count);
     let mut rows: Option<Vec<u32>> = None;
     for row in 0..count as u32 {
-        let row_defects = defects(&SplatvGaussian::of_words(&file.words(row as usize)), zero_rotation);
+        let row_defects = defects(&SplatvGaussian::from_words(&file.words(row as usize)), zero_rotation);
         found.add(row, &row_defects);
         match (row_defects.iter().any(|&(_, dropped, _)| dropped), &mut rows) {
             // First row that is left out: all rows before it are kept.
@@ -94,11 +94,11 @@ pub fn inspect(file: &Splatv, zero_rotation: ZeroRotation) -> Result<(Defects, O
 /// Repairs the words of a row that is kept: an infinite width becomes the largest finite half-precision value, a
 /// quaternion that is 0 at every time becomes the identity.
 pub fn repair(words: &mut [u32; WORDS]) {
-    let row = SplatvGaussian::of_words(words);
+    let row = SplatvGaussian::from_words(words);
     if row.width == f32::INFINITY {
         words[15] = (words[15] & 0xffff) | u32::from(f16::MAX.to_bits()) << 16;
     }
-    if is_unturned(&row) {
+    if has_zero_quaternion(&row) {
         words[3] = u32::from(f16::ONE.to_bits());
     }
 }
@@ -208,9 +208,9 @@ mod tests {
         for (edit, expected) in [(8, [1.0, 0.0, 0.0, 0.0]), (9, [1.0, 0.0, 0.0, 0.0]), (10, [0.0; 4])] {
             let mut row = words(&sound(1.0));
             EDITS[edit](&mut row);
-            let before = SplatvGaussian::of_words(&row);
+            let before = SplatvGaussian::from_words(&row);
             repair(&mut row);
-            let after = SplatvGaussian::of_words(&row);
+            let after = SplatvGaussian::from_words(&row);
             let width = if before.width.is_finite() { before.width } else { 65504.0 };
             assert_eq!(after, SplatvGaussian { rotation: expected, width, ..before }, "edit {edit}");
         }

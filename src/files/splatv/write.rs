@@ -11,11 +11,11 @@ use half::f16;
 use serde_json::{Value, json};
 
 use crate::error::{Error, Result};
-use crate::files::accuracy::{Accuracy, Drawn};
+use crate::files::accuracy::{Accuracy, RenderedAttributes};
 use crate::files::cameras::virtual_rig;
 use crate::files::splatv::{MAGIC, ROW_BYTES, SplatvGaussian, TEXELS, WORDS};
 use crate::model::RobustBox;
-use crate::model::{Camera, Column};
+use crate::model::{AttributeValues, Camera};
 
 /// Index of a camera of the virtual rig that is neither at the top nor at the bottom of the scene.
 const DEFAULT_CAMERA: usize = 4;
@@ -70,8 +70,8 @@ pub fn words(row: &SplatvGaussian) -> [u32; WORDS] {
 /// Adds the error between `row` and its stored form, as Gaussian `id`, to `to`. The error of the path is taken as far
 /// from its center in time as the Gaussian is visible.
 pub fn measure(row: &SplatvGaussian, id: usize, to: &mut Accuracy) {
-    let held = SplatvGaussian::of_words(&words(row));
-    let drawn = |row: &SplatvGaussian| Drawn {
+    let held = SplatvGaussian::from_words(&words(row));
+    let drawn = |row: &SplatvGaussian| RenderedAttributes {
         position: row.position.map(f64::from),
         scale: row.scale.map(f64::from),
         opacity: row.opacity,
@@ -98,7 +98,7 @@ pub fn camera(camera: &Camera) -> Value {
 }
 
 /// Returns the list of cameras for a model without cameras: one that sees most of the Gaussians at `positions`.
-pub fn seen_whole(positions: &Column) -> Value {
+pub fn default_cameras(positions: &AttributeValues) -> Value {
     let found = RobustBox::from_positions(positions);
     virtual_rig(found.middle, found.extent())
         .cameras
@@ -171,7 +171,7 @@ mod tests {
                     && bytes < 65536 * u64::from(count.div_ceil(1024)) + 512
             );
             for (i, expected) in rows.iter().enumerate() {
-                let found = SplatvGaussian::of_words(&read.words(i));
+                let found = SplatvGaussian::from_words(&read.words(i));
                 let close = |a: f64, b: f64| (a - b).abs() <= 1.0 / 255.0;
                 assert!(
                     found.rgb.iter().zip(expected.rgb).all(|(&a, b)| close(a, b))
@@ -189,7 +189,7 @@ mod tests {
     #[test]
     fn zero_quaternions_are_never_written() {
         let rotation = |rotation| {
-            SplatvGaussian::of_words(&words(&SplatvGaussian { rotation, omega: [0.0; 4], ..row(1) })).rotation
+            SplatvGaussian::from_words(&words(&SplatvGaussian { rotation, omega: [0.0; 4], ..row(1) })).rotation
         };
         assert_eq!(rotation([0.0; 4]), [1.0, 0.0, 0.0, 0.0]);
         assert_eq!(rotation([0.0, 3e-9, 0.0, -4e-9]).map(|x| (100.0 * x).round()), [0.0, 60.0, 0.0, -80.0]);
@@ -199,7 +199,7 @@ mod tests {
     #[test]
     fn values_beyond_half_precision_are_clamped() {
         let wild = SplatvGaussian { motion: [1e9, -1e9, f32::NAN, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], width: 1e6, ..row(1) };
-        let found = SplatvGaussian::of_words(&words(&wild));
+        let found = SplatvGaussian::from_words(&words(&wild));
         assert_eq!((&found.motion[..3], found.width), (&[65504.0, -65504.0, 0.0][..], 65504.0));
         assert_eq!(words(&SplatvGaussian { rgb: [-1.0, 2.0, 0.5], ..row(1) })[7] & 0xffffff, 0x7f_ff_00);
     }

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use crate::archive::Content;
 use crate::error::{Error, Result};
-use crate::files::ply::write::{beside, bytes_beside, write_rows};
+use crate::files::ply::write::{beside, extra_bytes_per_row, write_rows};
 use crate::files::ply::{Ply, PlyHeader, name_without_bands};
 
 /// Name of the part with the header of the PLY.
@@ -28,7 +28,7 @@ pub(crate) fn add_cloud(content: &mut Content, template: &Ply, rows: impl Iterat
     template.check_unshrunk()?;
     let [lead, tail] = template.bytes_around();
     let what = "the data that the archive keeps beside the attributes of Gaussians";
-    let bytes = lead + tail + bytes_beside(template) * content.cloud.len();
+    let bytes = lead + tail + extra_bytes_per_row(template) * content.cloud.len();
     // Counted twice: the content and the archive encoded from it.
     template.memory().check(template.path(), "element vertex", what, 2 * bytes as u64)?;
     content.beside = beside(template, rows);

@@ -20,16 +20,16 @@ pub(super) use paths::{has_network, network_tensor_names};
 
 use super::files::copy;
 use super::four_d_gaussians::cfg_args::read_for_degree;
-use super::size::{Size, bytes_below, bytes_of};
+use super::size::{Size, bytes_below, bytes_read_for};
 use super::trajectories::{check_output, state_bytes, write_sequence};
 use crate::compressed_model::{Cluster, CompressedModel, Proxies, Reference};
 use crate::deform::Tensors;
 use crate::error::{Error, Result};
 use crate::files::cameras::Clock;
-use crate::files::ply::write::{out_rows, write_like};
+use crate::files::ply::write::{rows_of_model, write_like};
 use crate::files::ply::{Ply, PlyEncoding, read_plane};
 use crate::limits::Limits;
-use crate::model::{Column, Columns, Gaussians, Jacobian, Raw};
+use crate::model::{AttributeValues, Attributes, Gaussians, Jacobian, StoredParams};
 use crate::models::input_model::{InputModel, MemoryProfile, OpenOptions, Timing};
 use crate::models::motion_model::{MotionModel, MotionModelFrames, solve};
 use crate::outputs::container::GAUSSIAN_BLOCK;
@@ -136,7 +136,7 @@ impl<L: NetworkMotionModel + 'static> DeformFolder<L> {
         }
         let none = Gaussians::zeros(0, self.model.info().sh_degree);
         let proxies = reduction.proxies.raw.as_ref().map_or(&none, |raw| &raw.gaussians);
-        let mut rows = out_rows(reduction);
+        let mut rows = rows_of_model(reduction);
         for cluster in &reduction.clusters {
             // A proxy gets the features of its heaviest member.
             rows[cluster.output as usize].source = heaviest(cluster);
@@ -154,12 +154,12 @@ fn heaviest(cluster: &Cluster) -> u32 {
 
 /// Reads the parameters of all Gaussians, with the properties `fea_0`, `fea_1`, … as format-specific planes. Fails if
 /// values that the network reads or that are decomposed are not finite.
-fn raw(ply: &Ply) -> Result<Raw> {
+fn raw(ply: &Ply) -> Result<StoredParams> {
     let count = ply.count();
     let gaussians = ply.whole()?;
     let find = |k: usize| ply.properties().iter().find(|property| property.name == format!("fea_{k}"));
     let features: Vec<_> = (0..).map_while(find).collect();
-    let mut own = Column::zeros(features.len(), count);
+    let mut own = AttributeValues::zeros(features.len(), count);
     let big_endian = ply.header().encoding == PlyEncoding::BigEndian;
     for (k, property) in features.into_iter().enumerate() {
         let plane = own.plane_mut(k);
@@ -181,13 +181,13 @@ fn raw(ply: &Ply) -> Result<Raw> {
             .hint("remove this Gaussian from the model, or train and save it again"));
         }
     }
-    Ok(Raw { gaussians, own })
+    Ok(StoredParams { gaussians, own })
 }
 
 /// Returns the sizes of the files that a renderer opens.
 fn size_of(paths: &Paths) -> Result<Size> {
-    let (cloud, field) = (bytes_of([&*paths.point_cloud])?, bytes_of([&*paths.network])?);
-    Ok(Size { cloud, field, rest: bytes_of([&*paths.cfg_args])?, ..Size::default() })
+    let (cloud, field) = (bytes_read_for([&*paths.point_cloud])?, bytes_read_for([&*paths.network])?);
+    Ok(Size { cloud, field, rest: bytes_read_for([&*paths.cfg_args])?, ..Size::default() })
 }
 
 impl<L: NetworkMotionModel + 'static> InputModel for DeformFolder<L> {
@@ -221,7 +221,7 @@ impl<L: NetworkMotionModel + 'static> InputModel for DeformFolder<L> {
     fn residence(&self) -> MemoryProfile {
         let motion_model = self.model.motion_model();
         let features = 4 * self.model.raw().own.width() as u64;
-        let whole = state_bytes(self.model.info().sh_degree, Columns::all()) + features;
+        let whole = state_bytes(self.model.info().sh_degree, Attributes::all()) + features;
         MemoryProfile {
             per_gaussian: whole,
             // Normals and other extra properties are stored beside the attributes.
@@ -302,7 +302,7 @@ impl<L: NetworkMotionModel + 'static> InputModel for DeformFolder<L> {
             OutputKind::Model => self.write_folder(reduction, path).map(|()| Vec::new())?,
             _ => write_sequence(&*self.reduced(reduction)?, kind, path, limits.frames_held, events)?,
         };
-        let left = Columns::all().difference(self.model.motion_model().movable());
+        let left = Attributes::all().difference(self.model.motion_model().movable());
         if !reduction.change.is_empty() && !left.is_empty() {
             notes.push(
                 "scales and rotations were not refined: the covariances of this model do not follow from its \

@@ -12,7 +12,7 @@ use super::{MIN_SCALE, NetworkMotionModel, heaviest};
 use crate::compressed_model::Cluster;
 use crate::error::Result;
 use crate::merging::merged::MergedSequence;
-use crate::model::{Columns, Gaussians, Raw, logit, opacity};
+use crate::model::{Attributes, Gaussians, StoredParams, logit, opacity};
 use crate::models::motion_model::MotionModelFrames;
 use crate::passes::gather_all;
 use crate::recipe::MergeParams;
@@ -38,7 +38,7 @@ pub(super) fn propose<L: NetworkMotionModel>(
     model: &MotionModelFrames<L>,
     clusters: &[Cluster],
     rule: &MergeParams,
-) -> Result<Raw> {
+) -> Result<StoredParams> {
     let leaders: Vec<u32> = clusters.iter().map(|cluster| cluster.leader).collect();
     let members = clusters.iter().zip(0..).map(|(cluster, position)| (position, &cluster.members[..]));
     let wanted = MergedSequence::new(model, &leaders, members, rule);
@@ -47,8 +47,8 @@ pub(super) fn propose<L: NetworkMotionModel>(
     let frames: Vec<usize> =
         (0..sampled).map(|k| if sampled < 2 { 0 } else { k * (count - 1) / (sampled - 1) }).collect();
     let of_frame = |(k, &frame): (usize, &usize)| {
-        let constant = if k == 0 { Columns::SH } else { Columns::empty() };
-        gather_all(&wanted, frame, Columns::all().difference(Columns::SH) | constant)
+        let constant = if k == 0 { Attributes::SH } else { Attributes::empty() };
+        gather_all(&wanted, frame, Attributes::all().difference(Attributes::SH) | constant)
     };
     let wanted: Vec<Gaussians> = frames.iter().enumerate().map(of_frame).collect::<Result<_>>()?;
 
@@ -107,13 +107,13 @@ fn position(state: &Gaussians, row: usize) -> DVec3 {
 /// Returns for every row of `raw` the sum over frames of its squared distance from the position that `wanted` returns.
 fn squared_distances<L: NetworkMotionModel>(
     model: &MotionModelFrames<L>,
-    raw: &Raw,
+    raw: &StoredParams,
     frames: &[usize],
     wanted: impl Fn(usize, usize) -> DVec3,
 ) -> Result<Vec<f64>> {
     let (mut off, mut state) = (vec![0.0; raw.len()], Gaussians::zeros(0, 0));
     for (k, &frame) in frames.iter().enumerate() {
-        Deformation::state(model, frame, raw, Columns::POSITION, &mut state)?;
+        Deformation::state(model, frame, raw, Attributes::POSITION, &mut state)?;
         for (row, off) in off.iter_mut().enumerate() {
             *off += (position(&state, row) - wanted(k, row)).length_squared();
         }
@@ -124,16 +124,16 @@ fn squared_distances<L: NetworkMotionModel>(
 /// Returns `raw` with every position improved by one Gauss-Newton step.
 fn gauss_newton_step<L: NetworkMotionModel>(
     model: &MotionModelFrames<L>,
-    raw: &Raw,
+    raw: &StoredParams,
     frames: &[usize],
     wanted: &[Gaussians],
-) -> Result<Raw> {
+) -> Result<StoredParams> {
     let mut sums = vec![(DMat3::ZERO, DVec3::ZERO); raw.len()];
     let mut state = Gaussians::zeros(0, 0);
     for (&frame, wanted) in frames.iter().zip(wanted) {
-        Deformation::state(model, frame, raw, Columns::POSITION, &mut state)?;
-        let slopes = Deformation::jacobian(model, frame, raw, Columns::POSITION)?;
-        let slopes = slopes.column(Columns::POSITION);
+        Deformation::state(model, frame, raw, Attributes::POSITION, &mut state)?;
+        let slopes = Deformation::jacobian(model, frame, raw, Attributes::POSITION)?;
+        let slopes = slopes.column(Attributes::POSITION);
         for (row, (matrix, vector)) in sums.iter_mut().enumerate() {
             // Plane 3·i + j is the derivative of component i by component j, so reading columns gives the transpose.
             let transposed = DMat3::from_cols_array(&slopes.row::<9>(row).map(f64::from));
@@ -158,7 +158,7 @@ fn gauss_newton_step<L: NetworkMotionModel>(
 /// normalized need several. Keeps the best scale and rotation.
 fn shape<L: NetworkMotionModel>(
     model: &MotionModelFrames<L>,
-    made: &mut Raw,
+    made: &mut StoredParams,
     leaders: &[u32],
     frames: &[usize],
     wanted: &[Gaussians],
@@ -172,7 +172,7 @@ fn shape<L: NetworkMotionModel>(
         let mut all = vec![StateDifference::default(); made.len()];
         let mut state = Gaussians::zeros(0, own.sh_degree());
         for (&frame, wanted) in frames.iter().zip(wanted) {
-            Deformation::state(model, frame, made, Columns::all(), &mut state)?;
+            Deformation::state(model, frame, made, Attributes::all(), &mut state)?;
             all.par_iter_mut().enumerate().for_each(|(row, sum)| sum.add(wanted, &state, row));
             if wanted.sh.len() == made.len() {
                 // SH coefficients are compared at one frame: their change over time is the same at all frames.

@@ -13,7 +13,7 @@ use crate::deform::{Network, PredictedMotion, Tensor, Tensors};
 use crate::error::Result;
 use crate::files::state_dict::{StoredTensor, TensorValues, write_state_dict};
 use crate::limits::Limits;
-use crate::model::{Column, Columns, Gaussians, opacity};
+use crate::model::{AttributeValues, Attributes, Gaussians, opacity};
 use crate::models;
 use crate::models::{InputModel, OpenOptions};
 use crate::outputs::kind::OutputKind;
@@ -146,7 +146,7 @@ fn open(path: &Path) -> Result<Box<dyn InputModel>> {
 }
 
 fn states(source: &dyn FrameSource) -> Vec<Gaussians> {
-    (0..TIMES.len()).map(|frame| gather_all(source, frame, Columns::all()).unwrap()).collect()
+    (0..TIMES.len()).map(|frame| gather_all(source, frame, Attributes::all()).unwrap()).collect()
 }
 
 /// Returns R·S²·Rᵀ by the formula of the rasterizer, which accepts any quaternion.
@@ -180,11 +180,13 @@ fn motion(tensors: &Tensors, prefix: &str, places: &[[f64; 3]], time: f64) -> Pr
     let network = Network::new(tensors, prefix, Path::new("made")).unwrap();
     let planes = (0..3).flat_map(|c| places.iter().map(move |place| place[c] as f32)).collect();
     let mut motion = PredictedMotion::default();
-    network.motion(&network.encode(&Column::from_planes(3, planes)), time, Columns::all(), &mut motion).unwrap();
+    network
+        .motion(&network.encode(&AttributeValues::from_planes(3, planes)), time, Attributes::all(), &mut motion)
+        .unwrap();
     motion
 }
 
-fn row<const W: usize>(column: &Column, i: usize) -> [f64; W] {
+fn row<const W: usize>(column: &AttributeValues, i: usize) -> [f64; W] {
     column.row::<W>(i).map(f64::from)
 }
 
@@ -242,7 +244,7 @@ fn states_of_sc_gs_follow_the_formulas() {
                 });
                 let u: Vec<(f64, usize)> = u.collect();
                 let sum: f64 = u.iter().map(|u| u.0).sum();
-                let sum = |column: &Column, c: usize| {
+                let sum = |column: &AttributeValues, c: usize| {
                     let weighted: f64 = u.iter().map(|&(u, node)| u / sum * f64::from(column.plane(c)[node])).sum();
                     weighted / (1.0 + (-mask).exp())
                 };
@@ -302,7 +304,7 @@ fn jacobian_agrees_with_finite_differences() {
         let deformation = model.source().deformation().unwrap();
         let (stored, want) = (deformation.stored(), deformation.movable());
         let jacobian = deformation.jacobian(3, stored, want).unwrap();
-        let state = |raw: &crate::model::Raw| {
+        let state = |raw: &crate::model::StoredParams| {
             let mut out = Gaussians::zeros(0, 1);
             deformation.state(3, raw, want, &mut out).unwrap();
             out
@@ -310,7 +312,7 @@ fn jacobian_agrees_with_finite_differences() {
         // Small compared to 1/512, large compared to the f32 error of a difference.
         let step = 3e-5f32;
         let (mut wrong, mut all) = (0, 0);
-        for column in want.difference(Columns::SH).iter() {
+        for column in want.difference(Attributes::SH).iter() {
             for j in 0..column.width(1) {
                 let by = |by: f32| {
                     let mut raw = stored.clone();
@@ -319,7 +321,7 @@ fn jacobian_agrees_with_finite_differences() {
                 };
                 let (above, below) = (by(step), by(-step));
                 let mut change = Gaussians::default();
-                *change.column_mut(column) = Column::zeros(column.width(1), COUNT);
+                *change.column_mut(column) = AttributeValues::zeros(column.width(1), COUNT);
                 change.column_mut(column).plane_mut(j).fill(1.0);
                 let mut found = Gaussians::zeros(COUNT, 1);
                 jacobian.add_to(&change, &mut found);
@@ -353,7 +355,7 @@ fn reduction(model: &dyn InputModel) -> CompressedModel {
     let reference = Reference { frame: 0, extent: 1.0 };
     reduction.proxies = model.solve(&reduction.clusters, reference, &rule).unwrap();
     let mut by = Gaussians::zeros(5, 0);
-    by.rotation = Column::default();
+    by.rotation = AttributeValues::default();
     by.position.set_row(2, [0.5, 0.0, -0.25]);
     by.sh.set_row(0, [0.1, 0.0, 0.2]);
     reduction.change = ParamDelta(by);

@@ -14,7 +14,7 @@ use glam::{DMat3, DVec3};
 use super::deform_folder::{DeformFolder, ModelParts, NetworkMotionModel, has_network};
 use crate::deform::{Encoded, Network, PredictedMotion};
 use crate::error::{Error, Result};
-use crate::model::{Column, Columns, Gaussians, Jacobian, Raw, scale_rotation};
+use crate::model::{AttributeValues, Attributes, Gaussians, Jacobian, StoredParams, scale_rotation};
 use crate::models::input_model::ModelFormat;
 use crate::models::motion_model::{MotionModel, copy_stored};
 
@@ -25,7 +25,7 @@ pub(super) const ENTRY: ModelFormat = ModelFormat {
 };
 
 /// Columns that follow from the covariance.
-const SHAPE: Columns = Columns::ROTATION.union(Columns::LOG_SCALE);
+const SHAPE: Attributes = Attributes::ROTATION.union(Attributes::LOG_SCALE);
 
 /// Motion model of Deformable-3D-Gaussians.
 #[derive(Debug)]
@@ -45,7 +45,7 @@ impl DeformableMotion {
         let network = Network::new(parts.tensors, "", parts.file)?;
         let mut notes = Vec::new();
         let time = parts.tensors.contains_key("timenet.0.weight");
-        for (key, actual) in [("is_blender", time), ("is_6dof", network.has_screws())] {
+        for (key, actual) in [("is_blender", time), ("is_6dof", network.predicts_screw_motion())] {
             let configured = parts.arguments.get(key).bool(actual)?;
             if configured != actual {
                 let [configured, actual] = [configured, actual].map(|yes| if yes { "True" } else { "False" });
@@ -61,10 +61,10 @@ impl DeformableMotion {
 
 impl DeformableMotion {
     /// Returns the network's output for the columns `want` of a block.
-    fn motion(&self, time: f64, encoded: &Encoded, want: Columns) -> Result<PredictedMotion> {
+    fn motion(&self, time: f64, encoded: &Encoded, want: Attributes) -> Result<PredictedMotion> {
         let mut motion = PredictedMotion::default();
-        let shape = if (want & SHAPE).is_empty() { Columns::empty() } else { SHAPE };
-        let want = want & Columns::POSITION | shape;
+        let shape = if (want & SHAPE).is_empty() { Attributes::empty() } else { SHAPE };
+        let want = want & Attributes::POSITION | shape;
         if !want.is_empty() {
             self.network.motion(encoded, time, want, &mut motion)?;
         }
@@ -75,26 +75,33 @@ impl DeformableMotion {
 impl MotionModel for DeformableMotion {
     type Prepared = Encoded;
 
-    fn prepare(&self, raw: &Raw) -> Encoded {
+    fn prepare(&self, raw: &StoredParams) -> Encoded {
         self.network.encode(&raw.gaussians.position)
     }
 
-    fn varying(&self) -> Columns {
-        Columns::POSITION | SHAPE
+    fn varying(&self) -> Attributes {
+        Attributes::POSITION | SHAPE
     }
 
-    fn movable(&self) -> Columns {
-        Columns::all().difference(SHAPE)
+    fn movable(&self) -> Attributes {
+        Attributes::all().difference(SHAPE)
     }
 
-    fn state(&self, time: f64, raw: &Raw, encoded: &Encoded, want: Columns, out: &mut Gaussians) -> Result<()> {
+    fn state(
+        &self,
+        time: f64,
+        raw: &StoredParams,
+        encoded: &Encoded,
+        want: Attributes,
+        out: &mut Gaussians,
+    ) -> Result<()> {
         let raw_state = &raw.gaussians;
         copy_stored(raw, want.difference(self.varying()), out);
         let motion = self.motion(time, encoded, want)?;
-        if want.contains(Columns::POSITION) {
+        if want.contains(Attributes::POSITION) {
             for row in 0..raw.len() {
                 let at = raw_state.position.row::<3>(row);
-                let to = match self.network.has_screws() {
+                let to = match self.network.predicts_screw_motion() {
                     true => {
                         let [x, w, v] = screw(at, motion.warp.row::<6>(row));
                         screw::apply_screw(x, w, v).as_vec3().to_array()
@@ -113,10 +120,10 @@ impl MotionModel for DeformableMotion {
                 let rotation = raw_state.rotation.row::<4>(row).map(f64::from);
                 let by = (motion.scaling.row::<3>(row), motion.rotation.row::<4>(row));
                 let (scales, rotation) = scale_rotation(covariance(scales, rotation, by), rotation);
-                if want.contains(Columns::LOG_SCALE) {
+                if want.contains(Attributes::LOG_SCALE) {
                     out.log_scale.set_row(row, scales.map(|scale| scale.ln() as f32));
                 }
-                if want.contains(Columns::ROTATION) {
+                if want.contains(Attributes::ROTATION) {
                     out.rotation.set_row(row, rotation.map(|x| x as f32));
                 }
             }
@@ -126,22 +133,22 @@ impl MotionModel for DeformableMotion {
 
     /// Returns the derivative of positions only. The covariance depends on scales and rotations too, but its
     /// decomposition is not continuous from frame to frame.
-    fn jacobian(&self, time: f64, raw: &Raw, encoded: &Encoded, want: Columns) -> Result<Jacobian> {
+    fn jacobian(&self, time: f64, raw: &StoredParams, encoded: &Encoded, want: Attributes) -> Result<Jacobian> {
         let mut found = Jacobian::default();
-        if want.contains(Columns::POSITION) {
+        if want.contains(Attributes::POSITION) {
             let position = &raw.gaussians.position;
             let slopes = self.network.slopes(position, time)?;
-            let motion = match self.network.has_screws() {
-                true => self.motion(time, encoded, Columns::POSITION)?,
+            let motion = match self.network.predicts_screw_motion() {
+                true => self.motion(time, encoded, Attributes::POSITION)?,
                 false => PredictedMotion::default(),
             };
-            let mut out = Column::zeros(9, raw.len());
+            let mut out = AttributeValues::zeros(9, raw.len());
             for row in 0..raw.len() {
                 for (axis, unit) in [DVec3::X, DVec3::Y, DVec3::Z].into_iter().enumerate() {
                     let along = |first: usize| {
                         DVec3::from([0, 1, 2].map(|c| f64::from(slopes.plane(3 * (first + c) + axis)[row])))
                     };
-                    let change = match self.network.has_screws() {
+                    let change = match self.network.predicts_screw_motion() {
                         true => {
                             let [x, w, v] = screw(position.row::<3>(row), motion.warp.row::<6>(row));
                             screw::slope(x, w, v, unit, [along(0), along(3)])
@@ -153,7 +160,7 @@ impl MotionModel for DeformableMotion {
                     (0..3).for_each(|i| out.plane_mut(3 * i + axis)[row] = change[i] as f32);
                 }
             }
-            *found.column_mut(Columns::POSITION) = out;
+            *found.column_mut(Attributes::POSITION) = out;
         }
         Ok(found)
     }

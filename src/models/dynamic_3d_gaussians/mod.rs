@@ -10,14 +10,14 @@ use std::path::{Path, PathBuf};
 
 use xxhash_rust::xxh3::Xxh3;
 
-use super::size::bytes_of;
+use super::size::bytes_read_for;
 use super::trajectories::{check_output, state_bytes, write_sequence};
 use crate::compressed_model::{Cluster, CompressedModel, Proxies, Reference};
 use crate::error::Result;
 use crate::files::digest::hash_file;
 use crate::files::npz::write::write_like;
 use crate::limits::Limits;
-use crate::model::{Columns, Gaussians, SH_C0, color};
+use crate::model::{Attributes, Gaussians, SH_C0, color};
 use crate::models::input_model::{InputModel, MemoryProfile, ModelFormat, Timing};
 use crate::outputs::container::GAUSSIAN_BLOCK;
 use crate::outputs::kind::OutputKind;
@@ -63,7 +63,7 @@ impl InputModel for Params {
     }
 
     fn bytes(&self) -> Result<u64> {
-        bytes_of([&*self.path()])
+        bytes_read_for([&*self.path()])
     }
 
     fn residence(&self) -> MemoryProfile {
@@ -72,7 +72,7 @@ impl InputModel for Params {
             opening: 0,
             reader: 8,
             // Scales and opacities of proxies, and their indices.
-            reduced: state_bytes(0, Columns::all()) + 16,
+            reduced: state_bytes(0, Attributes::all()) + 16,
             jacobian: 0,
             file: 0,
             fixed: 0,
@@ -148,15 +148,15 @@ impl Params {
             Params::axis,
             |name, frame, values| {
                 let column = match name {
-                    MEANS => Columns::POSITION,
-                    ROTATIONS => Columns::ROTATION,
-                    COLORS => Columns::SH,
-                    LOG_SCALES => Columns::LOG_SCALE,
-                    OPACITIES => Columns::OPACITY,
+                    MEANS => Attributes::POSITION,
+                    ROTATIONS => Attributes::ROTATION,
+                    COLORS => Attributes::SH,
+                    LOG_SCALES => Attributes::LOG_SCALE,
+                    OPACITIES => Attributes::OPACITY,
                     // Proxies keep the segment of their leader.
                     _ => return Ok(Vec::new()),
                 };
-                let (width, is_color) = (column.width(0), column == Columns::SH);
+                let (width, is_color) = (column.width(0), column == Attributes::SH);
                 if !places.is_empty() {
                     proxies.read(frame, column, &mut state)?;
                 }

@@ -9,9 +9,9 @@
 use std::path::{Path, PathBuf};
 
 use crate::error::{Error, Result};
-use crate::files::npz::write::ArrayRows;
+use crate::files::npz::write::GaussianAxis;
 use crate::files::npz::{Floats, Npz, NpzArray};
-use crate::model::{Columns, Gaussians, SequenceInfo, harmonic};
+use crate::model::{Attributes, Gaussians, SequenceInfo, harmonic};
 use crate::source::{BlockReader, Count, FrameSource, Ids, Reads};
 
 /// Array of positions.
@@ -84,13 +84,13 @@ impl Params {
         npz.check_floats(&expected.iter().map(|&(name, _)| name).collect::<Vec<_>>())?;
         let floats = |name: &str| npz.floats(name, scratch);
         let segments = has_segments.then(|| floats(SEGMENTS)).transpose()?;
-        let varying = Columns::POSITION | Columns::ROTATION | Columns::SH;
+        let varying = Attributes::POSITION | Attributes::ROTATION | Attributes::SH;
         let last = frames.saturating_sub(1).max(1) as f64;
         let info = SequenceInfo {
             count,
             times: (0..frames).map(|frame| frame as f64 / last).collect(),
             sh_degree: 0,
-            varying: if frames > 1 { varying } else { Columns::empty() },
+            varying: if frames > 1 { varying } else { Attributes::empty() },
         };
         Ok(Params {
             means: floats(MEANS)?,
@@ -130,11 +130,11 @@ impl Params {
     }
 
     /// Returns the axis of an array that counts Gaussians.
-    pub(super) fn axis(entry: &NpzArray) -> ArrayRows {
+    pub(super) fn axis(entry: &NpzArray) -> GaussianAxis {
         match entry.name.as_str() {
-            MEANS | ROTATIONS | COLORS => ArrayRows::Second,
-            LOG_SCALES | OPACITIES | SEGMENTS => ArrayRows::First,
-            _ => ArrayRows::None,
+            MEANS | ROTATIONS | COLORS => GaussianAxis::Second,
+            LOG_SCALES | OPACITIES | SEGMENTS => GaussianAxis::First,
+            _ => GaussianAxis::None,
         }
     }
 }
@@ -164,7 +164,7 @@ struct TrajectoryBlock<'a> {
 }
 
 impl BlockReader for TrajectoryBlock<'_> {
-    fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
+    fn read(&mut self, frame: usize, want: Attributes, out: &mut Gaussians) -> Result<()> {
         let Params { info, means, rotations, colors, log_scales, opacities, states, .. } = self.params;
         if frame >= info.times.len() {
             return Err(Error::internal(format!("frame {frame} was asked for, of {}", info.times.len())));
@@ -176,10 +176,10 @@ impl BlockReader for TrajectoryBlock<'_> {
             let at = frame * info.count + id;
             for column in want.iter() {
                 match column {
-                    Columns::POSITION => out.position.set_row(row, means.row::<3>(3 * at)),
-                    Columns::ROTATION => out.rotation.set_row(row, rotations.row::<4>(4 * at)),
-                    Columns::LOG_SCALE => out.log_scale.set_row(row, log_scales.row::<3>(3 * id)),
-                    Columns::OPACITY => out.opacity_logit.set_row(row, opacities.row::<1>(id)),
+                    Attributes::POSITION => out.position.set_row(row, means.row::<3>(3 * at)),
+                    Attributes::ROTATION => out.rotation.set_row(row, rotations.row::<4>(4 * at)),
+                    Attributes::LOG_SCALE => out.log_scale.set_row(row, log_scales.row::<3>(3 * id)),
+                    Attributes::OPACITY => out.opacity_logit.set_row(row, opacities.row::<1>(id)),
                     _ => out.sh.set_row(row, colors.row::<3>(3 * at).map(|color| harmonic(color.into()))),
                 }
             }

@@ -7,16 +7,16 @@ use super::params::Params;
 use crate::compressed_model::{Cluster, CompressedModel, Proxies};
 use crate::error::Result;
 use crate::merging::merged::MergedSequence;
-use crate::model::{Columns, Gaussians, SequenceInfo, logit, opacity};
+use crate::model::{Attributes, Gaussians, SequenceInfo, logit, opacity};
 use crate::models::trajectories::merged;
-use crate::passes::{Changed, gather_all};
+use crate::passes::{WithDelta, gather_all};
 use crate::recipe::MergeParams;
 use crate::source::{BlockReader, FrameSource, Ids, ReadPlan, Reads};
 
 /// Maximum number of frames over which scales and opacities are averaged.
 const SAMPLED_FRAMES: usize = 16;
 /// Columns that are constant in time.
-const CONSTANT: Columns = Columns::LOG_SCALE.union(Columns::OPACITY);
+const CONSTANT: Attributes = Attributes::LOG_SCALE.union(Attributes::OPACITY);
 
 /// Returns the scales and opacities of the proxies of `clusters` as rows of [`Proxies::raw`]: geometric means of
 /// scales, arithmetic means of opacities.
@@ -49,7 +49,7 @@ pub(super) fn solve(params: &Params, clusters: &[Cluster], merge: &MergeParams) 
 
 /// Returns the frames of the compressed model `reduction`.
 pub(super) fn reduced<'a>(params: &'a Params, reduction: &'a CompressedModel) -> Box<dyn FrameSource + 'a> {
-    Box::new(Changed::new(
+    Box::new(WithDelta::new(
         Box::new(MergedSource::new(params, reduction)),
         &reduction.change,
         &reduction.course,
@@ -116,14 +116,14 @@ struct MergedReader<'a> {
 }
 
 impl BlockReader for MergedReader<'_> {
-    fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
+    fn read(&mut self, frame: usize, want: Attributes, out: &mut Gaussians) -> Result<()> {
         self.reader.read(frame, want, out)?;
         let Some(raw) = self.raw else { return Ok(()) };
         for &(row, proxy) in &self.proxies {
-            if want.contains(Columns::LOG_SCALE) {
+            if want.contains(Attributes::LOG_SCALE) {
                 out.log_scale.set_row(row, raw.log_scale.row::<3>(proxy));
             }
-            if want.contains(Columns::OPACITY) {
+            if want.contains(Attributes::OPACITY) {
                 out.opacity_logit.set_row(row, raw.opacity_logit.row::<1>(proxy));
             }
         }

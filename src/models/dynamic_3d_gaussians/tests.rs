@@ -52,7 +52,7 @@ fn message(path: &Path) -> String {
 
 fn states(model: &dyn InputModel) -> Vec<Gaussians> {
     let source = model.source();
-    (0..source.info().times.len()).map(|frame| gather_all(source, frame, Columns::all()).unwrap()).collect()
+    (0..source.info().times.len()).map(|frame| gather_all(source, frame, Attributes::all()).unwrap()).collect()
 }
 
 #[test]
@@ -147,18 +147,18 @@ fn written_proxies_and_deltas_read_back() {
     model.write(&reduction, OutputKind::Model, &result, &Limits::NONE, &Events::IGNORED).unwrap();
     let read = open(&result).unwrap();
     for (frame, state) in states(&*read).iter().enumerate() {
-        let expected = gather_all(&*shown, frame, Columns::all()).unwrap();
-        for column in Columns::all().iter() {
+        let expected = gather_all(&*shown, frame, Attributes::all()).unwrap();
+        for column in Attributes::all().iter() {
             let pairs = state.column(column).planes().iter().zip(expected.column(column).planes());
             pairs.for_each(|(a, b)| assert!((a - b).abs() < 1e-6, "{} {a} {b}", column.name()));
         }
         // A proxy is at the weighted mean of its members.
-        let at = |id: usize| gather_all(model.source(), frame, Columns::all()).unwrap().position.row::<3>(id);
+        let at = |id: usize| gather_all(model.source(), frame, Attributes::all()).unwrap().position.row::<3>(id);
         let mean: [f32; 3] = std::array::from_fn(|c| 0.75 * at(3)[c] + 0.25 * at(4)[c]);
         let found = state.position.row::<3>(1);
         (0..3).for_each(|c| assert!((found[c] - mean[c]).abs() < 1e-6, "{found:?} {mean:?}"));
     }
-    assert!(!shown.info().varying.intersects(Columns::LOG_SCALE | Columns::OPACITY));
+    assert!(!shown.info().varying.intersects(Attributes::LOG_SCALE | Attributes::OPACITY));
 }
 
 #[test]

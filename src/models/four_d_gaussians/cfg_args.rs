@@ -4,7 +4,7 @@ use std::path::Path;
 
 use crate::deform::{FieldConfig, Tensors};
 use crate::error::{Error, Result};
-use crate::model::Columns;
+use crate::model::Attributes;
 
 use crate::files::open::read_small;
 use crate::files::python_literal::{Literal, parse_call};
@@ -151,14 +151,14 @@ impl ModelConfig {
     /// Returns the settings that determine the evaluation of the deformation field.
     pub fn field(&self) -> FieldConfig {
         let off = [
-            (self.no_dx, Columns::POSITION),
-            (self.no_ds, Columns::LOG_SCALE),
-            (self.no_dr, Columns::ROTATION),
-            (self.no_do, Columns::OPACITY),
-            (self.no_dshs, Columns::SH),
+            (self.no_dx, Attributes::POSITION),
+            (self.no_ds, Attributes::LOG_SCALE),
+            (self.no_dr, Attributes::ROTATION),
+            (self.no_do, Attributes::OPACITY),
+            (self.no_dshs, Attributes::SH),
         ];
         FieldConfig {
-            active: off.iter().filter(|(off, _)| !off).fold(Columns::empty(), |set, &(_, column)| set | column),
+            active: off.iter().filter(|(off, _)| !off).fold(Attributes::empty(), |set, &(_, column)| set | column),
             static_mlp: self.static_mlp,
             empty_voxel: self.empty_voxel,
             grid_pe: self.grid_pe,
@@ -381,14 +381,14 @@ mod tests {
                 apply_rotation: true,
             }
         );
-        assert_eq!(config.field().active, Columns::all());
+        assert_eq!(config.field().active, Attributes::all());
     }
 
     #[test]
     fn missing_keys_take_the_defaults_of_the_original() {
         let config = parse("Namespace()").unwrap();
         assert_eq!((config.net_width, config.defor_depth, config.sh_degree), (64, 1, 3));
-        assert_eq!(config.field().active, Columns::POSITION | Columns::LOG_SCALE | Columns::ROTATION);
+        assert_eq!(config.field().active, Attributes::POSITION | Attributes::LOG_SCALE | Attributes::ROTATION);
         assert_eq!(config, parse("Namespace(source_path=None, unknown=3)\n").unwrap());
     }
 

@@ -14,17 +14,17 @@ use std::path::{Path, PathBuf};
 
 use super::archive::files::{CFG_ARGS, ITERATION, add_cloud};
 use super::files::copy;
-use super::size::{Size, bytes_below, bytes_of};
+use super::size::{Size, bytes_below, bytes_read_for};
 use super::trajectories::{state_bytes, write_sequence};
 use crate::archive::{Content, Role};
 use crate::compressed_model::{Cluster, CompressedModel, Proxies, Reference};
 use crate::deform::{Field, FieldConfig, Tensor, Tensors};
 use crate::error::{Error, Result, ShowPath};
 use crate::files::ply::Ply;
-use crate::files::ply::write::{out_rows, write_like};
+use crate::files::ply::write::{rows_of_model, write_like};
 use crate::files::state_dict::{StoredTensor, TensorValues, is_floating, read_state_dict, write_state_dict};
 use crate::limits::Limits;
-use crate::model::{Columns, Gaussians, Jacobian};
+use crate::model::{Attributes, Gaussians, Jacobian};
 use crate::models::input_model::{InputModel, MemoryProfile, ModelFormat, Timing};
 use crate::models::motion_model::compressed_raw;
 use crate::outputs::container::GAUSSIAN_BLOCK;
@@ -71,14 +71,14 @@ impl InputModel for ModelFolder {
                 let folder = iteration_folder(path, self.paths().iteration);
                 size_of(&folder.join("point_cloud.ply"), &folder.join("deformation.pth"), &path.join("cfg_args"))
             }
-            OutputKind::Ply => Ok(Size { cloud: bytes_of([path])?, ..Size::default() }),
+            OutputKind::Ply => Ok(Size { cloud: bytes_read_for([path])?, ..Size::default() }),
             // Archives and `.splatv` are written elsewhere.
             _ => Ok(Size::of_frames(bytes_below(path)?)),
         }
     }
 
     fn residence(&self) -> MemoryProfile {
-        let whole = state_bytes(self.info().sh_degree, Columns::all());
+        let whole = state_bytes(self.info().sh_degree, Attributes::all());
         MemoryProfile {
             per_gaussian: whole,
             // Normals and other extra properties are stored beside the attributes.
@@ -191,7 +191,7 @@ impl InputModel for ModelFolder {
     }
 
     fn needs_all_bands(&self) -> Option<&'static str> {
-        self.field().active().contains(Columns::SH).then_some(
+        self.field().active().contains(Attributes::SH).then_some(
             "the SH head of the deformation field adds to \
                                                                coefficients of every degree",
         )
@@ -216,7 +216,7 @@ impl InputModel for ModelFolder {
                 self.write_field(reduction.field, &folder.join("deformation.pth"))?;
                 self.write_cloud(reduction, &folder.join("point_cloud.ply"))?;
                 let training = [&paths.deformation_table, &paths.deformation_accum].into_iter().flatten();
-                let bytes = bytes_of(training.map(PathBuf::as_path))?;
+                let bytes = bytes_read_for(training.map(PathBuf::as_path))?;
                 if bytes > 0 {
                     notes.push(format!(
                         "deformation_table.pth and deformation_accum.pth ({bytes} bytes, read by training only) were \
@@ -260,7 +260,7 @@ impl ModelFolder {
         let none = Gaussians::zeros(0, self.info().sh_degree);
         let proxies = reduction.proxies.raw.as_ref().map_or(&none, |raw| &raw.gaussians);
         let template = Ply::open(&self.paths().point_cloud)?;
-        write_like(&template, &out_rows(reduction), proxies, &reduction.change, reduction.sh_degree, path)
+        write_like(&template, &rows_of_model(reduction), proxies, &reduction.change, reduction.sh_degree, path)
     }
 }
 
@@ -271,7 +271,7 @@ pub(super) fn iteration_folder(root: &Path, iteration: u32) -> PathBuf {
 
 /// Returns the sizes of the files of a model.
 fn size_of(cloud: &Path, field: &Path, configuration: &Path) -> Result<Size> {
-    let (cloud, field, rest) = (bytes_of([cloud])?, bytes_of([field])?, bytes_of([configuration])?);
+    let (cloud, field, rest) = (bytes_read_for([cloud])?, bytes_read_for([field])?, bytes_read_for([configuration])?);
     Ok(Size { cloud, field, rest, ..Size::default() })
 }
 
@@ -292,11 +292,11 @@ fn role(config: FieldConfig, name: &str) -> Role {
             _ => Role::Exact,
         },
         "feature_out" => Role::Weights,
-        "pos_deform" => reads(config.active.contains(Columns::POSITION), Role::Weights),
-        "scales_deform" => reads(config.active.contains(Columns::LOG_SCALE), Role::Weights),
-        "rotations_deform" => reads(config.active.contains(Columns::ROTATION), Role::Weights),
-        "opacity_deform" => reads(config.active.contains(Columns::OPACITY), Role::Weights),
-        "shs_deform" => reads(config.active.contains(Columns::SH), Role::Weights),
+        "pos_deform" => reads(config.active.contains(Attributes::POSITION), Role::Weights),
+        "scales_deform" => reads(config.active.contains(Attributes::LOG_SCALE), Role::Weights),
+        "rotations_deform" => reads(config.active.contains(Attributes::ROTATION), Role::Weights),
+        "opacity_deform" => reads(config.active.contains(Attributes::OPACITY), Role::Weights),
+        "shs_deform" => reads(config.active.contains(Attributes::SH), Role::Weights),
         "static_mlp" => reads(config.static_mlp, Role::Weights),
         "empty_voxel" => reads(config.empty_voxel, Role::Exact),
         // The tensor belongs to a version of the trainer that is not known here.

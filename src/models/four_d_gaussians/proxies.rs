@@ -6,7 +6,7 @@ use crate::compressed_model::{Cluster, Proxies, Reference};
 use crate::deform::Deltas;
 use crate::error::Result;
 use crate::merging::proxy::merge_state;
-use crate::model::{Columns, Gaussians};
+use crate::model::{Attributes, Gaussians};
 use crate::passes::{BLOCK, gather};
 use crate::recipe::{MergeParams, Placement};
 use crate::source::FrameSource;
@@ -38,8 +38,8 @@ pub(super) fn solve(
     }
     // A proxy placed at its leader has the canonical position of the leader to the bit, and so the same path.
     let solved = match merge.placement {
-        Placement::Mean => Columns::all(),
-        Placement::Leader => Columns::all().difference(Columns::POSITION),
+        Placement::Mean => Attributes::all(),
+        Placement::Leader => Attributes::all().difference(Attributes::POSITION),
     };
     for (clusters, first) in all.chunks(BLOCK).zip((0..).step_by(BLOCK)) {
         let of_leaders = model.canonical().pick(&leaders[first..first + clusters.len()]);
@@ -84,14 +84,14 @@ fn merged_states(
 ) -> Result<Gaussians> {
     let mut states = Gaussians::zeros(clusters.len(), model.info().sh_degree);
     let ids: Vec<u32> = clusters.iter().flat_map(|cluster| cluster.members.iter().map(|&(id, _)| id)).collect();
-    let of_members = gather(model, &ids, reference.frame, Columns::all())?;
+    let of_members = gather(model, &ids, reference.frame, Attributes::all())?;
     let mut rows = 0..;
     for (proxy, cluster) in clusters.iter().enumerate() {
         let members: Vec<(u32, f64)> =
             cluster.members.iter().zip(rows.by_ref()).map(|(&(_, weight), row)| (row, weight)).collect();
         let leader = cluster.members.iter().position(|&(id, _)| id == cluster.leader).unwrap_or(0);
-        merge_state(&members, &of_members, members[leader].0, merge, Columns::all()).write(
-            Columns::all(),
+        merge_state(&members, &of_members, members[leader].0, merge, Attributes::all()).write(
+            Attributes::all(),
             proxy,
             &mut states,
         );
@@ -103,7 +103,7 @@ fn merged_states(
 /// adds its delta to the raw quaternion, so the angle of rotation depends on the length.
 fn with_leader_lengths(deltas: &Deltas, of_leaders: &Gaussians, mut states: Gaussians) -> Gaussians {
     let mut leaders = Gaussians { rotation: of_leaders.rotation.clone(), ..Gaussians::default() };
-    deltas.apply(of_leaders, Columns::ROTATION, &mut leaders);
+    deltas.apply(of_leaders, Attributes::ROTATION, &mut leaders);
     for row in 0..states.len() {
         let length = leaders.rotation.row::<4>(row).iter().map(|x| x * x).sum::<f32>().sqrt();
         // If the leader's quaternion has no direction, the proxy keeps its unit quaternion.
@@ -116,7 +116,7 @@ fn with_leader_lengths(deltas: &Deltas, of_leaders: &Gaussians, mut states: Gaus
 
 /// Replaces rows that have a value that is not finite by the parameters of their leaders. Returns their number.
 fn restore_unsolved(raw: &mut Gaussians, leaders: &Gaussians) -> usize {
-    let columns: Vec<Columns> = Columns::all().iter().collect();
+    let columns: Vec<Attributes> = Attributes::all().iter().collect();
     let planes = |state: &Gaussians, row: usize| -> Vec<f32> {
         columns
             .iter()
@@ -152,8 +152,8 @@ fn deviations(
     let places: Vec<u32> = (0..raw.len() as u32).collect();
     let ids: Vec<u32> = clusters.iter().flat_map(|cluster| cluster.members.iter().map(|&(id, _)| id)).collect();
     let offsets = |frame: usize| -> Result<Vec<[f64; 3]>> {
-        let of_proxies = gather(&proxies, &places, frame, Columns::POSITION)?.position;
-        let of_members = gather(model, &ids, frame, Columns::POSITION)?.position;
+        let of_proxies = gather(&proxies, &places, frame, Attributes::POSITION)?.position;
+        let of_members = gather(model, &ids, frame, Attributes::POSITION)?.position;
         let mut row = 0;
         Ok(clusters
             .iter()

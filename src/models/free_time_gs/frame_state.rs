@@ -8,20 +8,20 @@ use xxhash_rust::xxh3::Xxh3;
 
 use crate::compressed_model::Cluster;
 use crate::error::Result;
-use crate::model::{Column, Columns, Gaussians, Jacobian, Raw, scale_rotation};
+use crate::model::{AttributeValues, Attributes, Gaussians, Jacobian, StoredParams, scale_rotation};
 use crate::models::in_checkpoint::ProxyRule;
 use crate::models::in_checkpoint::linear::{LinearPath, match_proxies};
 use crate::models::motion_model::window::{faded_logit, inverse_odds, slope};
 use crate::models::motion_model::{MotionModel, MotionModelFrames, copy_stored};
 use crate::recipe::MergeParams;
 
-/// Plane of [`Raw::own`] with the center in time.
+/// Plane of [`StoredParams::own`] with the center in time.
 pub(super) const TIME: usize = 0;
-/// Plane of [`Raw::own`] with the logarithm of the standard deviation in time.
+/// Plane of [`StoredParams::own`] with the logarithm of the standard deviation in time.
 pub(super) const DURATION: usize = 1;
-/// First of three planes of [`Raw::own`] with the velocity.
+/// First of three planes of [`StoredParams::own`] with the velocity.
 pub(super) const VELOCITY: usize = 2;
-/// Number of planes of [`Raw::own`].
+/// Number of planes of [`StoredParams::own`].
 pub(super) const OWN: usize = 5;
 
 /// Minimum standard deviation in time, and the value added to it.
@@ -60,7 +60,7 @@ fn min_logit() -> f64 {
 impl MotionModel for FreeTime {
     type Prepared = Windows;
 
-    fn prepare(&self, raw: &Raw) -> Windows {
+    fn prepare(&self, raw: &StoredParams) -> Windows {
         let rates = raw.own.plane(DURATION).iter().map(|&duration| rate(duration)).collect();
         Windows {
             rates,
@@ -68,19 +68,26 @@ impl MotionModel for FreeTime {
         }
     }
 
-    fn varying(&self) -> Columns {
-        Columns::POSITION | Columns::OPACITY
+    fn varying(&self) -> Attributes {
+        Attributes::POSITION | Attributes::OPACITY
     }
 
-    fn movable(&self) -> Columns {
-        Columns::all()
+    fn movable(&self) -> Attributes {
+        Attributes::all()
     }
 
     #[inline(always)]
-    fn state(&self, time: f64, raw: &Raw, windows: &Windows, want: Columns, out: &mut Gaussians) -> Result<()> {
+    fn state(
+        &self,
+        time: f64,
+        raw: &StoredParams,
+        windows: &Windows,
+        want: Attributes,
+        out: &mut Gaussians,
+    ) -> Result<()> {
         copy_stored(raw, want.difference(self.varying()), out);
         let centers = raw.own.plane(TIME);
-        if want.contains(Columns::POSITION) {
+        if want.contains(Attributes::POSITION) {
             for c in 0..3 {
                 let (from, velocity) = (raw.gaussians.position.plane(c), raw.own.plane(VELOCITY + c));
                 let to = out.position.plane_mut(c).iter_mut().zip(from).zip(velocity).zip(centers);
@@ -89,7 +96,7 @@ impl MotionModel for FreeTime {
                 });
             }
         }
-        if want.contains(Columns::OPACITY) {
+        if want.contains(Attributes::OPACITY) {
             let min_logit = min_logit();
             let to =
                 out.opacity_logit.plane_mut(0).iter_mut().zip(centers).zip(&windows.rates).zip(&windows.inverse_odds);
@@ -101,9 +108,9 @@ impl MotionModel for FreeTime {
         Ok(())
     }
 
-    fn jacobian(&self, time: f64, raw: &Raw, windows: &Windows, want: Columns) -> Result<Jacobian> {
+    fn jacobian(&self, time: f64, raw: &StoredParams, windows: &Windows, want: Attributes) -> Result<Jacobian> {
         let mut jacobian = Jacobian::default();
-        if want.contains(Columns::OPACITY) {
+        if want.contains(Attributes::OPACITY) {
             let min_logit = min_logit();
             let centers = raw.own.plane(TIME).iter().zip(&windows.rates).zip(&windows.inverse_odds);
             let slopes = centers.map(|((&center, &rate), &inverse_odds)| {
@@ -114,14 +121,14 @@ impl MotionModel for FreeTime {
                     slope(inverse_odds, exponent) as f32
                 }
             });
-            *jacobian.column_mut(Columns::OPACITY) = Column::from_planes(1, slopes.collect());
+            *jacobian.column_mut(Attributes::OPACITY) = AttributeValues::from_planes(1, slopes.collect());
         }
         Ok(jacobian)
     }
 }
 
 impl ProxyRule for FreeTime {
-    fn propose(model: &MotionModelFrames<FreeTime>, clusters: &[Cluster], rule: &MergeParams) -> Result<Raw> {
+    fn propose(model: &MotionModelFrames<FreeTime>, clusters: &[Cluster], rule: &MergeParams) -> Result<StoredParams> {
         let raw = model.raw();
         let line = |id: u32| {
             let id = id as usize;
@@ -134,7 +141,7 @@ impl ProxyRule for FreeTime {
         };
         let window = |line: &LinearPath, time: f64| (-0.5 * ((time - line.center) / line.deviation).powi(2)).exp();
         let mut sh = vec![Vec::new(); clusters.len()];
-        let matched = match_proxies(model, clusters, rule, line, window, Columns::SH, |seen| {
+        let matched = match_proxies(model, clusters, rule, line, window, Attributes::SH, |seen| {
             // SH coefficients are the same at every frame.
             if sh[seen.proxy].is_empty() {
                 let sh_at_frame = &seen.state.sh;
@@ -145,7 +152,7 @@ impl ProxyRule for FreeTime {
         let mut proxies = raw.pick(&leaders);
         for (row, (matched, sh)) in matched.iter().zip(&sh).enumerate() {
             let line = matched.line;
-            let Raw { gaussians, own } = &mut proxies;
+            let StoredParams { gaussians, own } = &mut proxies;
             gaussians.position.set_row(row, line.position.map(|x| x as f32));
             own.plane_mut(TIME)[row] = line.center as f32;
             own.plane_mut(DURATION)[row] = (line.deviation - DEVIATION_FLOOR[1]).max(DEVIATION_FLOOR[0]).ln() as f32;

@@ -17,7 +17,7 @@ use super::in_checkpoint::{
 use crate::error::{Error, Result, quoted};
 use crate::files::checkpoint::{Checkpoint, NodeId};
 use crate::limits::ReadLimit;
-use crate::model::{Columns, HIGHEST_DEGREE, sh_coefficients};
+use crate::model::{Attributes, MAX_SH_DEGREE, sh_coefficients};
 use crate::models::input_model::{InputModel, ModelFormat, OpenOptions};
 use frame_state::{DURATION, FreeTime, OWN, TIME, VELOCITY};
 
@@ -126,7 +126,7 @@ fn open(description: ModelDescription, options: &OpenOptions) -> Result<Box<dyn 
     let count = row_count(&checkpoint, nodes[0], &place("means"))?;
     let rest = checkpoint.float_tensor(nodes[5], &place("shN"))?;
     let bands = rest.shape.get(1).map(|bands| bands + 1);
-    let Some(degree) = (0..=HIGHEST_DEGREE).find(|&degree| bands == Some(sh_coefficients(degree))) else {
+    let Some(degree) = (0..=MAX_SH_DEGREE).find(|&degree| bands == Some(sh_coefficients(degree))) else {
         return Err(checkpoint.wrong(
             &place("shN"),
             "shape [N, 0, 3], [N, 3, 3], [N, 8, 3] or [N, 15, 3]",
@@ -136,12 +136,12 @@ fn open(description: ModelDescription, options: &OpenOptions) -> Result<Box<dyn 
     let bands = sh_coefficients(degree);
     let mut reader = CheckpointReader::new(checkpoint, count, degree, if has_motion { OWN } else { 0 })?;
     let planes = [
-        (Columns::POSITION, &[3][..], 0, 3),
-        (Columns::LOG_SCALE, &[3], 0, 3),
-        (Columns::ROTATION, &[4], 0, 4),
-        (Columns::OPACITY, &[], 0, 1),
-        (Columns::SH, &[1, 3], 0, 3),
-        (Columns::SH, &[bands - 1, 3], 3, 3 * (bands - 1)),
+        (Attributes::POSITION, &[3][..], 0, 3),
+        (Attributes::LOG_SCALE, &[3], 0, 3),
+        (Attributes::ROTATION, &[4], 0, 4),
+        (Attributes::OPACITY, &[], 0, 1),
+        (Attributes::SH, &[1, 3], 0, 3),
+        (Attributes::SH, &[bands - 1, 3], 3, 3 * (bands - 1)),
     ];
     for ((name, id), (column, row, skipped, width)) in names.iter().zip(nodes).zip(planes) {
         reader.read(id, &place(name), row, RowElement::all_of(column, skipped, width))?;

@@ -2,7 +2,7 @@ use std::fs;
 
 use super::*;
 use crate::compressed_model::{Cluster, CompressedModel, Reference};
-use crate::files::checkpoint::made::{Made, MadeTensor, named, tensor};
+use crate::files::checkpoint::made::{Made, PickledTensor, named, tensor};
 use crate::limits::Limits;
 use crate::limits::ReadLimit;
 use crate::model::{Gaussians, opacity};
@@ -48,7 +48,7 @@ fn file(splats: &Splats) -> Vec<u8> {
     let own =
         splats.iter().enumerate().map(|(k, (name, row, values))| (*name, Made::Tensor(stored_tensor(k, row, values))));
     let adam = splats.iter().enumerate().map(|(k, (name, row, values))| {
-        let average = |storage| Made::Tensor(MadeTensor { storage, ..stored_tensor(k, row, values) });
+        let average = |storage| Made::Tensor(PickledTensor { storage, ..stored_tensor(k, row, values) });
         let step = Made::Tensor(tensor(20 + k, &[], &[7.0]));
         let state = named(vec![("step", step), ("exp_avg", average(40 + k)), ("exp_avg_sq", average(60 + k))]);
         (*name, Made::Dict(named(vec![("state", Made::Dict(vec![(Made::Int(0), Made::Dict(state))]))])))
@@ -88,7 +88,7 @@ fn open(path: &Path) -> Result<Box<dyn InputModel>> {
 }
 
 fn states(model: &dyn InputModel) -> Vec<Gaussians> {
-    (0..TIMES.len()).map(|frame| gather_all(model.source(), frame, Columns::all()).unwrap()).collect()
+    (0..TIMES.len()).map(|frame| gather_all(model.source(), frame, Attributes::all()).unwrap()).collect()
 }
 
 fn rule() -> MergeParams {
@@ -184,10 +184,10 @@ fn model_without_velocities_is_static_with_any_sh_degree() {
     let folder = ResultFolder::put(&made);
     let model = models::open(&folder.path("result"), &OpenOptions::default()).unwrap();
     assert_eq!((model.kind(), model.source().info().sh_degree), ("gsplat checkpoint", 1));
-    let whole = gather_all(model.source(), 0, Columns::all()).unwrap();
+    let whole = gather_all(model.source(), 0, Attributes::all()).unwrap();
     let result = folder.written(&*model, &CompressedModel::pruned(vec![1, 2], &rule()));
     let left = models::open(&result, &OpenOptions::default()).unwrap();
-    assert_eq!(gather_all(left.source(), 0, Columns::all()).unwrap(), whole.pick(&[1, 2]));
+    assert_eq!(gather_all(left.source(), 0, Attributes::all()).unwrap(), whole.pick(&[1, 2]));
 }
 
 #[test]

@@ -8,7 +8,7 @@
 use crate::compressed_model::Cluster;
 use crate::error::Result;
 use crate::merging::merged::MergedSequence;
-use crate::model::{Columns, Gaussians, logit, opacity};
+use crate::model::{Attributes, Gaussians, logit, opacity};
 use crate::passes::{BLOCK, gather_all};
 use crate::recipe::MergeParams;
 use crate::source::FrameSource;
@@ -92,13 +92,13 @@ pub(in crate::models) fn match_proxies(
     rule: &MergeParams,
     line_of: impl Fn(u32) -> LinearPath,
     window: impl Fn(&LinearPath, f64) -> f64,
-    wanted: Columns,
+    wanted: Attributes,
     mut visit: impl FnMut(ProxyAtFrame<'_>),
 ) -> Result<Vec<Matched>> {
     let times = &source.info().times;
     let sampled = times.len().min(SAMPLED_FRAMES);
     let frames: Vec<usize> = (0..sampled).map(|k| (2 * k + 1) * times.len() / (2 * sampled)).collect();
-    let wanted = wanted | Columns::ROTATION | Columns::LOG_SCALE | Columns::OPACITY;
+    let wanted = wanted | Attributes::ROTATION | Attributes::LOG_SCALE | Attributes::OPACITY;
     let mut matched = Vec::with_capacity(clusters.len());
     for (chunk, first) in clusters.chunks(BLOCK).zip((0..).step_by(BLOCK)) {
         let leaders: Vec<u32> = chunk.iter().map(|cluster| cluster.leader).collect();

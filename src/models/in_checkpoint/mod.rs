@@ -12,14 +12,14 @@ use std::path::{Path, PathBuf};
 use xxhash_rust::xxh3::Xxh3;
 
 use super::files::copy;
-use super::size::{Size, bytes_below, bytes_of};
+use super::size::{Size, bytes_below, bytes_read_for};
 use super::trajectories::{check_output, state_bytes, write_sequence};
 use crate::compressed_model::{Cluster, CompressedModel, Proxies, Reference};
 use crate::error::{Error, Result};
 use crate::files::cameras::Clock;
 use crate::files::digest::hash_file;
 use crate::limits::Limits;
-use crate::model::{Columns, Jacobian, Raw};
+use crate::model::{Attributes, Jacobian, StoredParams};
 use crate::models::input_model::{InputModel, MemoryProfile, Timing};
 use crate::models::motion_model;
 use crate::models::motion_model::{MotionModel, MotionModelFrames};
@@ -39,7 +39,7 @@ pub(super) trait ProxyRule: MotionModel {
     ///
     /// # Errors
     /// Fails if frames cannot be evaluated.
-    fn propose(model: &MotionModelFrames<Self>, clusters: &[Cluster], rule: &MergeParams) -> Result<Raw>
+    fn propose(model: &MotionModelFrames<Self>, clusters: &[Cluster], rule: &MergeParams) -> Result<StoredParams>
     where
         Self: Sized;
 
@@ -157,14 +157,14 @@ impl<L: ProxyRule + 'static> InputModel for CheckpointModel<L> {
     }
 
     fn size(&self) -> Result<Size> {
-        let rest = bytes_of(self.copied_files().iter().map(PathBuf::as_path))?;
-        Ok(Size { cloud: bytes_of([&*self.description.file])?, rest, ..Size::default() })
+        let rest = bytes_read_for(self.copied_files().iter().map(PathBuf::as_path))?;
+        Ok(Size { cloud: bytes_read_for([&*self.description.file])?, rest, ..Size::default() })
     }
 
     fn size_written(&self, kind: OutputKind, path: &Path) -> Result<Size> {
         match kind {
             OutputKind::Model => {
-                let cloud = bytes_of([&*path.join(self.relative_path())])?;
+                let cloud = bytes_read_for([&*path.join(self.relative_path())])?;
                 Ok(Size { cloud, rest: bytes_below(path)?.saturating_sub(cloud), ..Size::default() })
             }
             _ => Ok(Size::of_frames(bytes_below(path)?)),
@@ -173,7 +173,7 @@ impl<L: ProxyRule + 'static> InputModel for CheckpointModel<L> {
 
     fn residence(&self) -> MemoryProfile {
         let raw = self.model.raw();
-        let whole = state_bytes(raw.gaussians.sh_degree(), Columns::all()) + 4 * raw.own.width() as u64;
+        let whole = state_bytes(raw.gaussians.sh_degree(), Attributes::all()) + 4 * raw.own.width() as u64;
         MemoryProfile {
             per_gaussian: whole,
             // The widest tensor, as stored and as f32.

@@ -9,15 +9,15 @@ use crate::compressed_model::CompressedModel;
 use crate::error::Result;
 use crate::files::checkpoint::write::{GaussianRows, write_like};
 use crate::files::checkpoint::{Checkpoint, NodeId, TensorView};
-use crate::model::{Column, Columns, Gaussians, Raw};
+use crate::model::{AttributeValues, Attributes, Gaussians, StoredParams};
 use crate::models::trajectories::state_bytes;
 
 /// Meaning of one element of a tensor's row.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(in crate::models) enum RowElement {
     /// Plane of an attribute column.
-    Of(Columns, usize),
-    /// Plane of [`Raw::own`].
+    Of(Attributes, usize),
+    /// Plane of [`StoredParams::own`].
     Own(usize),
     /// Value that frame states do not depend on.
     Unread,
@@ -25,17 +25,17 @@ pub(in crate::models) enum RowElement {
 
 impl RowElement {
     /// Returns `count` consecutive planes of a column, after the first `skipped`.
-    pub(in crate::models) fn all_of(column: Columns, skipped: usize, count: usize) -> Vec<RowElement> {
+    pub(in crate::models) fn all_of(column: Attributes, skipped: usize, count: usize) -> Vec<RowElement> {
         (skipped..skipped + count).map(|c| RowElement::Of(column, c)).collect()
     }
 
-    /// Returns `count` consecutive planes of [`Raw::own`], from `first` on.
+    /// Returns `count` consecutive planes of [`StoredParams::own`], from `first` on.
     pub(in crate::models) fn own(first: usize, count: usize) -> Vec<RowElement> {
         (first..first + count).map(RowElement::Own).collect()
     }
 
     /// Returns the plane of `raw` that holds this element; `None` for values that are not read.
-    fn get(self, raw: &Raw) -> Option<&[f32]> {
+    fn get(self, raw: &StoredParams) -> Option<&[f32]> {
         match self {
             RowElement::Of(column, c) => Some(raw.gaussians.column(column).plane(c)),
             RowElement::Own(c) => Some(raw.own.plane(c)),
@@ -70,7 +70,7 @@ pub(in crate::models) struct CheckpointReader {
     /// Tensors read so far.
     pub(in crate::models) tensors: RowTensors,
     /// Parameters read so far.
-    pub(in crate::models) raw: Raw,
+    pub(in crate::models) raw: StoredParams,
 }
 
 impl CheckpointReader {
@@ -84,9 +84,10 @@ impl CheckpointReader {
         sh_degree: usize,
         own: usize,
     ) -> Result<CheckpointReader> {
-        let row = state_bytes(sh_degree, Columns::all()) + 4 * own as u64;
+        let row = state_bytes(sh_degree, Attributes::all()) + 4 * own as u64;
         checkpoint.allow("", &format!("its {count} Gaussians"), row.saturating_mul(count as u64))?;
-        let raw = Raw { gaussians: Gaussians::zeros(count, sh_degree), own: Column::zeros(own, count) };
+        let raw =
+            StoredParams { gaussians: Gaussians::zeros(count, sh_degree), own: AttributeValues::zeros(own, count) };
         Ok(CheckpointReader {
             tensors: RowTensors { checkpoint, count, params: Vec::new(), training_only: Vec::new() },
             raw,
@@ -152,8 +153,8 @@ impl RowTensors {
     /// Fails if a tensor cannot be read or a write fails.
     pub(in crate::models) fn write(
         &self,
-        before: &Raw,
-        raw_left: &Raw,
+        before: &StoredParams,
+        raw_left: &StoredParams,
         reduction: &CompressedModel,
         path: &Path,
     ) -> Result<()> {

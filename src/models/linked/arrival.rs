@@ -18,8 +18,8 @@ use crate::files::frame_stream::FrameStream;
 use crate::files::ply::PlyOptions;
 use crate::files::ply::write::write_inria;
 use crate::files::ply_frames::PlyFrames;
-use crate::fit::SEEN;
-use crate::model::{Columns, Gaussians, opacity};
+use crate::fit::MIN_VISIBLE_OPACITY;
+use crate::model::{Attributes, Gaussians, opacity};
 use crate::models::InputModel;
 use crate::models::trajectories::state_bytes;
 use crate::outputs::container::{GAUSSIAN_BLOCK, of_block};
@@ -51,7 +51,7 @@ impl ReceivedFrames {
         write_inria(state, &[], &self.folder.path().join(format!("frame_{:05}.ply", self.times.len())))?;
         self.times.push(time);
         self.largest_frame_bytes =
-            self.largest_frame_bytes.max(state.len() as u64 * state_bytes(state.sh_degree(), Columns::all()));
+            self.largest_frame_bytes.max(state.len() as u64 * state_bytes(state.sh_degree(), Attributes::all()));
         Ok(())
     }
 
@@ -112,10 +112,10 @@ impl LinkedFrames {
     ) -> Result<LinkedFrames> {
         let (source, info) = (input.source(), input.source().info());
         let visible_rows = count_visible_rows(source)?;
-        let state = state_bytes(info.sh_degree, Columns::all());
+        let state = state_bytes(info.sh_degree, Attributes::all());
         let residence = input.residence();
         let tile = residence.gaussian_block.min(info.count as u64) * residence.frame_block;
-        let decoding = tile * (state + 3 * state_bytes(info.sh_degree, Columns::SH));
+        let decoding = tile * (state + 3 * state_bytes(info.sh_degree, Attributes::SH));
         let unpacked = TOGETHER_BYTES.min(state * visible_rows.iter().sum::<u64>());
         let mut received =
             ReceivedFrames::new(&options.scratch, unpacked + rayon::current_num_threads() as u64 * decoding)?;
@@ -152,10 +152,10 @@ fn blocks(source: &dyn FrameSource) -> impl IndexedParallelIterator<Item = Range
     (0..count.div_ceil(GAUSSIAN_BLOCK)).into_par_iter().map(move |block| of_block(count, block))
 }
 
-/// Returns the rows of `state` that may be visible: with an opacity of at least [`SEEN`].
+/// Returns the rows of `state` that may be visible: with an opacity of at least [`MIN_VISIBLE_OPACITY`].
 fn visible_rows(state: &Gaussians) -> Vec<u32> {
     let opacities = (0u32..).zip(state.opacity_logit.plane(0));
-    opacities.filter(|&(_, &logit)| opacity(logit) >= SEEN).map(|(row, _)| row).collect()
+    opacities.filter(|&(_, &logit)| opacity(logit) >= MIN_VISIBLE_OPACITY).map(|(row, _)| row).collect()
 }
 
 /// Returns the number of visible Gaussians ([`visible_rows`]) in each frame of `source`.
@@ -165,7 +165,7 @@ fn count_visible_rows(source: &dyn FrameSource) -> Result<Vec<u64>> {
         let (mut reader, mut state) = (source.open(Ids::Range(range))?, Gaussians::zeros(0, 0));
         (0..frames)
             .map(|frame| {
-                reader.read(frame, Columns::OPACITY, &mut state)?;
+                reader.read(frame, Attributes::OPACITY, &mut state)?;
                 Ok(visible_rows(&state).len() as u64)
             })
             .collect()
@@ -186,7 +186,7 @@ fn unpack(source: &dyn FrameSource, frames: Range<usize>) -> Result<Vec<Vec<Gaus
         frames
             .clone()
             .map(|frame| {
-                reader.read(frame, Columns::all(), &mut state)?;
+                reader.read(frame, Attributes::all(), &mut state)?;
                 Ok(state.pick(&visible_rows(&state)))
             })
             .collect()

@@ -3,7 +3,7 @@
 use std::mem::size_of;
 
 use super::steady::{BATCH, TrackSums};
-use crate::model::Columns;
+use crate::model::Attributes;
 use crate::models::trajectories::state_bytes;
 use crate::outputs::container::{FRAME_BLOCK, GAUSSIAN_BLOCK};
 use crate::render::{BYTES_PER_VISIBLE, STRIP_BYTES};
@@ -34,7 +34,7 @@ pub(super) struct Sizes {
 impl Sizes {
     /// Returns the bytes of the state of a Gaussian.
     fn state(&self) -> u64 {
-        state_bytes(self.sh_degree, Columns::all())
+        state_bytes(self.sh_degree, Attributes::all())
     }
 
     /// Returns the bytes of a Gaussian in the file of a frame: its attributes and 24 bytes of normals and other extra
@@ -61,14 +61,14 @@ impl Sizes {
     /// Returns the bytes while the frames are open: first frame and row of every track, the joined track it belongs to,
     /// and its constant columns.
     pub(super) fn open(&self) -> u64 {
-        (8 + 4 + size_of::<Columns>() as u64) * self.linked
+        (8 + 4 + size_of::<Attributes>() as u64) * self.linked
     }
 
     /// Returns the bytes of linking: a frame and its compared attributes, the tracks that may continue, and for every
     /// track its first row and its last state.
     fn linking(&self) -> u64 {
         let of_frame = self.file() + self.state() + Linker::BYTES_PER_GAUSSIAN as u64 + BYTES_PER_ROW;
-        let of_living = (Linker::BYTES_PER_TRACK + Joiner::BYTES_PER_LIVING) as u64;
+        let of_living = (Linker::BYTES_PER_TRACK + Joiner::BYTES_PER_OPEN_TRACK) as u64;
         let of_track = 2 * 8 + Joiner::BYTES_PER_TRACK as u64;
         self.frame_gaussians * of_frame + self.live_tracks * of_living + self.linked * of_track
     }

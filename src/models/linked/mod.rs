@@ -24,7 +24,7 @@ use std::path::{Path, PathBuf};
 use xxhash_rust::xxh3::xxh3_128;
 
 use self::tracks::LinkedTracks;
-use super::size::bytes_of;
+use super::size::bytes_read_for;
 use super::trajectories::write_trajectories;
 use crate::compressed_model::CompressedModel;
 use crate::error::Result;
@@ -136,7 +136,7 @@ impl InputModel for LinkedFrames {
 
     fn bytes(&self) -> Result<u64> {
         match &self.origin {
-            None => bytes_of(self.tracks.frames().paths().iter().map(PathBuf::as_path)),
+            None => bytes_read_for(self.tracks.frames().paths().iter().map(PathBuf::as_path)),
             Some(origin) => Ok(origin.bytes),
         }
     }

@@ -10,7 +10,7 @@ use crate::error::Result;
 use crate::files::cameras::virtual_rig;
 use crate::metrics::psnr;
 use crate::model::RobustBox;
-use crate::model::{Columns, Gaussians};
+use crate::model::{Attributes, Gaussians};
 use crate::render::Renderer;
 use crate::tracking::{Joiner, Linker};
 
@@ -113,7 +113,7 @@ fn joining_psnr(tracks: &LinkedTracks) -> Result<Option<f64>> {
     for frame in sampled_frames(&frames) {
         let ply = tracks.frames().frame(frame)?;
         let mut all = Gaussians::zeros(0, tracks.frames().sh_degree());
-        ply.gaussians(0..ply.count(), Columns::all(), &mut all)?;
+        ply.gaussians(0..ply.count(), Attributes::all(), &mut all)?;
         apart.push(all);
         joined.push(tracks.states(&ply, &tracks.rows(frame, 0..tracks.count())?)?);
     }

@@ -18,10 +18,10 @@ use rayon::prelude::*;
 
 use crate::cache::{Spill, SpillWriter};
 use crate::error::Result;
-use crate::model::{Columns, Gaussians};
+use crate::model::{Attributes, Gaussians};
 
 /// Columns that may become constant. Positions always move.
-const STEADY_COLUMNS: Columns = Columns::all().difference(Columns::POSITION);
+const STEADY_COLUMNS: Attributes = Attributes::all().difference(Attributes::POSITION);
 /// Number of tracks per batch in which a thread computes means.
 pub(super) const BATCH: usize = 1 << 16;
 
@@ -37,7 +37,7 @@ pub(super) struct Bound {
 /// Columns of each track that are constant, and their values.
 pub(super) struct Steady {
     /// Constant columns of every track.
-    columns: Vec<Columns>,
+    columns: Vec<Attributes>,
     /// Means of the columns [`STEADY_COLUMNS`] of every track, track by track, plane by plane.
     means: Spill,
     sh_degree: usize,
@@ -45,7 +45,7 @@ pub(super) struct Steady {
 
 /// Constant columns of some tracks, and their values.
 pub(super) struct HeldMeans {
-    columns: Vec<Columns>,
+    columns: Vec<Attributes>,
     values: Gaussians,
 }
 
@@ -77,7 +77,7 @@ impl Steady {
 
     /// Returns the fractions of tracks whose colors, scales, rotations and opacities are constant, in this order.
     pub(super) fn parts(&self) -> [f64; 4] {
-        [Columns::SH, Columns::LOG_SCALE, Columns::ROTATION, Columns::OPACITY].map(|column| {
+        [Attributes::SH, Attributes::LOG_SCALE, Attributes::ROTATION, Attributes::OPACITY].map(|column| {
             let held = self.columns.iter().filter(|columns| columns.contains(column)).count();
             held as f64 / self.columns.len().max(1) as f64
         })
@@ -148,7 +148,7 @@ impl TrackSums {
     /// Creates the sums of `len` tracks without frames.
     pub(super) fn new(len: usize, sh_degree: usize) -> TrackSums {
         TrackSums {
-            sh_width: Columns::SH.width(sh_degree),
+            sh_width: Attributes::SH.width(sh_degree),
             opacity: vec![[0.0; 3]; len],
             values: vec![0.0; STEADY_COLUMNS.width(sh_degree) * len],
             rotations: vec![[0.0; 4]; len],
@@ -212,7 +212,7 @@ impl TrackSums {
     }
 
     /// Returns the columns of `track` that change by at most `bound`. A column with NaN is not steady.
-    fn steady(&self, track: usize, bound: Bound) -> Columns {
+    fn steady(&self, track: usize, bound: Bound) -> Attributes {
         let [frames, weight, squares] = self.opacity[track];
         let width = self.values.len() / self.opacity.len();
         let mean: Vec<f64> = self.values[track * width..][..width].iter().map(|sum| sum / weight).collect();
@@ -224,11 +224,11 @@ impl TrackSums {
             let of_mean: f64 = colors.iter().skip(channel).step_by(3).map(|value| value * value).sum();
             within((self.colors[track][channel] / weight - of_mean) / (4.0 * PI), bound.color)
         });
-        let mut steady = Columns::empty();
-        steady.set(Columns::ROTATION, within(turn, bound.other));
-        steady.set(Columns::LOG_SCALE, are_scales);
-        steady.set(Columns::OPACITY, within(squares / frames - (weight / frames).powi(2), bound.other));
-        steady.set(Columns::SH, are_colors);
+        let mut steady = Attributes::empty();
+        steady.set(Attributes::ROTATION, within(turn, bound.other));
+        steady.set(Attributes::LOG_SCALE, are_scales);
+        steady.set(Attributes::OPACITY, within(squares / frames - (weight / frames).powi(2), bound.other));
+        steady.set(Attributes::SH, are_colors);
         steady
     }
 }

@@ -12,8 +12,8 @@ use crate::cache::{Spill, SpillWriter};
 use crate::error::{Result, ShowPath};
 use crate::files::ply::{Ply, PlyOptions};
 use crate::files::ply_frames::PlyFrames;
-use crate::model::{Columns, Gaussians, SequenceInfo};
-use crate::outputs::container::{BlockPresence, ContainerWriter, GAUSSIAN_BLOCK};
+use crate::model::{Attributes, Gaussians, SequenceInfo};
+use crate::outputs::container::{BlockChange, ContainerWriter, GAUSSIAN_BLOCK};
 use crate::progress::Events;
 use crate::source::{BlockReader, FrameSource, Ids};
 use crate::tracking::{Joiner, Linker, blend};
@@ -138,9 +138,9 @@ impl LinkedTracks {
             };
             options.memory.check(name, &format!("frame {frame}"), "linking the frames", sizes.opening())?;
             let ply = frames.frame(frame)?;
-            ply.gaussians(0..ply.count(), Columns::all(), &mut state)?;
+            ply.gaussians(0..ply.count(), Attributes::all(), &mut state)?;
             let linked = linker.link(&state);
-            live_tracks = live_tracks.max(linker.may_go_on());
+            live_tracks = live_tracks.max(linker.open_track_count());
             if let Some(joiner) = &mut joiner {
                 joiner.see(&linker);
             }
@@ -276,7 +276,7 @@ impl LinkedTracks {
     /// Fails if a read fails.
     pub(super) fn blended(&self, file: &Ply, rows: &[TrackedRow], state: &mut Gaussians) -> Result<Vec<usize>> {
         let of_file: Vec<u32> = rows.iter().map(|row| row.row).collect();
-        file.gather(&Ids::List(&of_file), Columns::all(), state)?;
+        file.gather(&Ids::List(&of_file), Attributes::all(), state)?;
         let mut firsts = Vec::with_capacity(rows.len());
         let mut at = 0;
         for of_track in rows.chunk_by(|a, b| a.track == b.track) {
@@ -320,27 +320,27 @@ impl LinkedTracks {
             let files: Vec<Ply> = of_block.clone().map(|frame| self.frames.frame(frame)).collect::<Result<_>>()?;
             let rows: Vec<Vec<TrackedRow>> =
                 of_block.clone().map(|frame| self.rows(frame, 0..self.count)).collect::<Result<_>>()?;
-            let mut presence: Vec<BlockPresence> = was_still
+            let mut presence: Vec<BlockChange> = was_still
                 .iter()
-                .map(|&still| if still { BlockPresence::Repeating } else { BlockPresence::Still })
+                .map(|&still| if still { BlockChange::Repeating } else { BlockChange::Still })
                 .collect();
             for row in rows.iter().flatten() {
-                presence[row.track as usize / GAUSSIAN_BLOCK] = BlockPresence::New;
+                presence[row.track as usize / GAUSSIAN_BLOCK] = BlockChange::New;
             }
             let info = SequenceInfo {
                 count: self.count,
                 times: times[of_block.clone()].to_vec(),
                 sh_degree: degree,
-                varying: Columns::all(),
+                varying: Attributes::all(),
             };
             let block = FrameBlock { info, tracks: self, start, files: &files, rows: &rows, held: &held };
-            writer.append_lives(&block, 0..of_block.len(), &times[of_block.clone()], &presence)?;
+            writer.append_with_presence(&block, 0..of_block.len(), &times[of_block.clone()], &presence)?;
             for (frame, rows) in of_block.clone().zip(&rows) {
                 for row in rows {
                     held[row.track as usize] = TrackPosition { frame: frame as u32, row: row.row };
                 }
             }
-            was_still = presence.iter().map(|presence| *presence != BlockPresence::New).collect();
+            was_still = presence.iter().map(|presence| *presence != BlockChange::New).collect();
             progress.advance(of_block.len() as u64);
         }
         writer.finish()
@@ -395,7 +395,7 @@ impl FrameBlock<'_> {
                     &opened
                 }
             };
-            ply.gather(&Ids::List(&rows), Columns::all(), &mut part)?;
+            ply.gather(&Ids::List(&rows), Attributes::all(), &mut part)?;
             scatter(&part, of_frame.iter().map(|&(_, i)| i).enumerate(), state);
         }
         Ok(())
@@ -427,7 +427,7 @@ impl TrackReader<'_> {
 }
 
 impl BlockReader for TrackReader<'_> {
-    fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
+    fn read(&mut self, frame: usize, want: Attributes, out: &mut Gaussians) -> Result<()> {
         if frame + 1 < self.next {
             self.begin()?;
         }
@@ -454,7 +454,7 @@ impl BlockReader for TrackReader<'_> {
 
 /// Copies rows of `part` to `state`. Each pair of `places` is a source row and a target row.
 fn scatter(part: &Gaussians, places: impl Iterator<Item = (usize, usize)> + Clone, state: &mut Gaussians) {
-    for column in Columns::all().iter() {
+    for column in Attributes::all().iter() {
         let (from, to) = (part.column(column), state.column_mut(column));
         for c in 0..to.width() {
             let (from, to) = (from.plane(c), to.plane_mut(c));

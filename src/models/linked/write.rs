@@ -9,8 +9,8 @@ use rayon::prelude::*;
 use super::LinkedFrames;
 use crate::compressed_model::CompressedModel;
 use crate::error::Result;
-use crate::files::ply::write::{OutRow, out_rows, write_like};
-use crate::model::{Columns, Gaussians};
+use crate::files::ply::write::{OutRow, rows_of_model, write_like};
+use crate::model::{Attributes, Gaussians};
 use crate::models::trajectories::merged;
 use crate::progress::Events;
 use crate::source::{FrameSource, Ids};
@@ -26,7 +26,7 @@ impl LinkedFrames {
     /// Fails if frames cannot be read or a write fails.
     pub(super) fn write_files(&self, reduction: &CompressedModel, folder: &Path, events: &Events) -> Result<()> {
         let (frames, result) = (self.tracks.frames(), merged(self, reduction));
-        let all = out_rows(reduction);
+        let all = rows_of_model(reduction);
         let progress = events.task("emit", "frames", frames.paths().len() as u64);
         let write = |&frame: &usize| {
             let mut of_frame = self.tracks.rows(frame, 0..self.tracks.count())?;
@@ -55,7 +55,7 @@ impl LinkedFrames {
             let template = frames.frame(frame)?;
             let places: Vec<u32> = merged.iter().map(|&at| written[at]).collect();
             let mut first = Gaussians::zeros(0, self.info.sh_degree);
-            result.open(Ids::List(&places))?.read(frame, Columns::all(), &mut first)?;
+            result.open(Ids::List(&places))?.read(frame, Attributes::all(), &mut first)?;
             of_frame.retain(|row| {
                 computed.binary_search_by_key(&row.track, |&at| all[written[at] as usize].source).is_ok()
             });
@@ -65,7 +65,7 @@ impl LinkedFrames {
             for (proxy, at) in merged.into_iter().chain(computed).enumerate() {
                 rows[at].proxy = Some(proxy as u32);
             }
-            let change = reduction.change_at(frame, frames.paths().len()).pick(&written);
+            let change = reduction.delta_at(frame, frames.paths().len()).pick(&written);
             let name = template.path().file_name().unwrap_or_default();
             write_like(&template, &rows, &proxies, &change, reduction.sh_degree, &folder.join(name))?;
             progress.advance(1);

@@ -15,8 +15,8 @@ use rayon::prelude::*;
 
 use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result};
-use crate::model::{Column, Columns, Gaussians, Jacobian, Raw, SequenceInfo};
-use crate::passes::{BLOCK, BlockSlices, InBlocks};
+use crate::model::{AttributeValues, Attributes, Gaussians, Jacobian, SequenceInfo, StoredParams};
+use crate::passes::{BLOCK, BlockSlices, BlockwiseReader};
 use crate::source::{BlockReader, Count, Deformation, FeatureDecoder, FrameSource, Ids, ReadPlan, Reads};
 
 pub(super) use proxies::solve;
@@ -27,13 +27,13 @@ pub(super) trait MotionModel: Debug + Send + Sync {
     type Prepared: Send + Sync;
 
     /// Computes the time-independent values of `raw`.
-    fn prepare(&self, raw: &Raw) -> Self::Prepared;
+    fn prepare(&self, raw: &StoredParams) -> Self::Prepared;
 
     /// Returns the columns that change with time.
-    fn varying(&self) -> Columns;
+    fn varying(&self) -> Attributes;
 
-    /// Returns the columns of [`Raw::gaussians`] that [`MotionModel::jacobian`] covers, so that they can be optimized.
-    fn movable(&self) -> Columns;
+    /// Returns the columns of [`StoredParams::gaussians`] that [`MotionModel::jacobian`] covers, so that they can be optimized.
+    fn movable(&self) -> Attributes;
 
     /// Writes the columns `want` of the states at `time` into `out`, whose columns already have the right length.
     /// Called with at most [`BLOCK`] Gaussians at once, from many threads.
@@ -43,14 +43,21 @@ pub(super) trait MotionModel: Debug + Send + Sync {
     ///
     /// # Errors
     /// Fails if the model cannot be evaluated.
-    fn state(&self, time: f64, raw: &Raw, prepared: &Self::Prepared, want: Columns, out: &mut Gaussians) -> Result<()>;
+    fn state(
+        &self,
+        time: f64,
+        raw: &StoredParams,
+        prepared: &Self::Prepared,
+        want: Attributes,
+        out: &mut Gaussians,
+    ) -> Result<()>;
 
-    /// Returns the derivative of the columns `want` of these states with respect to [`Raw::gaussians`]. The default is
+    /// Returns the derivative of the columns `want` of these states with respect to [`StoredParams::gaussians`]. The default is
     /// the identity: states change by as much as stored values.
     ///
     /// # Errors
     /// Fails if the model cannot be evaluated.
-    fn jacobian(&self, time: f64, raw: &Raw, prepared: &Self::Prepared, want: Columns) -> Result<Jacobian> {
+    fn jacobian(&self, time: f64, raw: &StoredParams, prepared: &Self::Prepared, want: Attributes) -> Result<Jacobian> {
         let _ = (time, raw, prepared, want);
         Ok(Jacobian::default())
     }
@@ -64,7 +71,7 @@ pub(super) trait MotionModel: Debug + Send + Sync {
 /// Decoder of rendered features to colors.
 pub(super) trait Shading: Sync {
     /// Returns the features of `raw` at `time`, one plane per feature.
-    fn features(&self, time: f64, raw: &Raw) -> Column;
+    fn features(&self, time: f64, raw: &StoredParams) -> AttributeValues;
 
     /// Returns the color of a pixel from its blended `features`, seen from the camera center `center` along the unit
     /// vector `ray`.
@@ -75,7 +82,7 @@ pub(super) trait Shading: Sync {
 #[derive(Debug)]
 pub(super) struct MotionModelFrames<L> {
     motion_model: Arc<L>,
-    raw: Arc<Raw>,
+    raw: Arc<StoredParams>,
     info: SequenceInfo,
     states: Count,
 }
@@ -89,7 +96,7 @@ impl<L> Clone for MotionModelFrames<L> {
 
 impl<L: MotionModel> MotionModelFrames<L> {
     /// Creates a model without frames, whose states have the SH degree `sh_degree`.
-    pub(super) fn new(motion_model: L, raw: Raw, sh_degree: usize) -> MotionModelFrames<L> {
+    pub(super) fn new(motion_model: L, raw: StoredParams, sh_degree: usize) -> MotionModelFrames<L> {
         let info = SequenceInfo { count: raw.len(), times: Vec::new(), sh_degree, varying: motion_model.varying() };
         MotionModelFrames { motion_model: Arc::new(motion_model), raw: Arc::new(raw), info, states: Count::default() }
     }
@@ -100,7 +107,7 @@ impl<L: MotionModel> MotionModelFrames<L> {
     }
 
     /// Returns the raw parameters.
-    pub(super) fn raw(&self) -> &Raw {
+    pub(super) fn raw(&self) -> &StoredParams {
         &self.raw
     }
 
@@ -114,7 +121,7 @@ impl<L: MotionModel> MotionModelFrames<L> {
     }
 
     /// Returns the same motion model and frames with other Gaussians.
-    pub(super) fn with_raw(&self, raw: Raw) -> MotionModelFrames<L> {
+    pub(super) fn with_raw(&self, raw: StoredParams) -> MotionModelFrames<L> {
         let sh_degree = self.info.sh_degree.min(raw.gaussians.sh_degree());
         let info = SequenceInfo { count: raw.len(), sh_degree, ..self.info.clone() };
         MotionModelFrames {
@@ -140,20 +147,20 @@ impl<L: MotionModel> MotionModelFrames<L> {
 
 /// Returns the raw parameters of the compressed model `reduction` of `raw`: the survivors, proxies in place of their
 /// leaders, parameter deltas added, and the SH degree lowered.
-pub(super) fn compressed_raw(raw: &Raw, reduction: &CompressedModel) -> Raw {
+pub(super) fn compressed_raw(raw: &StoredParams, reduction: &CompressedModel) -> StoredParams {
     let mut raw_left = raw.pick(&reduction.kept);
     if let Some(proxies) = &reduction.proxies.raw {
         for (proxy, cluster) in reduction.clusters.iter().enumerate() {
             raw_left.set_row(cluster.output as usize, proxies, proxy);
         }
     }
-    raw_left.gaussians.drop_bands(reduction.sh_degree);
-    reduction.change.add_to(&mut raw_left.gaussians, Columns::all());
+    raw_left.gaussians.truncate_sh(reduction.sh_degree);
+    reduction.change.add_to(&mut raw_left.gaussians, Attributes::all());
     raw_left
 }
 
 /// Copies the columns `want` of `raw` to `out`.
-pub(super) fn copy_stored(raw: &Raw, want: Columns, out: &mut Gaussians) {
+pub(super) fn copy_stored(raw: &StoredParams, want: Attributes, out: &mut Gaussians) {
     for column in want.iter() {
         let (from, to) = (raw.gaussians.column(column), out.column_mut(column));
         (0..to.width()).for_each(|c| to.plane_mut(c).copy_from_slice(from.plane(c)));
@@ -178,7 +185,7 @@ impl<L: MotionModel> FrameSource for MotionModelFrames<L> {
 
     /// No frames are decoded together, so blocks are read one by one.
     fn open_all(&self, _: &ReadPlan) -> Option<Result<Box<dyn BlockReader + '_>>> {
-        Some(Ok(Box::new(InBlocks::new(self))))
+        Some(Ok(Box::new(BlockwiseReader::new(self))))
     }
 
     fn deformation(&self) -> Option<&dyn Deformation> {
@@ -195,9 +202,10 @@ impl<L: MotionModel> FrameSource for MotionModelFrames<L> {
 }
 
 impl<L: MotionModel> FeatureDecoder for MotionModelFrames<L> {
-    fn features(&self, frame: usize, out: &mut Column) -> Result<()> {
+    fn features(&self, frame: usize, out: &mut AttributeValues) -> Result<()> {
         let time = self.frame_time(frame)?;
-        *out = self.motion_model.shading().map_or(Column::default(), |shading| shading.features(time, &self.raw));
+        *out =
+            self.motion_model.shading().map_or(AttributeValues::default(), |shading| shading.features(time, &self.raw));
         Ok(())
     }
 
@@ -208,17 +216,17 @@ impl<L: MotionModel> FeatureDecoder for MotionModelFrames<L> {
 
 /// Up to [`BLOCK`] Gaussians with their time-independent values.
 struct PreparedBlock<L: MotionModel> {
-    raw: Raw,
+    raw: StoredParams,
     prepared: L::Prepared,
 }
 
 impl<L: MotionModel> PreparedBlock<L> {
-    fn new(motion_model: &L, raw: Raw) -> PreparedBlock<L> {
+    fn new(motion_model: &L, raw: StoredParams) -> PreparedBlock<L> {
         PreparedBlock { prepared: motion_model.prepare(&raw), raw }
     }
 
     /// Computes the columns `want` of the states at `time`, with AVX2 where the processor has it.
-    fn state(&self, motion_model: &L, time: f64, want: Columns, out: &mut Gaussians) -> Result<()> {
+    fn state(&self, motion_model: &L, time: f64, want: Attributes, out: &mut Gaussians) -> Result<()> {
         out.columns_mut(want).for_each(|column| column.resize(self.raw.len()));
         #[cfg(target_arch = "x86_64")]
         if std::arch::is_x86_feature_detected!("avx2") {
@@ -231,7 +239,7 @@ impl<L: MotionModel> PreparedBlock<L> {
     /// Calls [`MotionModel::state`] compiled for AVX2.
     #[cfg(target_arch = "x86_64")]
     #[target_feature(enable = "avx2")]
-    fn state_avx2(&self, motion_model: &L, time: f64, want: Columns, out: &mut Gaussians) -> Result<()> {
+    fn state_avx2(&self, motion_model: &L, time: f64, want: Attributes, out: &mut Gaussians) -> Result<()> {
         motion_model.state(time, &self.raw, &self.prepared, want, out)
     }
 }
@@ -244,7 +252,7 @@ struct MotionModelReader<'a, L: MotionModel> {
 }
 
 impl<L: MotionModel> BlockReader for MotionModelReader<'_, L> {
-    fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
+    fn read(&mut self, frame: usize, want: Attributes, out: &mut Gaussians) -> Result<()> {
         let (model, time) = (self.model, self.model.frame_time(frame)?);
         if !want.is_empty() {
             model.states.add(self.count as u64);
@@ -264,15 +272,15 @@ impl<L: MotionModel> BlockReader for MotionModelReader<'_, L> {
 
 /// Evaluates blocks of Gaussians in parallel.
 impl<L: MotionModel> Deformation for MotionModelFrames<L> {
-    fn stored(&self) -> &Raw {
+    fn stored(&self) -> &StoredParams {
         &self.raw
     }
 
-    fn movable(&self) -> Columns {
+    fn movable(&self) -> Attributes {
         self.motion_model.movable()
     }
 
-    fn state(&self, frame: usize, stored: &Raw, want: Columns, out: &mut Gaussians) -> Result<()> {
+    fn state(&self, frame: usize, stored: &StoredParams, want: Attributes, out: &mut Gaussians) -> Result<()> {
         let time = self.frame_time(frame)?;
         let ids: Vec<u32> = (0..stored.len() as u32).collect();
         let parts = BlockSlices::split(out, want, ids.len());
@@ -291,7 +299,7 @@ impl<L: MotionModel> Deformation for MotionModelFrames<L> {
         )
     }
 
-    fn jacobian(&self, frame: usize, stored: &Raw, want: Columns) -> Result<Jacobian> {
+    fn jacobian(&self, frame: usize, stored: &StoredParams, want: Attributes) -> Result<Jacobian> {
         let time = self.frame_time(frame)?;
         let ids: Vec<u32> = (0..stored.len() as u32).collect();
         let of_block = |ids: &[u32]| {

@@ -3,9 +3,9 @@
 use super::{MotionModel, MotionModelFrames};
 use crate::compressed_model::{Cluster, Proxies, Reference};
 use crate::error::Result;
-use crate::fit::SEEN;
+use crate::fit::MIN_VISIBLE_OPACITY;
 use crate::merging::merged::MergedSequence;
-use crate::model::{Columns, Raw, opacity};
+use crate::model::{Attributes, StoredParams, opacity};
 use crate::passes::gather_all;
 use crate::recipe::MergeParams;
 use crate::source::FrameSource;
@@ -24,7 +24,7 @@ pub(in crate::models) fn solve<L: MotionModel>(
     clusters: &[Cluster],
     reference: Reference,
     rule: &MergeParams,
-    propose: impl FnOnce(&[Cluster]) -> Result<Raw>,
+    propose: impl FnOnce(&[Cluster]) -> Result<StoredParams>,
 ) -> Result<Proxies> {
     if clusters.is_empty() {
         return Ok(Proxies::default());
@@ -36,12 +36,12 @@ pub(in crate::models) fn solve<L: MotionModel>(
     let drift = rule.max_drift * rule.length_unit.in_scene_units(reference.extent);
     let mut furthest = vec![0.0f64; clusters.len()];
     let mut drifts = vec![false; clusters.len()];
-    let compared = Columns::POSITION | Columns::OPACITY;
+    let compared = Attributes::POSITION | Attributes::OPACITY;
     for frame in 0..model.info().times.len() {
         let (wanted, made) = (gather_all(&wanted, frame, compared)?, gather_all(&made, frame, compared)?);
         for proxy in 0..clusters.len() {
             let [a, b] = [&wanted, &made].map(|state| opacity(state.opacity_logit.row::<1>(proxy)[0]));
-            if a.max(b) < SEEN {
+            if a.max(b) < MIN_VISIBLE_OPACITY {
                 continue;
             }
             let [to, from] = [&wanted, &made].map(|state| state.position.row::<3>(proxy).map(f64::from));

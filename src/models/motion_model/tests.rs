@@ -11,29 +11,36 @@ struct Straight;
 impl MotionModel for Straight {
     type Prepared = Vec<f32>;
 
-    fn prepare(&self, raw: &Raw) -> Vec<f32> {
+    fn prepare(&self, raw: &StoredParams) -> Vec<f32> {
         raw.own.plane(3).to_vec()
     }
 
-    fn varying(&self) -> Columns {
-        Columns::POSITION | Columns::OPACITY
+    fn varying(&self) -> Attributes {
+        Attributes::POSITION | Attributes::OPACITY
     }
 
-    fn movable(&self) -> Columns {
-        Columns::POSITION
+    fn movable(&self) -> Attributes {
+        Attributes::POSITION
     }
 
-    fn state(&self, time: f64, raw: &Raw, fading: &Vec<f32>, want: Columns, out: &mut Gaussians) -> Result<()> {
+    fn state(
+        &self,
+        time: f64,
+        raw: &StoredParams,
+        fading: &Vec<f32>,
+        want: Attributes,
+        out: &mut Gaussians,
+    ) -> Result<()> {
         for column in want.iter() {
             *out.column_mut(column) = raw.gaussians.column(column).clone();
         }
-        if want.contains(Columns::POSITION) {
+        if want.contains(Attributes::POSITION) {
             for c in 0..3 {
                 let velocity = raw.own.plane(c);
                 out.position.plane_mut(c).iter_mut().zip(velocity).for_each(|(x, v)| *x += v * time as f32);
             }
         }
-        if want.contains(Columns::OPACITY) {
+        if want.contains(Attributes::OPACITY) {
             out.opacity_logit.plane_mut(0).iter_mut().zip(fading).for_each(|(o, f)| *o -= f * time as f32);
         }
         Ok(())
@@ -43,11 +50,11 @@ impl MotionModel for Straight {
 /// Builds a model of more than two blocks of Gaussians, each with different values.
 fn model() -> MotionModelFrames<Straight> {
     let count = 2 * BLOCK + 77;
-    let mut raw = Raw { gaussians: Gaussians::zeros(count, 0), own: Column::zeros(4, count) };
-    let noise = |column: &mut Column, step: f32| {
+    let mut raw = StoredParams { gaussians: Gaussians::zeros(count, 0), own: AttributeValues::zeros(4, count) };
+    let noise = |column: &mut AttributeValues, step: f32| {
         column.planes_mut().iter_mut().enumerate().for_each(|(k, x)| *x = (k as f32 * step).fract());
     };
-    raw.gaussians.columns_mut(Columns::all()).for_each(|column| noise(column, 0.618_034));
+    raw.gaussians.columns_mut(Attributes::all()).for_each(|column| noise(column, 0.618_034));
     noise(&mut raw.own, 0.754_878);
     MotionModelFrames::new(Straight, raw, 0).with_times(vec![0.0, 0.5, 2.0]).unwrap()
 }
@@ -55,19 +62,21 @@ fn model() -> MotionModelFrames<Straight> {
 #[test]
 fn every_reader_returns_the_same_bits() {
     let model = model();
-    let all = gather_all(&model, 2, Columns::all()).unwrap();
+    let all = gather_all(&model, 2, Attributes::all()).unwrap();
     let ids: Vec<u32> = (0..model.info().count as u32).rev().step_by(2).collect();
     let mut some = Gaussians::zeros(0, 0);
-    model.open(Ids::List(&ids)).unwrap().read(2, Columns::all(), &mut some).unwrap();
+    model.open(Ids::List(&ids)).unwrap().read(2, Attributes::all(), &mut some).unwrap();
     assert_eq!(some, all.pick(&ids));
-    assert_eq!(gather(&model, &ids, 2, Columns::all()).unwrap(), some);
+    assert_eq!(gather(&model, &ids, 2, Attributes::all()).unwrap(), some);
     let mut stored = Gaussians::zeros(0, 0);
-    Deformation::state(&model, 2, model.stored(), Columns::all(), &mut stored).unwrap();
+    Deformation::state(&model, 2, model.stored(), Attributes::all(), &mut stored).unwrap();
     assert_eq!(stored, all);
     let id = BLOCK + 5;
     let [x, v] = [model.raw().gaussians.position.row::<3>(id), model.raw().own.row::<3>(id)];
     assert_eq!(all.position.row(id), [x[0] + 2.0 * v[0], x[1] + 2.0 * v[1], x[2] + 2.0 * v[2]]);
-    assert!(model.open(Ids::Range(0..model.info().count + 1)).is_err() && gather_all(&model, 3, Columns::SH).is_err());
+    assert!(
+        model.open(Ids::Range(0..model.info().count + 1)).is_err() && gather_all(&model, 3, Attributes::SH).is_err()
+    );
 }
 
 #[test]
@@ -76,7 +85,7 @@ fn compressed_model_has_survivors_proxies_and_deltas() {
     let mut reduction = CompressedModel::pruned(vec![3, 8, 11], &rule);
     reduction.clusters.push(Cluster { output: 1, leader: 8, members: vec![(8, 0.5), (9, 0.5)] });
     reduction.proxies.raw = Some(model.raw().pick(&[20]));
-    let mut by = Gaussians { position: Column::zeros(3, 3), ..Gaussians::default() };
+    let mut by = Gaussians { position: AttributeValues::zeros(3, 3), ..Gaussians::default() };
     by.position.set_row(2, [1.0, 0.0, 0.0]);
     reduction.change = ParamDelta(by);
     let reduced = model.reduced(&reduction);
@@ -96,7 +105,7 @@ fn proxies_that_drift_at_any_frame_are_refused() {
     let cluster = |output: u32, id: u32| Cluster { output, leader: id, members: vec![(id, 1.0)] };
     let clusters: Vec<Cluster> = (0..4).map(|k| cluster(k, 10 * k + 1)).collect();
     let ids: Vec<u32> = clusters.iter().map(|cluster| cluster.leader).collect();
-    let proposed = |change: fn(&mut Raw, f64)| {
+    let proposed = |change: fn(&mut StoredParams, f64)| {
         let mut raw = model.raw().pick(&ids);
         change(&mut raw, drift);
         solve(&model, &clusters, reference, &rule, |_| Ok(raw)).unwrap()

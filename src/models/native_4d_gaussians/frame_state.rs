@@ -13,17 +13,17 @@ use std::f64::consts::TAU;
 
 use super::rotation::{covariance, rotation};
 use crate::error::Result;
-use crate::model::{Column, Columns, Gaussians, Jacobian, Raw, scale_rotation};
+use crate::model::{AttributeValues, Attributes, Gaussians, Jacobian, StoredParams, scale_rotation};
 use crate::models::motion_model::window::{MAX_LOGIT, faded_logit, inverse_odds, slope};
 use crate::models::motion_model::{MotionModel, copy_stored};
 
-/// Plane of [`Raw::own`] with the center μ in time.
+/// Plane of [`StoredParams::own`] with the center μ in time.
 pub(super) const TIME: usize = 0;
-/// Plane of [`Raw::own`] with the logarithm of the scale along time.
+/// Plane of [`StoredParams::own`] with the logarithm of the scale along time.
 pub(super) const SCALING_T: usize = 1;
-/// First of four planes of [`Raw::own`] with the right quaternion.
+/// First of four planes of [`StoredParams::own`] with the right quaternion.
 pub(super) const ROTATION_R: usize = 2;
-/// First plane of [`Raw::own`] with the time-dependent SH coefficients, term by term.
+/// First plane of [`StoredParams::own`] with the time-dependent SH coefficients, term by term.
 pub(super) const TERMS: usize = 6;
 /// Number of planes of one term of SH coefficients of degree 3.
 pub(super) const TERM_WIDTH: usize = 48;
@@ -58,9 +58,9 @@ pub(super) struct Slices {
     /// exp(−o) of each opacity logit o.
     inverse_odds: Vec<f64>,
     /// Rotation of Σ; empty without a 4D rotation.
-    rotation: Column,
+    rotation: AttributeValues,
     /// Log scales of Σ; empty without a 4D rotation.
-    log_scale: Column,
+    log_scale: AttributeValues,
 }
 
 /// Time-independent values of one Gaussian.
@@ -74,7 +74,7 @@ pub(super) struct Slice {
 
 impl Native {
     /// Computes the velocity and covariance of Gaussian `i`.
-    pub(super) fn slice(&self, raw: &Raw, i: usize) -> Slice {
+    pub(super) fn slice(&self, raw: &StoredParams, i: usize) -> Slice {
         let log_scale_t = f64::from(raw.own.plane(SCALING_T)[i]);
         if !self.has_4d_rotation {
             return Slice { velocity: [0.0; 3], variance: log_scale_t.exp(), covariance: None };
@@ -114,14 +114,14 @@ impl Native {
 impl MotionModel for Native {
     type Prepared = Slices;
 
-    fn prepare(&self, raw: &Raw) -> Slices {
+    fn prepare(&self, raw: &StoredParams) -> Slices {
         let (count, turning) = (raw.len(), if self.has_4d_rotation { raw.len() } else { 0 });
         let mut slices = Slices {
             velocity: [0, 1, 2].map(|_| vec![0.0; count]),
             rates: vec![0.0; count],
             inverse_odds: raw.gaussians.opacity_logit.plane(0).iter().map(|&logit| inverse_odds(logit)).collect(),
-            rotation: Column::zeros(4, turning),
-            log_scale: Column::zeros(3, turning),
+            rotation: AttributeValues::zeros(4, turning),
+            log_scale: AttributeValues::zeros(3, turning),
         };
         for i in 0..count {
             let Slice { velocity, variance, covariance } = self.slice(raw, i);
@@ -136,30 +136,39 @@ impl MotionModel for Native {
         slices
     }
 
-    fn varying(&self) -> Columns {
-        let colors = if self.terms > 0 { Columns::SH } else { Columns::empty() };
-        Columns::POSITION | Columns::OPACITY | colors
+    fn varying(&self) -> Attributes {
+        let colors = if self.terms > 0 { Attributes::SH } else { Attributes::empty() };
+        Attributes::POSITION | Attributes::OPACITY | colors
     }
 
     /// Excludes scales and rotations of Gaussians with a 4D rotation: they follow from the 4D scales and rotation
     /// together.
-    fn movable(&self) -> Columns {
-        let mixed = if self.has_4d_rotation { Columns::ROTATION | Columns::LOG_SCALE } else { Columns::empty() };
-        Columns::all().difference(mixed)
+    fn movable(&self) -> Attributes {
+        let mixed =
+            if self.has_4d_rotation { Attributes::ROTATION | Attributes::LOG_SCALE } else { Attributes::empty() };
+        Attributes::all().difference(mixed)
     }
 
     #[inline(always)]
-    fn state(&self, time: f64, raw: &Raw, slices: &Slices, want: Columns, out: &mut Gaussians) -> Result<()> {
+    fn state(
+        &self,
+        time: f64,
+        raw: &StoredParams,
+        slices: &Slices,
+        want: Attributes,
+        out: &mut Gaussians,
+    ) -> Result<()> {
         let centers = raw.own.plane(TIME);
-        let mixed = if self.has_4d_rotation { Columns::ROTATION | Columns::LOG_SCALE } else { Columns::empty() };
-        copy_stored(raw, want.difference(Columns::POSITION | Columns::OPACITY | mixed), out);
-        if (want & mixed).contains(Columns::ROTATION) {
+        let mixed =
+            if self.has_4d_rotation { Attributes::ROTATION | Attributes::LOG_SCALE } else { Attributes::empty() };
+        copy_stored(raw, want.difference(Attributes::POSITION | Attributes::OPACITY | mixed), out);
+        if (want & mixed).contains(Attributes::ROTATION) {
             out.rotation.planes_mut().copy_from_slice(slices.rotation.planes());
         }
-        if (want & mixed).contains(Columns::LOG_SCALE) {
+        if (want & mixed).contains(Attributes::LOG_SCALE) {
             out.log_scale.planes_mut().copy_from_slice(slices.log_scale.planes());
         }
-        if want.contains(Columns::POSITION) {
+        if want.contains(Attributes::POSITION) {
             for (c, velocity) in slices.velocity.iter().enumerate() {
                 let from = raw.gaussians.position.plane(c).iter().zip(velocity).zip(centers);
                 out.position.plane_mut(c).iter_mut().zip(from).for_each(|(to, ((&x, &velocity), &center))| {
@@ -167,7 +176,7 @@ impl MotionModel for Native {
                 });
             }
         }
-        if want.contains(Columns::OPACITY) {
+        if want.contains(Attributes::OPACITY) {
             let log_cutoff = MIN_MARGINAL.ln();
             let from = centers.iter().zip(&slices.rates).zip(&slices.inverse_odds);
             out.opacity_logit.plane_mut(0).iter_mut().zip(from).for_each(|(to, ((&center, &rate), &inverse_odds))| {
@@ -176,7 +185,7 @@ impl MotionModel for Native {
                 *to = if exponent > log_cutoff { drawn } else { -MAX_LOGIT } as f32;
             });
         }
-        if want.contains(Columns::SH) && self.terms > 0 {
+        if want.contains(Attributes::SH) && self.terms > 0 {
             let waves = centers.iter().map(|&center| self.waves(time, f64::from(center)));
             let waves: (Vec<f64>, Vec<f64>) = waves.map(|[first, second]| (first, second)).unzip();
             for (term, waves) in [waves.0, waves.1].iter().enumerate().take(self.terms) {
@@ -191,16 +200,16 @@ impl MotionModel for Native {
         Ok(())
     }
 
-    fn jacobian(&self, time: f64, raw: &Raw, slices: &Slices, want: Columns) -> Result<Jacobian> {
+    fn jacobian(&self, time: f64, raw: &StoredParams, slices: &Slices, want: Attributes) -> Result<Jacobian> {
         let mut jacobian = Jacobian::default();
-        if want.contains(Columns::OPACITY) {
+        if want.contains(Attributes::OPACITY) {
             let log_cutoff = MIN_MARGINAL.ln();
             let windows = raw.own.plane(TIME).iter().zip(&slices.rates).zip(&slices.inverse_odds);
             let slopes = windows.map(|((&center, &rate), &inverse_odds)| {
                 let exponent = rate * (time - f64::from(center)).powi(2);
                 if exponent > log_cutoff { slope(inverse_odds, exponent) as f32 } else { 0.0 }
             });
-            *jacobian.column_mut(Columns::OPACITY) = Column::from_planes(1, slopes.collect());
+            *jacobian.column_mut(Attributes::OPACITY) = AttributeValues::from_planes(1, slopes.collect());
         }
         Ok(jacobian)
     }

@@ -22,7 +22,7 @@ use crate::compressed_model::Cluster;
 use crate::error::{Error, Result};
 use crate::files::checkpoint::{Checkpoint, Node, NodeId, Pickle};
 use crate::limits::ReadLimit;
-use crate::model::{Columns, Raw, sh_coefficients};
+use crate::model::{Attributes, StoredParams, sh_coefficients};
 use crate::models::input_model::{Conventions, InputModel, ModelFormat, OpenOptions};
 use crate::models::motion_model::MotionModelFrames;
 use crate::recipe::MergeParams;
@@ -202,7 +202,7 @@ fn open(description: ModelDescription, options: &OpenOptions) -> Result<Box<dyn 
     let terms = motion_model.as_ref().map_or(0, |motion_model| motion_model.terms);
     let own = if is_4d { TERMS + TERM_WIDTH * terms } else { 0 };
     let bands = sh_coefficients(degree);
-    let mut rest_elements = RowElement::all_of(Columns::SH, 3, 3 * (bands - 1));
+    let mut rest_elements = RowElement::all_of(Attributes::SH, 3, 3 * (bands - 1));
     rest_elements.extend(RowElement::own(TERMS, TERM_WIDTH * terms));
     rest_elements.resize(3 * (coefficients - 1), RowElement::Unread);
     let mut reader = CheckpointReader::new(checkpoint, count, degree, own)?;
@@ -210,12 +210,12 @@ fn open(description: ModelDescription, options: &OpenOptions) -> Result<Box<dyn 
         let (id, place) = part(i, name);
         reader.read(id, &place, row, planes)
     };
-    read(1, "xyz", &[3], RowElement::all_of(Columns::POSITION, 0, 3))?;
-    read(2, "features_dc", &[1, 3], RowElement::all_of(Columns::SH, 0, 3))?;
+    read(1, "xyz", &[3], RowElement::all_of(Attributes::POSITION, 0, 3))?;
+    read(2, "features_dc", &[1, 3], RowElement::all_of(Attributes::SH, 0, 3))?;
     read(3, "features_rest", &[coefficients - 1, 3], rest_elements)?;
-    read(4, "scaling", &[3], RowElement::all_of(Columns::LOG_SCALE, 0, 3))?;
-    read(5, "rotation", &[4], RowElement::all_of(Columns::ROTATION, 0, 4))?;
-    read(6, "opacity", &[1], RowElement::all_of(Columns::OPACITY, 0, 1))?;
+    read(4, "scaling", &[3], RowElement::all_of(Attributes::LOG_SCALE, 0, 3))?;
+    read(5, "rotation", &[4], RowElement::all_of(Attributes::ROTATION, 0, 4))?;
+    read(6, "opacity", &[1], RowElement::all_of(Attributes::OPACITY, 0, 1))?;
     if let Some(motion_model) = &motion_model {
         read(13, "t", &[1], RowElement::own(TIME, 1))?;
         read(14, "scaling_t", &[1], RowElement::own(SCALING_T, 1))?;
@@ -239,7 +239,7 @@ fn open(description: ModelDescription, options: &OpenOptions) -> Result<Box<dyn 
 }
 
 impl ProxyRule for Native {
-    fn propose(model: &MotionModelFrames<Native>, clusters: &[Cluster], rule: &MergeParams) -> Result<Raw> {
+    fn propose(model: &MotionModelFrames<Native>, clusters: &[Cluster], rule: &MergeParams) -> Result<StoredParams> {
         proxies::propose(model, clusters, rule)
     }
 

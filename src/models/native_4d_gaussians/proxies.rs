@@ -9,7 +9,7 @@ use super::frame_state::{Native, ROTATION_R, SCALING_T, TERM_WIDTH, TERMS, TIME}
 use super::rotation::{decomposed, quaternions};
 use crate::compressed_model::Cluster;
 use crate::error::Result;
-use crate::model::{Columns, Raw, scale_rotation};
+use crate::model::{Attributes, StoredParams, scale_rotation};
 use crate::models::in_checkpoint::linear::{LinearPath, match_proxies};
 use crate::models::motion_model::MotionModelFrames;
 use crate::recipe::MergeParams;
@@ -22,7 +22,11 @@ const RIDGE: f64 = 1e-3;
 ///
 /// # Errors
 /// Fails if frames cannot be evaluated.
-pub(super) fn propose(model: &MotionModelFrames<Native>, clusters: &[Cluster], rule: &MergeParams) -> Result<Raw> {
+pub(super) fn propose(
+    model: &MotionModelFrames<Native>,
+    clusters: &[Cluster],
+    rule: &MergeParams,
+) -> Result<StoredParams> {
     let (raw, motion_model) = (model.raw(), model.motion_model());
     let line = |id: u32| {
         let slice = motion_model.slice(raw, id as usize);
@@ -35,7 +39,7 @@ pub(super) fn propose(model: &MotionModelFrames<Native>, clusters: &[Cluster], r
     };
     let window = |line: &LinearPath, time: f64| motion_model.marginal(time, line.center, line.deviation.powi(2));
     let mut fits = vec![ThreeFunctionFit::default(); clusters.len()];
-    let matched = match_proxies(model, clusters, rule, line, window, Columns::SH, |seen| {
+    let matched = match_proxies(model, clusters, rule, line, window, Attributes::SH, |seen| {
         let [first, second] = motion_model.waves(seen.time, seen.line.center);
         let sh = &seen.state.sh;
         let values = (0..sh.width()).map(|c| f64::from(sh.plane(c)[seen.row]));
@@ -45,7 +49,7 @@ pub(super) fn propose(model: &MotionModelFrames<Native>, clusters: &[Cluster], r
     let mut proxies = raw.pick(&leaders);
     for (row, (matched, fit)) in matched.iter().zip(&fits).enumerate() {
         let Some((opacity, covariance)) = matched.shape else { continue };
-        let Raw { gaussians, own } = &mut proxies;
+        let StoredParams { gaussians, own } = &mut proxies;
         let LinearPath { position, velocity, center, deviation } = matched.line;
         let variance = deviation.powi(2);
         gaussians.position.set_row(row, position.map(|x| x as f32));

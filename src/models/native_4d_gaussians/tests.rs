@@ -5,7 +5,7 @@ use glam::{DMat3, DMat4, DVec4};
 
 use super::*;
 use crate::compressed_model::{Cluster, CompressedModel, ParamDelta, Reference};
-use crate::files::checkpoint::made::{Made, MadeTensor, named, tensor};
+use crate::files::checkpoint::made::{Made, PickledTensor, named, tensor};
 use crate::limits::Limits;
 use crate::limits::ReadLimit;
 use crate::model::{Gaussians, opacity};
@@ -27,7 +27,7 @@ fn noise(n: usize, seed: f64) -> Vec<f32> {
 }
 
 /// Returns the parameters of a test model, with their indices in the capture.
-fn parameters(turns: bool) -> Vec<(usize, MadeTensor)> {
+fn parameters(turns: bool) -> Vec<(usize, PickledTensor)> {
     let add = |values: Vec<f32>, by: f32| values.into_iter().map(|x| x + by).collect::<Vec<f32>>();
     let (n, shape) = (COUNT, |row: &[usize]| [&[COUNT], row].concat());
     let right: (&[usize], usize) = if turns { (&[4], 4) } else { (&[0], 0) };
@@ -50,7 +50,7 @@ fn capture(turns: bool) -> Vec<Made> {
     let mut parts = vec![Made::None; CAPTURE_LENGTH_4D];
     let mut state = Vec::new();
     for (k, (i, tensor)) in parameters(turns).into_iter().enumerate() {
-        let adam = |seed: f64, storage: usize| MadeTensor {
+        let adam = |seed: f64, storage: usize| PickledTensor {
             storage,
             ..self::tensor(0, &tensor.shape, &noise(tensor.bytes.len() / 4, seed))
         };
@@ -113,10 +113,10 @@ fn open(path: &Path) -> Box<dyn InputModel> {
 }
 
 fn states(model: &dyn InputModel) -> Vec<Gaussians> {
-    (0..TIMES.len()).map(|frame| gather_all(model.source(), frame, Columns::all()).unwrap()).collect()
+    (0..TIMES.len()).map(|frame| gather_all(model.source(), frame, Attributes::all()).unwrap()).collect()
 }
 
-fn floats(tensor: &MadeTensor, row: usize) -> Vec<f64> {
+fn floats(tensor: &PickledTensor, row: usize) -> Vec<f64> {
     let width = tensor.shape[1..].iter().product::<usize>();
     let values = tensor.bytes.as_chunks::<4>().0[row * width..][..width].iter();
     values.map(|&bytes| f64::from(f32::from_le_bytes(bytes))).collect()
@@ -128,7 +128,7 @@ fn rule() -> crate::recipe::MergeParams {
 
 /// Checks a row against an independent computation. The covariance of a slice is the inverse of the spatial block of
 /// the inverse of Σ₄. The rotation is computed by applying the quaternions to each axis.
-fn check(parameters: &[(usize, MadeTensor)], flipped: bool, row: usize, time: f64, state: &Gaussians) {
+fn check(parameters: &[(usize, PickledTensor)], flipped: bool, row: usize, time: f64, state: &Gaussians) {
     let values = |i: usize| floats(&parameters.iter().find(|part| part.0 == i).unwrap().1, row);
     let unit = |q: Vec<f64>| DVec4::from_slice(&q).normalize().to_array();
     let (l, r) = (unit(values(5)), unit(values(15)));
@@ -261,7 +261,7 @@ fn written_proxies_and_deltas_read_back() {
     let result = folder.written(&*model, &reduction);
     let whole = states(&*model);
     for (frame, state) in states(&*open(&result)).iter().enumerate() {
-        assert_eq!(*state, gather_all(&*shown, frame, Columns::all()).unwrap());
+        assert_eq!(*state, gather_all(&*shown, frame, Attributes::all()).unwrap());
         // A proxy of two equal Gaussians moves as they do.
         let [got, expected] = [(state, 0), (&whole[frame], 1)].map(|(state, row)| state.position.row::<3>(row));
         (0..3).for_each(|c| assert!((got[c] - expected[c]).abs() < 2e-6, "{got:?} {expected:?}"));
@@ -285,11 +285,11 @@ fn static_capture_is_read_as_static_model() {
     let root = folder.put(parts);
     let model = models::open(&root, &OpenOptions::default()).unwrap();
     assert_eq!(model.kind(), "3D Gaussian Splatting checkpoint");
-    let state = gather_all(model.source(), 0, Columns::all()).unwrap();
+    let state = gather_all(model.source(), 0, Attributes::all()).unwrap();
     assert_eq!(f64::from(state.sh.plane(5)[2]), floats(&tensor(0, &[COUNT, 45], &noise(45 * COUNT, 3.0)), 2)[2]);
     let result = folder.written(&*model, &CompressedModel::pruned(vec![2], &rule()));
     let left = models::open(&result, &OpenOptions::default()).unwrap();
-    assert_eq!(gather_all(left.source(), 0, Columns::all()).unwrap(), state.pick(&[2]));
+    assert_eq!(gather_all(left.source(), 0, Attributes::all()).unwrap(), state.pick(&[2]));
 }
 
 #[test]
@@ -332,7 +332,7 @@ fn errors_name_the_tensor_and_the_problem() {
         (|parts| parts[16] = Made::Int(1), &["(rot_4d)", "True or False", "1"]),
         (
             |parts| {
-                let long = MadeTensor {
+                let long = PickledTensor {
                     class: "LongStorage",
                     width: 8,
                     bytes: vec![0; 48 * COUNT],

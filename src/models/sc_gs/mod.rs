@@ -20,7 +20,7 @@ use super::deform_folder::{
 use crate::deform::{Encoded, Network, PredictedMotion};
 use crate::error::{Error, Result, quoted};
 use crate::model::functions::{exp, ln};
-use crate::model::{Column, Columns, Gaussians, Jacobian, Raw, logit, opacity};
+use crate::model::{AttributeValues, Attributes, Gaussians, Jacobian, StoredParams, logit, opacity};
 use crate::models::input_model::ModelFormat;
 use crate::models::motion_model::{MotionModel, copy_stored};
 use nodes::Nodes;
@@ -165,7 +165,7 @@ impl NodeMotion {
 
 impl CachedNodes {
     /// Returns the motion mask of a Gaussian, σ of its last feature; 1 without a mask.
-    fn mask(&self, raw: &Raw, row: usize) -> f64 {
+    fn mask(&self, raw: &StoredParams, row: usize) -> f64 {
         if self.has_mask { opacity(raw.own.plane(self.nodes.features())[row]) } else { 1.0 }
     }
 
@@ -178,7 +178,7 @@ impl CachedNodes {
             return Ok(Arc::clone(found));
         }
         let mut motion = PredictedMotion::default();
-        network.motion(&self.encoded, time, Columns::all(), &mut motion)?;
+        network.motion(&self.encoded, time, Attributes::all(), &mut motion)?;
         let motion = Arc::new(motion);
         let mut cache = cache();
         if !cache.iter().any(|(of, _)| *of == key) {
@@ -198,8 +198,8 @@ impl CachedNodes {
 
 /// Returns the sum of the rows of `output`, weighted by the node weights of each Gaussian. `each` is the number of nodes
 /// per Gaussian.
-fn blend(output: &Column, shares: &[(u32, f64)], each: usize) -> Column {
-    let mut out = Column::zeros(output.width(), shares.len() / each.max(1));
+fn blend(output: &AttributeValues, shares: &[(u32, f64)], each: usize) -> AttributeValues {
+    let mut out = AttributeValues::zeros(output.width(), shares.len() / each.max(1));
     for c in 0..output.width() {
         let plane = output.plane(c);
         for (out, shares) in out.plane_mut(c).iter_mut().zip(shares.chunks_exact(each)) {
@@ -211,23 +211,23 @@ fn blend(output: &Column, shares: &[(u32, f64)], each: usize) -> Column {
 
 impl NodeMotion {
     /// Returns the network's output for the columns `want` of a block.
-    fn motion(&self, time: f64, prepared: &PreparedNodes, want: Columns) -> Result<PredictedMotion> {
+    fn motion(&self, time: f64, prepared: &PreparedNodes, want: Attributes) -> Result<PredictedMotion> {
         let (mut motion, want) = (PredictedMotion::default(), want & self.network.active());
         match (prepared, &self.nodes) {
             _ if want.is_empty() => (),
             (PreparedNodes::Encoded(encoded), _) => self.network.motion(encoded, time, want, &mut motion)?,
             (PreparedNodes::Shares(shares), Some(sparse)) => {
                 let (of_nodes, each) = (sparse.motion(&self.network, time)?, sparse.nodes.nearest());
-                let blended = |column: Columns, output: &Column| match want.contains(column) {
+                let blended = |column: Attributes, output: &AttributeValues| match want.contains(column) {
                     true => blend(output, shares, each),
-                    false => Column::default(),
+                    false => AttributeValues::default(),
                 };
                 motion = PredictedMotion {
-                    warp: blended(Columns::POSITION, &of_nodes.warp),
-                    rotation: blended(Columns::ROTATION, &of_nodes.rotation),
-                    scaling: blended(Columns::LOG_SCALE, &of_nodes.scaling),
-                    opacity: blended(Columns::OPACITY, &of_nodes.opacity),
-                    color: blended(Columns::SH, &of_nodes.color),
+                    warp: blended(Attributes::POSITION, &of_nodes.warp),
+                    rotation: blended(Attributes::ROTATION, &of_nodes.rotation),
+                    scaling: blended(Attributes::LOG_SCALE, &of_nodes.scaling),
+                    opacity: blended(Attributes::OPACITY, &of_nodes.opacity),
+                    color: blended(Attributes::SH, &of_nodes.color),
                 };
             }
             (PreparedNodes::Shares(_), None) => {
@@ -241,7 +241,7 @@ impl NodeMotion {
 impl MotionModel for NodeMotion {
     type Prepared = PreparedNodes;
 
-    fn prepare(&self, raw: &Raw) -> PreparedNodes {
+    fn prepare(&self, raw: &StoredParams) -> PreparedNodes {
         let Some(sparse) = &self.nodes else {
             return PreparedNodes::Encoded(self.network.encode(&raw.gaussians.position));
         };
@@ -255,41 +255,48 @@ impl MotionModel for NodeMotion {
         PreparedNodes::Shares(all)
     }
 
-    fn varying(&self) -> Columns {
+    fn varying(&self) -> Attributes {
         self.network.active()
     }
 
-    fn movable(&self) -> Columns {
-        Columns::all()
+    fn movable(&self) -> Attributes {
+        Attributes::all()
     }
 
     #[inline(always)]
-    fn state(&self, time: f64, raw: &Raw, prepared: &PreparedNodes, want: Columns, out: &mut Gaussians) -> Result<()> {
+    fn state(
+        &self,
+        time: f64,
+        raw: &StoredParams,
+        prepared: &PreparedNodes,
+        want: Attributes,
+        out: &mut Gaussians,
+    ) -> Result<()> {
         let motion = self.motion(time, prepared, want)?;
         copy_stored(raw, want, out);
         for column in want.iter() {
             let to = out.column_mut(column);
             match column {
-                Columns::POSITION => add(&motion.warp, to),
-                Columns::ROTATION => add(&motion.rotation, to),
-                Columns::LOG_SCALE => each(&motion.scaling, to, |log, by| {
+                Attributes::POSITION => add(&motion.warp, to),
+                Attributes::ROTATION => add(&motion.rotation, to),
+                Attributes::LOG_SCALE => each(&motion.scaling, to, |log, by| {
                     let log = f64::from(log);
                     let log = if log > MAX_LOG_SCALE { MAX_LOG_SCALE } else { log };
                     let log = if log < -MAX_LOG_SCALE { -MAX_LOG_SCALE } else { log };
                     ln((exp(log) + f64::from(by)).abs().max(MIN_SCALE)) as f32
                 }),
-                Columns::OPACITY => each(&motion.opacity, to, |logit, by| add_to_opacity(logit, by) as f32),
+                Attributes::OPACITY => each(&motion.opacity, to, |logit, by| add_to_opacity(logit, by) as f32),
                 _ => add(&motion.color, to),
             }
         }
         Ok(())
     }
 
-    fn jacobian(&self, time: f64, raw: &Raw, prepared: &PreparedNodes, want: Columns) -> Result<Jacobian> {
+    fn jacobian(&self, time: f64, raw: &StoredParams, prepared: &PreparedNodes, want: Attributes) -> Result<Jacobian> {
         let mut found = Jacobian::default();
-        let motion = self.motion(time, prepared, want.difference(Columns::POSITION))?;
-        if want.contains(Columns::POSITION) {
-            *found.column_mut(Columns::POSITION) = match &self.nodes {
+        let motion = self.motion(time, prepared, want.difference(Attributes::POSITION))?;
+        if want.contains(Attributes::POSITION) {
+            *found.column_mut(Attributes::POSITION) = match &self.nodes {
                 Some(sparse) => position_slopes(sparse, &self.network, raw, time)?,
                 None => {
                     let mut slopes = self.network.slopes(&raw.gaussians.position, time)?;
@@ -298,9 +305,9 @@ impl MotionModel for NodeMotion {
                 }
             };
         }
-        if want.contains(Columns::LOG_SCALE) {
+        if want.contains(Attributes::LOG_SCALE) {
             // Each scale depends on its own stored value only.
-            let mut out = Column::zeros(9, raw.len());
+            let mut out = AttributeValues::zeros(9, raw.len());
             for c in 0..3 {
                 let pairs = raw.gaussians.log_scale.plane(c).iter().zip(motion.scaling.plane(c));
                 for (out, (&log, &by)) in out.plane_mut(4 * c).iter_mut().zip(pairs) {
@@ -308,29 +315,29 @@ impl MotionModel for NodeMotion {
                     *out = if (own + by).abs() > MIN_SCALE { (own / (own + by)) as f32 } else { 0.0 };
                 }
             }
-            *found.column_mut(Columns::LOG_SCALE) = out;
+            *found.column_mut(Attributes::LOG_SCALE) = out;
         }
-        if want.contains(Columns::OPACITY) && !motion.opacity.is_empty() {
+        if want.contains(Attributes::OPACITY) && !motion.opacity.is_empty() {
             let mut out = raw.gaussians.opacity_logit.clone();
             each(&motion.opacity, &mut out, |logit, by| {
                 let (own, state) = (opacity(logit), add_to_opacity(logit, by));
                 let whole = opacity(state as f32);
                 if state.abs() < MAX_LOGIT { (own * (1.0 - own) / (whole * (1.0 - whole))) as f32 } else { 0.0 }
             });
-            *found.column_mut(Columns::OPACITY) = out;
+            *found.column_mut(Attributes::OPACITY) = out;
         }
         Ok(found)
     }
 }
 
 /// Adds `by` to the first planes of `to`. Does nothing if `by` is empty.
-fn add(by: &Column, to: &mut Column) {
+fn add(by: &AttributeValues, to: &mut AttributeValues) {
     each(by, to, |value, by| value + by);
 }
 
 /// Replaces each value of the planes that `by` has by `f` of it and the value of `by`.
 #[inline(always)]
-fn each(by: &Column, to: &mut Column, f: impl Fn(f32, f32) -> f32) {
+fn each(by: &AttributeValues, to: &mut AttributeValues, f: impl Fn(f32, f32) -> f32) {
     for c in 0..by.width().min(to.width()) {
         to.plane_mut(c).iter_mut().zip(by.plane(c)).for_each(|(value, &by)| *value = f(*value, by));
     }
@@ -343,9 +350,9 @@ fn add_to_opacity(stored: f32, by: f32) -> f64 {
 }
 
 /// Returns the derivatives of positions that follow nodes, whose node weights depend on the position.
-fn position_slopes(sparse: &CachedNodes, network: &Network, raw: &Raw, time: f64) -> Result<Column> {
+fn position_slopes(sparse: &CachedNodes, network: &Network, raw: &StoredParams, time: f64) -> Result<AttributeValues> {
     let motion = sparse.motion(network, time)?;
-    let (mut out, mut shares) = (Column::zeros(9, raw.len()), Vec::new());
+    let (mut out, mut shares) = (AttributeValues::zeros(9, raw.len()), Vec::new());
     for row in 0..raw.len() {
         shares.clear();
         sparse.nodes.shares(raw, row, &mut shares);

@@ -8,7 +8,7 @@ use std::path::Path;
 
 use crate::deform::{Tensor, Tensors};
 use crate::error::{Error, Result};
-use crate::model::{Column, Raw, opacity};
+use crate::model::{AttributeValues, StoredParams, opacity};
 
 /// Value added to every kernel before normalization.
 const FLOOR: f64 = 1e-7;
@@ -87,13 +87,13 @@ impl Nodes {
     }
 
     /// Returns the canonical positions of the nodes, `[M, 3]`.
-    pub(super) fn position(&self) -> Column {
+    pub(super) fn position(&self) -> AttributeValues {
         let planes = (0..3).flat_map(|c| self.values.iter().skip(c).step_by(self.width).copied());
-        Column::from_planes(3, planes.collect())
+        AttributeValues::from_planes(3, planes.collect())
     }
 
     /// Appends the nodes that move Gaussian `row` of `raw` to `out`, nearest first.
-    pub(super) fn shares(&self, raw: &Raw, row: usize, out: &mut Vec<Share>) {
+    pub(super) fn shares(&self, raw: &StoredParams, row: usize, out: &mut Vec<Share>) {
         let mut at: Vec<f32> = raw.gaussians.position.row::<3>(row).to_vec();
         at.extend((0..self.features()).map(|k| raw.own.plane(k)[row]));
         let mut nearest: Vec<(f64, u32)> = Vec::with_capacity(self.nearest + 1);

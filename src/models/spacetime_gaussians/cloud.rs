@@ -10,9 +10,9 @@ use super::decoder::ColorActivation;
 use super::frame_state::{FEATURES, FULL_WIDTH, MOTION, OMEGA, WIDTH};
 use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result};
-use crate::files::ply::write::{out_rows, put, value, write_rows_like};
+use crate::files::ply::write::{put, rows_of_model, value, write_rows_like};
 use crate::files::ply::{PlaneSource, Ply, PlyEncoding, PlyOptions, Property};
-use crate::model::{Column, Columns, Raw, SH_C0, harmonic};
+use crate::model::{AttributeValues, Attributes, SH_C0, StoredParams, harmonic};
 
 /// Name of a property that no other format has.
 pub(super) const MARKER_PROPERTY: &str = "trbf_center";
@@ -21,7 +21,7 @@ pub(super) const MARKER_PROPERTY: &str = "trbf_center";
 #[derive(Debug)]
 pub(super) struct PointCloudFile {
     ply: Ply,
-    /// Property of each plane of [`Raw::own`].
+    /// Property of each plane of [`StoredParams::own`].
     own: Vec<Property>,
 }
 
@@ -74,18 +74,18 @@ impl PointCloudFile {
     ///
     /// # Errors
     /// Fails if a value is not finite or the file was cut short since it was opened.
-    pub(super) fn raw(&self, activation: ColorActivation) -> Result<Raw> {
+    pub(super) fn raw(&self, activation: ColorActivation) -> Result<StoredParams> {
         let count = self.ply.count();
-        let mut raw = Raw { gaussians: self.ply.whole()?, own: Column::zeros(0, count) };
+        let mut raw = StoredParams { gaussians: self.ply.whole()?, own: AttributeValues::zeros(0, count) };
         let mut own = Vec::with_capacity(self.own.len() * count);
         for property in &self.own {
             own.extend(self.ply.values(&property.name)?.unwrap_or_default());
         }
         raw.own = match own.is_empty() {
-            true => Column::zeros(self.own.len(), 0),
-            false => Column::from_planes(self.own.len(), own),
+            true => AttributeValues::zeros(self.own.len(), 0),
+            false => AttributeValues::from_planes(self.own.len(), own),
         };
-        for column in Columns::all().iter() {
+        for column in Attributes::all().iter() {
             let names = self.ply.layout().planes(column).iter().map(|plane| match plane {
                 PlaneSource::Property(property) => property.name.as_str(),
                 PlaneSource::Thin => "scale_2",
@@ -127,14 +127,15 @@ impl PointCloudFile {
     /// # Errors
     /// Fails if the file was cut short since it was opened or a write fails.
     pub(super) fn write(&self, reduction: &CompressedModel, path: &Path) -> Result<()> {
-        let (layout, rows) = (self.ply.layout(), out_rows(reduction));
+        let (layout, rows) = (self.ply.layout(), rows_of_model(reduction));
         let big_endian = self.ply.header().encoding == PlyEncoding::BigEndian;
         let (proxies, by) = (reduction.proxies.raw.as_ref(), &reduction.change.0);
-        let places = |column: Columns| layout.planes(column).iter().enumerate();
-        let columns: Vec<Columns> = Columns::all().iter().filter(|&of| of != Columns::SH || !self.is_full()).collect();
+        let places = |column: Attributes| layout.planes(column).iter().enumerate();
+        let columns: Vec<Attributes> =
+            Attributes::all().iter().filter(|&of| of != Attributes::SH || !self.is_full()).collect();
         // The lite model stores colors, not SH coefficients.
-        let color_scale = |column: Columns| if column == Columns::SH { SH_C0 } else { 1.0 };
-        let color_offset = |column: Columns| if column == Columns::SH { 0.5 } else { 0.0 };
+        let color_scale = |column: Attributes| if column == Attributes::SH { SH_C0 } else { 1.0 };
+        let color_offset = |column: Attributes| if column == Attributes::SH { 0.5 } else { 0.0 };
         write_rows_like(
             &self.ply,
             &reduction.kept,
@@ -175,7 +176,7 @@ impl PointCloudFile {
     }
 }
 
-/// Returns the property names of the planes of [`Raw::own`].
+/// Returns the property names of the planes of [`StoredParams::own`].
 fn own_property_names(is_full: bool) -> Vec<String> {
     let numbered = |name: &'static str, count: usize| (0..count).map(move |k| format!("{name}_{k}"));
     let mut names: Vec<String> = vec![MARKER_PROPERTY.to_owned(), "trbf_scale".to_owned()];
@@ -188,7 +189,7 @@ fn own_property_names(is_full: bool) -> Vec<String> {
 
 /// Replaces stored colors by SH coefficients of degree 0. With `activation`, the color is `activation` of the first features;
 /// without, it is the stored color, which the PLY reader put where a coefficient would be.
-fn set_colors(raw: &mut Raw, activation: Option<ColorActivation>) {
+fn set_colors(raw: &mut StoredParams, activation: Option<ColorActivation>) {
     for c in 0..3 {
         let features = raw.own.width() > FEATURES;
         let from: Vec<f32> = if features { raw.own.plane(FEATURES + c) } else { raw.gaussians.sh.plane(c) }.to_vec();

@@ -1,7 +1,7 @@
 //! Functions shared by model folders and `.splatv`.
 
 use crate::error::{Error, Result};
-use crate::model::{Columns, Jacobian};
+use crate::model::{Attributes, Jacobian};
 use crate::models::input_model::MemoryProfile;
 use crate::models::trajectories::{NO_ARCHIVE, state_bytes};
 use crate::outputs::container::GAUSSIAN_BLOCK;
@@ -9,7 +9,7 @@ use crate::outputs::kind::OutputKind;
 
 /// Returns the memory profile of an open model with `width` planes of format-specific parameters.
 pub(super) fn residence(width: usize) -> MemoryProfile {
-    let whole = state_bytes(0, Columns::all()) + 4 * width as u64;
+    let whole = state_bytes(0, Attributes::all()) + 4 * width as u64;
     MemoryProfile {
         per_gaussian: whole,
         opening: whole,

@@ -1,12 +1,12 @@
 //! Computation of frame states from the stored parameters of a model: [`SpacetimeMotion`] and its temporal window.
 //!
-//! [`Raw::gaussians`] holds position, quaternion, log scales and opacity logit as stored, and the color as SH of degree
-//! 0. [`Raw::own`] holds the planes named here.
+//! [`StoredParams::gaussians`] holds position, quaternion, log scales and opacity logit as stored, and the color as SH of degree
+//! 0. [`StoredParams::own`] holds the planes named here.
 
 use super::decoder::{self, ColorDecoder};
 use super::motion::SpacetimeMotion;
 use crate::error::Result;
-use crate::model::{Column, Columns, Gaussians, Jacobian, Raw};
+use crate::model::{AttributeValues, Attributes, Gaussians, Jacobian, StoredParams};
 use crate::models::motion_model::window::{faded_logit, inverse_odds, slope};
 use crate::models::motion_model::{MotionModel, Shading, copy_stored};
 
@@ -18,19 +18,19 @@ pub(super) const LOG_WIDTH: usize = 1;
 pub(super) const MOTION: usize = 2;
 /// First of four planes: change of the quaternion per unit of time.
 pub(super) const OMEGA: usize = 11;
-/// Number of planes of [`Raw::own`] that both variants have.
+/// Number of planes of [`StoredParams::own`] that both variants have.
 pub(super) const WIDTH: usize = 15;
 /// First of six planes of the full model: features that are constant in time. The first three are a color before the
 /// last function.
 pub(super) const FEATURES: usize = 15;
 /// First of three planes of the full model: features per unit of time.
 pub(super) const FEATURES_IN_TIME: usize = 21;
-/// Number of planes of [`Raw::own`] of the full model.
+/// Number of planes of [`StoredParams::own`] of the full model.
 pub(super) const FULL_WIDTH: usize = 24;
 
 impl SpacetimeMotion {
     /// Returns the motion of Gaussian `row`.
-    pub(super) fn from_raw(raw: &Raw, row: usize) -> SpacetimeMotion {
+    pub(super) fn from_raw(raw: &StoredParams, row: usize) -> SpacetimeMotion {
         let own = |plane: usize| f64::from(raw.own.plane(plane)[row]);
         let path = |k: usize| std::array::from_fn(|c| own(MOTION + 3 * k + c));
         SpacetimeMotion {
@@ -43,7 +43,7 @@ impl SpacetimeMotion {
     }
 
     /// Stores the motion as that of Gaussian `row`, rounded to f32.
-    pub(super) fn write(&self, raw: &mut Raw, row: usize) {
+    pub(super) fn write(&self, raw: &mut StoredParams, row: usize) {
         let mut own = |plane: usize, value: f64| raw.own.plane_mut(plane)[row] = value as f32;
         own(CENTER, self.center);
         own(LOG_WIDTH, self.log_width);
@@ -56,7 +56,7 @@ impl SpacetimeMotion {
     }
 }
 
-/// Motion model of both variants. Colors of the full variant are those of [`Raw::gaussians`], without the network.
+/// Motion model of both variants. Colors of the full variant are those of [`StoredParams::gaussians`], without the network.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Spacetime {
     /// Whether pixel colors are computed from features by a network (full model).
@@ -83,34 +83,34 @@ fn window_exponent(dt: f64, inverse_squared: f64) -> f64 {
 impl MotionModel for Spacetime {
     type Prepared = PreparedGaussian;
 
-    fn prepare(&self, raw: &Raw) -> PreparedGaussian {
+    fn prepare(&self, raw: &StoredParams) -> PreparedGaussian {
         PreparedGaussian {
             inverse_squared: raw.own.plane(LOG_WIDTH).iter().map(|&log| (-2.0 * f64::from(log)).exp()).collect(),
             inverse_odds: raw.gaussians.opacity_logit.plane(0).iter().map(|&logit| inverse_odds(logit)).collect(),
         }
     }
 
-    fn varying(&self) -> Columns {
-        Columns::POSITION | Columns::ROTATION | Columns::OPACITY
+    fn varying(&self) -> Attributes {
+        Attributes::POSITION | Attributes::ROTATION | Attributes::OPACITY
     }
 
     /// Excludes the colors of the full model: they are computed from features, so no derivative leads to them.
-    fn movable(&self) -> Columns {
-        if self.is_full { Columns::all().difference(Columns::SH) } else { Columns::all() }
+    fn movable(&self) -> Attributes {
+        if self.is_full { Attributes::all().difference(Attributes::SH) } else { Attributes::all() }
     }
 
     #[inline(always)]
     fn state(
         &self,
         time: f64,
-        raw: &Raw,
+        raw: &StoredParams,
         prepared: &PreparedGaussian,
-        want: Columns,
+        want: Attributes,
         out: &mut Gaussians,
     ) -> Result<()> {
         let (stored, own, centers) = (&raw.gaussians, &raw.own, raw.own.plane(CENTER));
         let since = |center: &f32| time - f64::from(*center);
-        if want.contains(Columns::POSITION) {
+        if want.contains(Attributes::POSITION) {
             for c in 0..3 {
                 let [m1, m2, m3] = [0, 1, 2].map(|k| own.plane(MOTION + 3 * k + c));
                 let terms = stored.position.plane(c).iter().zip(m1).zip(m2).zip(m3);
@@ -121,7 +121,7 @@ impl MotionModel for Spacetime {
                 });
             }
         }
-        if want.contains(Columns::ROTATION) {
+        if want.contains(Attributes::ROTATION) {
             for c in 0..4 {
                 let terms = stored.rotation.plane(c).iter().zip(own.plane(OMEGA + c));
                 let to = out.rotation.plane_mut(c).iter_mut().zip(terms).zip(centers);
@@ -130,7 +130,7 @@ impl MotionModel for Spacetime {
                 });
             }
         }
-        if want.contains(Columns::OPACITY) {
+        if want.contains(Attributes::OPACITY) {
             let values = centers.iter().zip(&prepared.inverse_squared).zip(&prepared.inverse_odds);
             out.opacity_logit.plane_mut(0).iter_mut().zip(values).for_each(
                 |(to, ((center, &inverse_squared), &inverse_odds))| {
@@ -142,15 +142,22 @@ impl MotionModel for Spacetime {
         Ok(())
     }
 
-    fn jacobian(&self, time: f64, raw: &Raw, prepared: &PreparedGaussian, want: Columns) -> Result<Jacobian> {
+    fn jacobian(
+        &self,
+        time: f64,
+        raw: &StoredParams,
+        prepared: &PreparedGaussian,
+        want: Attributes,
+    ) -> Result<Jacobian> {
         let mut found = Jacobian::default();
-        if want.contains(Columns::OPACITY) {
+        if want.contains(Attributes::OPACITY) {
             let centers = raw.own.plane(CENTER);
             let derivative = |row: usize| {
                 let dt = time - f64::from(centers[row]);
                 slope(prepared.inverse_odds[row], window_exponent(dt, prepared.inverse_squared[row])) as f32
             };
-            *found.column_mut(Columns::OPACITY) = Column::from_planes(1, (0..raw.len()).map(derivative).collect());
+            *found.column_mut(Attributes::OPACITY) =
+                AttributeValues::from_planes(1, (0..raw.len()).map(derivative).collect());
         }
         Ok(found)
     }
@@ -162,8 +169,8 @@ impl MotionModel for Spacetime {
 
 impl Shading for Spacetime {
     /// Returns six constant features and three that grow with the time since the center.
-    fn features(&self, time: f64, raw: &Raw) -> Column {
-        let mut found = Column::zeros(decoder::FEATURES, raw.len());
+    fn features(&self, time: f64, raw: &StoredParams) -> AttributeValues {
+        let mut found = AttributeValues::zeros(decoder::FEATURES, raw.len());
         let centers = raw.own.plane(CENTER);
         for plane in 0..FEATURES_IN_TIME - FEATURES {
             found.plane_mut(plane).copy_from_slice(raw.own.plane(FEATURES + plane));

@@ -22,7 +22,7 @@ use xxhash_rust::xxh3::Xxh3;
 
 use super::files::copy;
 use super::iterations::find_iteration;
-use super::size::{Size, bytes_below, bytes_of};
+use super::size::{Size, bytes_below, bytes_read_for};
 use super::trajectories::{NO_ARCHIVE, write_sequence};
 use crate::compressed_model::{Cluster, CompressedModel, Proxies, Reference};
 use crate::error::{Error, Result, quoted};
@@ -33,7 +33,7 @@ use crate::files::python_literal::{Literal, parse_call};
 use crate::files::state_dict::read_state_dict;
 use crate::files::text::read_text;
 use crate::limits::Limits;
-use crate::model::{Raw, color};
+use crate::model::{StoredParams, color};
 use crate::models::input_model::{InputModel, MemoryProfile, ModelFormat, OpenOptions, Timing};
 use crate::models::motion_model::{MotionModelFrames, compressed_raw, solve};
 use crate::outputs::kind::OutputKind;
@@ -220,7 +220,7 @@ impl SpacetimeGaussians {
 
 /// Returns a note with the number of Gaussians whose color is negative: the authors' renderer adds such colors, others
 /// clamp them to 0.
-fn negative_color_note(raw: &Raw) -> Option<String> {
+fn negative_color_note(raw: &StoredParams) -> Option<String> {
     let is_negative = |row: usize| raw.gaussians.sh.row::<3>(row).iter().any(|&harmonic| color(harmonic) < 0.0);
     let count = (0..raw.len()).filter(|&row| is_negative(row)).count();
     (count > 0).then(|| {
@@ -253,7 +253,8 @@ impl InputModel for SpacetimeGaussians {
 
     fn size(&self) -> Result<Size> {
         let other = self.files.other_files();
-        let (cloud, rest) = (bytes_of([&*self.files.cloud])?, bytes_of(other.iter().map(PathBuf::as_path))?);
+        let (cloud, rest) =
+            (bytes_read_for([&*self.files.cloud])?, bytes_read_for(other.iter().map(PathBuf::as_path))?);
         Ok(Size { cloud, rest, ..Size::default() })
     }
 
@@ -261,10 +262,11 @@ impl InputModel for SpacetimeGaussians {
         match kind {
             OutputKind::Model => Files::find(path, &OpenOptions::default()).and_then(|files| {
                 let other = files.other_files();
-                let (cloud, rest) = (bytes_of([&*files.cloud])?, bytes_of(other.iter().map(PathBuf::as_path))?);
+                let (cloud, rest) =
+                    (bytes_read_for([&*files.cloud])?, bytes_read_for(other.iter().map(PathBuf::as_path))?);
                 Ok(Size { cloud, rest, ..Size::default() })
             }),
-            OutputKind::Ply | OutputKind::Splatv => Ok(Size { cloud: bytes_of([path])?, ..Size::default() }),
+            OutputKind::Ply | OutputKind::Splatv => Ok(Size { cloud: bytes_read_for([path])?, ..Size::default() }),
             _ => Ok(Size::of_frames(bytes_below(path)?)),
         }
     }

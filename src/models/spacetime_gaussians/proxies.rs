@@ -16,7 +16,7 @@ use crate::compressed_model::Cluster;
 use crate::error::Result;
 use crate::merging::moments::{WeightedGaussian, align_axes, moments};
 use crate::merging::proxy::merge_state;
-use crate::model::{Columns, Gaussians, Raw, harmonic, opacity};
+use crate::model::{Attributes, Gaussians, StoredParams, harmonic, opacity};
 use crate::models::motion_model::{MotionModel, MotionModelFrames};
 use crate::recipe::MergeParams;
 use crate::source::FrameSource;
@@ -40,10 +40,10 @@ pub(super) fn propose(
     clusters: &[Cluster],
     rule: &MergeParams,
     activation: ColorActivation,
-) -> Result<Raw> {
+) -> Result<StoredParams> {
     let leaders: Vec<u32> = clusters.iter().map(|cluster| cluster.leader).collect();
     let mut raw = model.raw().pick(&leaders);
-    let made: Vec<Raw> =
+    let made: Vec<StoredParams> =
         clusters.par_iter().map(|cluster| proxy_parameters(model, cluster, rule, activation)).collect::<Result<_>>()?;
     made.iter().enumerate().for_each(|(row, made)| raw.set_row(row, made, 0));
     Ok(raw)
@@ -52,7 +52,7 @@ pub(super) fn propose(
 /// Members of a cluster, with values that are used repeatedly.
 struct ClusterMembers<'a> {
     model: &'a MotionModelFrames<Spacetime>,
-    raw: Raw,
+    raw: StoredParams,
     prepared: <Spacetime as MotionModel>::Prepared,
     /// Weight and motion of each member.
     motions: Vec<(f64, SpacetimeMotion)>,
@@ -77,7 +77,7 @@ impl ClusterMembers<'_> {
     /// Returns the states of all members at `time`.
     fn state(&self, time: f64) -> Result<Gaussians> {
         let mut state = Gaussians::zeros(self.raw.len(), self.raw.gaussians.sh_degree());
-        self.model.motion_model().state(time, &self.raw, &self.prepared, Columns::all(), &mut state)?;
+        self.model.motion_model().state(time, &self.raw, &self.prepared, Attributes::all(), &mut state)?;
         Ok(state)
     }
 
@@ -101,7 +101,7 @@ fn proxy_parameters(
     cluster: &Cluster,
     rule: &MergeParams,
     activation: ColorActivation,
-) -> Result<Raw> {
+) -> Result<StoredParams> {
     let members = ClusterMembers::new(model, cluster);
     let (center, log_width) = merged_window(&members.motions);
     let recentered: Vec<(f64, SpacetimeMotion)> =
@@ -221,7 +221,7 @@ fn amplitude(
 ) -> f64 {
     let (mut of, mut by) = (0.0, 0.0);
     for (state, &time) in states.iter().zip(times) {
-        let merged = merge_state(&members.rows, state, members.leader, rule, Columns::OPACITY);
+        let merged = merge_state(&members.rows, state, members.leader, rule, Attributes::OPACITY);
         let window = motion.window(time);
         of += window * opacity(merged.opacity_logit as f32);
         by += window * window;

@@ -19,15 +19,15 @@ use crate::files::cameras::Clock;
 use crate::files::defects::Defects;
 use crate::files::digest::hash_file;
 use crate::files::json::read_json;
-use crate::files::splatv::rows::{inspect, is_unturned, repair};
-use crate::files::splatv::write::{measure, seen_whole, words, write as write_file};
+use crate::files::splatv::rows::{has_zero_quaternion, inspect, repair};
+use crate::files::splatv::write::{default_cameras, measure, words, write as write_file};
 use crate::files::splatv::{MAGIC, Splatv, SplatvGaussian};
 use crate::limits::Limits;
-use crate::model::{Column, Columns, Gaussians, Raw, color, harmonic, logit, opacity};
+use crate::model::{AttributeValues, Attributes, Gaussians, StoredParams, color, harmonic, logit, opacity};
 use crate::models::input_model::{InputModel, MemoryProfile, ModelFormat, OpenOptions, Timing};
 use crate::models::motion_model::window::MAX_LOGIT;
 use crate::models::motion_model::{MotionModelFrames, compressed_raw, solve};
-use crate::models::size::{Size, bytes_below, bytes_of};
+use crate::models::size::{Size, bytes_below, bytes_read_for};
 use crate::models::trajectories::write_sequence;
 use crate::outputs::kind::OutputKind;
 use crate::progress::Events;
@@ -67,14 +67,14 @@ impl SplatvModel {
     fn open(path: &Path, options: &OpenOptions) -> Result<SplatvModel> {
         let file = Splatv::open(path)?;
         // Parameters and the row number.
-        let values = (Columns::all().width(0) + WIDTH + 1) as u64;
+        let values = (Attributes::all().width(0) + WIDTH + 1) as u64;
         options.memory.check(path, "its texture", "the Gaussians of the file", 4 * values * file.count() as u64)?;
         let zero_rotation = options.conventions.zero_rotation.unwrap_or_default();
         let (defects, rows) = inspect(&file, zero_rotation)?;
         let count = file.count() - defects.dropped;
-        let mut raw = Raw { gaussians: Gaussians::zeros(count, 0), own: Column::zeros(WIDTH, count) };
+        let mut raw = StoredParams { gaussians: Gaussians::zeros(count, 0), own: AttributeValues::zeros(WIDTH, count) };
         for i in 0..count {
-            set_from_row(&mut raw, i, &SplatvGaussian::of_words(&file.words(file_row(rows.as_deref(), i))));
+            set_from_row(&mut raw, i, &SplatvGaussian::from_words(&file.words(file_row(rows.as_deref(), i))));
         }
         let model = MotionModelFrames::new(Spacetime { is_full: false, decoder: None }, raw, 0);
         Ok(SplatvModel { file, rows, defects, model })
@@ -87,10 +87,10 @@ fn file_row(rows: Option<&[u32]>, i: usize) -> usize {
 }
 
 /// Sets Gaussian `i` to the values of `row`.
-fn set_from_row(raw: &mut Raw, i: usize, row: &SplatvGaussian) {
+fn set_from_row(raw: &mut StoredParams, i: usize, row: &SplatvGaussian) {
     let log = |length: f32| f64::from(length).max(MIN_LENGTH).ln() as f32;
     raw.gaussians.position.set_row(i, row.position);
-    raw.gaussians.rotation.set_row(i, if is_unturned(row) { [1.0, 0.0, 0.0, 0.0] } else { row.rotation });
+    raw.gaussians.rotation.set_row(i, if has_zero_quaternion(row) { [1.0, 0.0, 0.0, 0.0] } else { row.rotation });
     // Players square the scales, so the sign has no effect.
     raw.gaussians.log_scale.set_row(i, row.scale.map(|scale| log(scale.abs())));
     raw.gaussians.opacity_logit.set_row(i, [logit(row.opacity).clamp(-MAX_LOGIT, MAX_LOGIT) as f32]);
@@ -103,7 +103,7 @@ fn set_from_row(raw: &mut Raw, i: usize, row: &SplatvGaussian) {
 }
 
 /// Returns Gaussian `i` as a row of a `.splatv`.
-fn to_row(raw: &Raw, i: usize) -> SplatvGaussian {
+fn to_row(raw: &StoredParams, i: usize) -> SplatvGaussian {
     let own = |plane: usize| raw.own.plane(plane)[i];
     SplatvGaussian {
         position: raw.gaussians.position.row(i),
@@ -124,7 +124,7 @@ fn to_row(raw: &Raw, i: usize) -> SplatvGaussian {
 /// # Errors
 /// Fails if half precision cannot hold the values or a write fails.
 pub(super) fn write(
-    raw: &Raw,
+    raw: &StoredParams,
     known: impl Fn(usize) -> Option<[f32; 3]>,
     cameras: Option<&Path>,
     path: &Path,
@@ -133,7 +133,7 @@ pub(super) fn write(
     let is_small = |path: &&Path| fs::metadata(path).is_ok_and(|found| found.len() <= MAX_LISTED);
     let listed = cameras.filter(is_small).map(|path| read_json(path, MAX_LISTED)).transpose()?;
     let listed = listed.filter(|cameras| !cameras[0]["rotation"].is_null());
-    let cameras = listed.unwrap_or_else(|| seen_whole(&raw.gaussians.position));
+    let cameras = listed.unwrap_or_else(|| default_cameras(&raw.gaussians.position));
     let output_row = |i: usize| {
         let row = to_row(raw, i);
         SplatvGaussian { rgb: known(i).map_or(row.rgb, |rgb| rgb.map(f64::from)), ..row }
@@ -160,7 +160,7 @@ impl InputModel for SplatvModel {
     }
 
     fn bytes(&self) -> Result<u64> {
-        bytes_of([self.file.path()])
+        bytes_read_for([self.file.path()])
     }
 
     fn size(&self) -> Result<Size> {
@@ -169,7 +169,7 @@ impl InputModel for SplatvModel {
 
     fn size_written(&self, kind: OutputKind, path: &Path) -> Result<Size> {
         match kind {
-            OutputKind::Splatv => Ok(Size { cloud: bytes_of([path])?, ..Size::default() }),
+            OutputKind::Splatv => Ok(Size { cloud: bytes_read_for([path])?, ..Size::default() }),
             _ => Ok(Size::of_frames(bytes_below(path)?)),
         }
     }

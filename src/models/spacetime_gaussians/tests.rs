@@ -3,7 +3,7 @@ use crate::compressed_model::ParamDelta;
 use crate::deform::Tensors;
 use crate::files::splatv::{Splatv, SplatvGaussian};
 use crate::files::state_dict::{StoredTensor, TensorValues, write_state_dict};
-use crate::model::{Column, Columns, Gaussians};
+use crate::model::{AttributeValues, Attributes, Gaussians};
 use crate::models;
 use crate::models::OpenOptions;
 use crate::passes::gather_all;
@@ -93,12 +93,12 @@ fn refusal(path: &Path) -> String {
 }
 
 fn states(source: &dyn FrameSource) -> Vec<Gaussians> {
-    (0..TIMES.len()).map(|frame| gather_all(source, frame, Columns::all()).unwrap()).collect()
+    (0..TIMES.len()).map(|frame| gather_all(source, frame, Attributes::all()).unwrap()).collect()
 }
 
 fn assert_near(found: &[Gaussians], expected: &[Gaussians], tolerance: f32) {
     for (found, expected) in found.iter().zip(expected) {
-        for column in Columns::all().iter() {
+        for column in Attributes::all().iter() {
             let pairs = found.column(column).planes().iter().zip(expected.column(column).planes());
             pairs.for_each(|(a, b)| assert!((a - b).abs() <= tolerance, "{}: {a}, expected {b}", column.name()));
         }
@@ -167,28 +167,28 @@ fn opacity_jacobian_agrees_with_finite_differences() {
     let root = folder(false);
     let model = open_with_frames(root.path());
     let deformation = model.source().deformation().unwrap();
-    assert_eq!(deformation.movable(), Columns::all());
+    assert_eq!(deformation.movable(), Attributes::all());
     let step = 1e-2;
     let at = |frame: usize, by: f32| {
         let mut raw = deformation.stored().clone();
         raw.gaussians.opacity_logit.planes_mut().iter_mut().for_each(|x| *x += by);
         let mut state = Gaussians::zeros(COUNT, 0);
-        deformation.state(frame, &raw, Columns::OPACITY, &mut state).unwrap();
+        deformation.state(frame, &raw, Attributes::OPACITY, &mut state).unwrap();
         state.opacity_logit
     };
     for frame in 0..TIMES.len() {
-        let found = deformation.jacobian(frame, deformation.stored(), Columns::all()).unwrap();
-        assert_eq!(found.column(Columns::POSITION).width(), 0);
+        let found = deformation.jacobian(frame, deformation.stored(), Attributes::all()).unwrap();
+        assert_eq!(found.column(Attributes::POSITION).width(), 0);
         let (more, less) = (at(frame, step), at(frame, -step));
         for i in 0..COUNT {
             let expected = (more.plane(0)[i] - less.plane(0)[i]) / (2.0 * step);
-            let found = found.column(Columns::OPACITY).plane(0)[i];
+            let found = found.column(Attributes::OPACITY).plane(0)[i];
             assert!((found - expected).abs() < 1e-3, "{found} for {expected}");
         }
     }
     let full = folder(true);
     let full = open_with_frames(full.path());
-    assert!(!full.source().deformation().unwrap().movable().contains(Columns::SH));
+    assert!(!full.source().deformation().unwrap().movable().contains(Attributes::SH));
 }
 
 #[test]
@@ -242,9 +242,9 @@ fn reduction(model: &dyn InputModel) -> CompressedModel {
     by.log_scale.set_row(1, [0.0, 0.125, 0.0]);
     by.rotation.set_row(2, [0.0, 0.0, 0.1, 0.0]);
     let changes = model.source().deformation().unwrap().movable();
-    match changes.contains(Columns::SH) {
+    match changes.contains(Attributes::SH) {
         true => by.sh.set_row(2, [0.1, 0.2, 0.0]),
-        false => by.sh = Column::default(),
+        false => by.sh = AttributeValues::default(),
     }
     CompressedModel {
         clusters: vec![cluster],
@@ -332,10 +332,10 @@ fn splatv_of_a_lite_model_keeps_motion_and_stored_words() {
     );
     // Colors and opacities are stored as bytes, and colors outside 0 … 1 are clamped, so they are not compared.
     for (found, expected) in states(read.source()).iter().zip(states(model.source())) {
-        let pairs = |column: Columns| {
+        let pairs = |column: Attributes| {
             found.column(column).planes().iter().zip(expected.column(column).planes()).collect::<Vec<_>>()
         };
-        for column in [Columns::POSITION, Columns::ROTATION, Columns::LOG_SCALE] {
+        for column in [Attributes::POSITION, Attributes::ROTATION, Attributes::LOG_SCALE] {
             pairs(column).iter().for_each(|(a, b)| assert!((*a - *b).abs() < 5e-3, "{}: {a} {b}", column.name()));
         }
     }
@@ -347,13 +347,13 @@ fn splatv_of_a_lite_model_keeps_motion_and_stored_words() {
     let small = Splatv::open(&kept).unwrap();
     assert_eq!((small.count(), small.words(0), small.words(1)), (2, file.words(2), file.words(5)));
     assert_eq!(small.cameras(), file.cameras());
-    let mut by = Gaussians { position: Column::zeros(3, 2), ..Gaussians::default() };
+    let mut by = Gaussians { position: AttributeValues::zeros(3, 2), ..Gaussians::default() };
     by.position.set_row(1, [1.0, 0.0, 0.0]);
     let moved = CompressedModel { change: ParamDelta(by), ..CompressedModel::pruned(vec![2, 5], &rule) };
     read.write(&moved, OutputKind::Splatv, &kept, &Limits::NONE, &Events::IGNORED).unwrap();
     let moved = Splatv::open(&kept).unwrap();
     assert_eq!(moved.words(0), file.words(2));
-    let (to, from) = (SplatvGaussian::of_words(&moved.words(1)), SplatvGaussian::of_words(&file.words(5)));
+    let (to, from) = (SplatvGaussian::from_words(&moved.words(1)), SplatvGaussian::from_words(&file.words(5)));
     assert_eq!(to, SplatvGaussian { position: [from.position[0] + 1.0, from.position[1], from.position[2]], ..from });
     // Without cameras of the model, the file gets one that a viewer can start at.
     fs::remove_file(root.path().join(CAMERAS)).unwrap();

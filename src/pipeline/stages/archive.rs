@@ -16,8 +16,8 @@ use crate::error::{Error, Result};
 use crate::journal::Journal;
 use crate::journal::as_toml::AsToml;
 use crate::limits::{Limits, ReadLimit};
-use crate::memory_plan::{PICTURE_ON_ALL_THREADS, RENDER, ResourceEstimate, Workload};
-use crate::model::Columns;
+use crate::memory_plan::{RENDER, ResourceEstimate, SHARED_VIEW_BYTES_PER_GAUSSIAN, Workload};
+use crate::model::Attributes;
 use crate::outputs::kind::OutputKind;
 use crate::pipeline::planning::Planning;
 use crate::pipeline::request::Goal;
@@ -109,19 +109,19 @@ impl ValueGroup {
 impl ArchiveStage {
     /// Returns the estimate: the result, its renders, the archive and the decoded archive.
     pub fn need(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
-        let whole = work.state(Columns::all());
+        let whole = work.state(Attributes::all());
         let count = pictures(work.pixels);
         // About forty groups are quantized in every round, and all together in each halving.
         let looked = count as f64 * (2.0 * OCTAVE_HALVINGS as f64 + BALANCING_ROUNDS as f64 * 40.0);
         ResourceEstimate {
             stage: NAME,
             reads: 1.0,
-            seconds: work.picturing(looked, 0.3 * work.count(), RENDER),
+            seconds: work.render_seconds(looked, 0.3 * work.count(), RENDER),
             per_gaussian: vec![
                 ("states", whole),
                 ("readers", work.input.reader),
-                ("held", work.held(limits, Columns::all())),
-                ("pictures", PICTURE_ON_ALL_THREADS),
+                ("held", work.held(limits, Attributes::all())),
+                ("pictures", SHARED_VIEW_BYTES_PER_GAUSSIAN),
                 ("contents", 4 * whole),
             ],
             fixed: vec![
@@ -147,8 +147,8 @@ impl ArchiveStage {
         journal: &mut Journal,
     ) -> Result<(Archived, ArchiveSummary)> {
         let key = scene.work.key(&(self.psnr, asked, compressed));
-        let (archived, AsToml(summary)) = journal.kept_stage(NAME, compressed.len(), scene, key, |_| {
-            let (archived, summary) = match scene.input.archives_frames() {
+        let (archived, AsToml(summary)) = journal.run_cached_stage(NAME, compressed.len(), scene, key, |_| {
+            let (archived, summary) = match scene.input.archives_as_frames() {
                 true => {
                     let left = scene.input.reduced(compressed)?;
                     let (bounds, summary) = bounds::find(scene, &*left, self.psnr, asked)?;
@@ -215,7 +215,7 @@ impl ArchiveStage {
 /// # Errors
 /// Fails if the input cannot be archived or values are not finite.
 pub fn bytes(scene: &Scene, compressed: &CompressedModel) -> Result<u64> {
-    if scene.input.archives_frames() {
+    if scene.input.archives_as_frames() {
         return bounds::bytes(scene, &*scene.input.reduced(compressed)?);
     }
     let content = scene.input.content(compressed)?;

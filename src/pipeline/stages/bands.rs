@@ -8,16 +8,16 @@ use crate::error::Result;
 use crate::journal::Journal;
 use crate::journal::records::BandsSummary;
 use crate::limits::Limits;
-use crate::memory_plan::{PICTURE_ON_ALL_THREADS, RENDER, ResourceEstimate, Workload, of_left};
+use crate::memory_plan::{RENDER, ResourceEstimate, SHARED_VIEW_BYTES_PER_GAUSSIAN, Workload, bytes_of_survivors};
 use crate::metrics::psnr;
-use crate::model::{Columns, Gaussians, Picture};
+use crate::model::{Attributes, FrameView, Gaussians};
 use crate::outputs::kind::OutputKind;
-use crate::passes::{Batch, Subject, show, spread};
+use crate::passes::{Batch, RenderedSource, show, spread};
 use crate::pipeline::planning::Planning;
 use crate::pipeline::request::Request;
 use crate::pipeline::stage::{EstimateInput, Phase, RunState, Stage, StageList};
 use crate::pruning::score::scored_memory;
-use crate::recipe::WhichBands;
+use crate::recipe::ShDegreeRule;
 use crate::render::{self, render};
 use crate::scene::Scene;
 use crate::source::FrameSource;
@@ -73,9 +73,9 @@ impl Stage for ShDegreeStage {
         }
         let result = run.take_result();
         let (count, key) = (result.len(), scene.work.key(&(self.margin, &result)));
-        run.result = run
-            .journal
-            .kept_stage(NAME, count, scene, key, |journal| Ok((self.lower_degree(scene, result, journal)?, count)))?;
+        run.result = run.journal.run_cached_stage(NAME, count, scene, key, |journal| {
+            Ok((self.lower_degree(scene, result, journal)?, count))
+        })?;
         Ok(())
     }
 }
@@ -85,27 +85,28 @@ impl ShDegreeStage {
     /// nobody sees, so it needs no such stage.
     pub(crate) fn from_request(request: &Request, kind: OutputKind) -> Option<ShDegreeStage> {
         let bands = &request.recipe.bands;
-        let drops = kind != OutputKind::Archive && bands.bands == WhichBands::Needed;
+        let drops = kind != OutputKind::Archive && bands.bands == ShDegreeRule::Needed;
         drops.then_some(ShDegreeStage { margin: bands.bands_margin })
     }
 
     /// Returns the estimate: three states and renders of them. The fraction `left` of the Gaussians stays.
     pub(crate) fn need(&self, work: &Workload, limits: &Limits, left: f64) -> ResourceEstimate {
-        let (whole, reader, held) = (work.state(Columns::all()), work.input.reader, work.held(limits, Columns::all()));
+        let (whole, reader, held) =
+            (work.state(Attributes::all()), work.input.reader, work.held(limits, Attributes::all()));
         let per_gaussian = vec![
-            ("kept", of_left(left, 24)),
-            ("states", whole + of_left(left, 2 * whole)),
-            ("result", of_left(left, work.input.reduced)),
-            ("readers", reader + of_left(left, reader)),
-            ("held", held + of_left(left, held)),
-            ("pictures", PICTURE_ON_ALL_THREADS),
+            ("kept", bytes_of_survivors(left, 24)),
+            ("states", whole + bytes_of_survivors(left, 2 * whole)),
+            ("result", bytes_of_survivors(left, work.input.reduced)),
+            ("readers", reader + bytes_of_survivors(left, reader)),
+            ("held", held + bytes_of_survivors(left, held)),
+            ("pictures", SHARED_VIEW_BYTES_PER_GAUSSIAN),
         ];
         let pictures = if work.sh_degree > 0 { (COMPARED_VIEWS as u64).min(work.pictures) } else { 0 };
         ResourceEstimate {
             stage: NAME,
             seconds: work.reading(work.count(), 2.0 * pictures as f64)
-                + work.picturing(pictures as f64, work.count(), RENDER)
-                + work.picturing(2.0 * pictures as f64, left * work.count(), RENDER),
+                + work.render_seconds(pictures as f64, work.count(), RENDER)
+                + work.render_seconds(2.0 * pictures as f64, left * work.count(), RENDER),
             reads: 2.0 * work.scattered_reads(pictures, limits),
             per_gaussian: [scored_memory(limits), per_gaussian].concat(),
             fixed: vec![work.arriving(), ("pictures", render::STRIP_BYTES as u64 + 36 * work.pixels)],
@@ -161,17 +162,17 @@ fn quality_without_degrees(
     scene: &Scene,
     result: &dyn FrameSource,
     degree: usize,
-    pictures: &[Picture],
+    pictures: &[FrameView],
 ) -> Result<[f64; 2]> {
     let progress = scene.events.task(NAME, "pictures", pictures.len() as u64);
     let mut sums = [0.0; 2];
-    let subjects = [Subject::all(scene.source()), Subject::all(result)];
+    let subjects = [RenderedSource::all(scene.source()), RenderedSource::all(result)];
     show(subjects, &scene.schedule.cameras, pictures, Batch::of_frame(&scene.limits), |views| {
         for view in views {
             let picture = |state: &Gaussians| render(state, view.camera, scene.background);
             let [original, whole] = view.states.map(picture);
             let mut state = view.states[1].clone();
-            state.drop_bands(degree);
+            state.truncate_sh(degree);
             sums[0] += psnr(&original, &whole);
             sums[1] += psnr(&picture(&state), &whole);
         }

@@ -12,7 +12,7 @@ use std::fs;
 use crate::error::{Error, Result};
 use crate::files::atomic::ScratchFolder;
 use crate::memory_plan::{MemoryPart, Workload};
-use crate::model::{Columns, Gaussians, SequenceInfo};
+use crate::model::{Attributes, Gaussians, SequenceInfo};
 use crate::outputs::bounds::Bounds;
 use crate::outputs::container::{BOUNDED_FRAME_BLOCK, GAUSSIAN_BLOCK, Packing, column_bytes, write_container};
 use crate::pipeline::stages::reference_views::{
@@ -75,7 +75,7 @@ pub(crate) fn find(
         let saved: Vec<f64> = (0..5).map(|k| (2.0 * (fine[k] - wide[k])).max(1.0 + 0.05 * fine[k])).collect();
         let all: f64 = saved.iter().sum();
         measured.clear();
-        for (k, column) in Columns::all().iter().enumerate() {
+        for (k, column) in Attributes::all().iter().enumerate() {
             measured.push((column.name().to_owned(), (2.0 * widths[k]).log2(), errors[k], fine[k]));
             let by = step_change(error * saved[k] / all, errors[k]);
             widths[k] = (widths[k] * by.exp2()).min(MAX_WIDENING * initial_bounds[k]);
@@ -118,7 +118,7 @@ pub(crate) fn find(
         }
     };
     check_met(quality_target, asked, psnr)?;
-    let names = Columns::all().iter().map(|column| column.name().to_owned());
+    let names = Attributes::all().iter().map(|column| column.name().to_owned());
     let bounds = names.zip(widths).collect();
     let bits = BTreeMap::new();
     let summary = ArchiveSummary { asked, psnr, level, loss, parts: None, bounds: Some(bounds), bits, measured };
@@ -198,7 +198,7 @@ struct RoundedReader<'a> {
 }
 
 impl BlockReader for RoundedReader<'_> {
-    fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
+    fn read(&mut self, frame: usize, want: Attributes, out: &mut Gaussians) -> Result<()> {
         self.reader.read(frame, want, out)?;
         for column in want.iter() {
             let step = 2.0 * self.bounds.column(column);
@@ -214,7 +214,7 @@ impl BlockReader for RoundedReader<'_> {
         self.reader.expect(wanted);
     }
 
-    fn prepare(&mut self, frame: usize, want: Columns) -> Result<()> {
+    fn prepare(&mut self, frame: usize, want: Attributes) -> Result<()> {
         self.reader.prepare(frame, want)
     }
 }

@@ -8,10 +8,10 @@ use crate::compressed_model::CompressedModel;
 use crate::error::Result;
 use crate::journal::Journal;
 use crate::limits::Limits;
-use crate::memory_plan::{PICTURE_ON_ALL_THREADS, RENDER, ResourceEstimate, Workload, of_left};
+use crate::memory_plan::{RENDER, ResourceEstimate, SHARED_VIEW_BYTES_PER_GAUSSIAN, Workload, bytes_of_survivors};
 use crate::metrics::{decibels_text, psnr};
-use crate::model::{Columns, Picture};
-use crate::passes::{Batch, Subject, VIEWS_AT_ONCE, ViewStates, show, spread};
+use crate::model::{Attributes, FrameView};
+use crate::passes::{Batch, RenderedSource, VIEWS_PER_FRAME, ViewStates, show, spread};
 use crate::pipeline::planning::Planning;
 use crate::pipeline::stage::{EstimateInput, Phase, RunState, Stage, StageList};
 use crate::progress::Message;
@@ -66,25 +66,25 @@ impl Choose {
     /// Returns the estimate: both alternatives, two states of a frame, and rendered views. The fraction `left` of the
     /// Gaussians stays.
     pub(crate) fn need(&self, work: &Workload, limits: &Limits, left: f64) -> ResourceEstimate {
-        let whole = work.state(Columns::all());
+        let whole = work.state(Attributes::all());
         // The trajectories of proxies are computed from all members.
         let merging = if work.input.reduced > 0 { left } else { 1.0 };
-        let (reader, held) = (work.input.reader, work.held(limits, Columns::all()));
+        let (reader, held) = (work.input.reader, work.held(limits, Attributes::all()));
         let per_gaussian = vec![
-            ("alternatives", of_left(left, 8)),
+            ("alternatives", bytes_of_survivors(left, 8)),
             ("clusters", CLUSTERED),
-            ("states", whole + of_left(left, whole)),
-            ("result", of_left(left, work.input.reduced)),
-            ("readers", reader + of_left(merging, reader)),
-            ("held", held + of_left(merging, held)),
-            ("pictures", PICTURE_ON_ALL_THREADS),
+            ("states", whole + bytes_of_survivors(left, whole)),
+            ("result", bytes_of_survivors(left, work.input.reduced)),
+            ("readers", reader + bytes_of_survivors(merging, reader)),
+            ("held", held + bytes_of_survivors(merging, held)),
+            ("pictures", SHARED_VIEW_BYTES_PER_GAUSSIAN),
         ];
         let together = VIEWS_PER_BATCH.min(limits.pictures_together) as u64;
         let pictures = render::STRIP_BYTES as u64 + 12 * work.pixels * (1 + together);
         let frames = (COMPARED_VIEWS as u64).min(work.pictures);
         // The original, and two alternatives of about half as many Gaussians.
-        let made = work.picturing(frames as f64, 2.0 * work.count(), RENDER)
-            + work.picturing(2.0 * frames as f64, 0.0, RENDER);
+        let made = work.render_seconds(frames as f64, 2.0 * work.count(), RENDER)
+            + work.render_seconds(2.0 * frames as f64, 0.0, RENDER);
         ResourceEstimate {
             stage: NAME,
             seconds: work.reading(work.count(), frames as f64) + made,
@@ -114,10 +114,11 @@ impl Choose {
             return Ok(merged);
         }
         let pruned = ranking.take(count);
-        let pictures = spread(&scene.schedule, COMPARED_VIEWS, VIEWS_AT_ONCE);
+        let pictures = spread(&scene.schedule, COMPARED_VIEWS, VIEWS_PER_FRAME);
         let key = scene.work.key(&(&pruned, compressed, &pictures));
-        let [without, with]: [f64; 2] = journal
-            .kept_stage(NAME, count, scene, key, |_| Ok((mean_psnr(scene, &pruned, compressed, &pictures)?, count)))?;
+        let [without, with]: [f64; 2] = journal.run_cached_stage(NAME, count, scene, key, |_| {
+            Ok((mean_psnr(scene, &pruned, compressed, &pictures)?, count))
+        })?;
         if with > without {
             return Ok(merged);
         }
@@ -133,13 +134,13 @@ impl Choose {
 }
 
 /// Returns the mean PSNR over `pictures` of the Gaussians `pruned` and of `merged`, each against the original, dB.
-fn mean_psnr(scene: &Scene, pruned: &[u32], merged: &CompressedModel, pictures: &[Picture]) -> Result<[f64; 2]> {
+fn mean_psnr(scene: &Scene, pruned: &[u32], merged: &CompressedModel, pictures: &[FrameView]) -> Result<[f64; 2]> {
     let result = scene.input.reduced(merged)?;
     let progress = scene.events.task(NAME, "pictures", pictures.len() as u64);
     let mut sums = [0.0; 2];
     let pictures_together = VIEWS_PER_BATCH.min(scene.limits.pictures_together);
     let batch = Batch { pictures: pictures_together, ..Batch::of_frame(&scene.limits) };
-    let subjects = [Subject::all(scene.source()), Subject::all(&*result)];
+    let subjects = [RenderedSource::all(scene.source()), RenderedSource::all(&*result)];
     show(subjects, &scene.schedule.cameras, pictures, batch, |views| {
         let picture = |subject: usize, view: &ViewStates<'_, 2>| view.render(subject, scene.background);
         let expected: Vec<Image> = views.iter().map(|view| picture(0, view)).collect();
@@ -166,7 +167,7 @@ mod tests {
 
     /// Returns the mean PSNR over the views by which the stage chooses.
     fn quality(scene: &Scene, compressed: &CompressedModel) -> f64 {
-        mean_psnr(scene, &[], compressed, &spread(&scene.schedule, COMPARED_VIEWS, VIEWS_AT_ONCE)).unwrap()[1]
+        mean_psnr(scene, &[], compressed, &spread(&scene.schedule, COMPARED_VIEWS, VIEWS_PER_FRAME)).unwrap()[1]
     }
 
     /// Returns the merged model of a scene, the result of the choice, and the journal.

@@ -36,7 +36,7 @@ pub(crate) struct Degree {
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
     if let Some(refine) = planning.refine.as_ref().filter(|_| planning.chooses_degree()) {
         stages.set_open_ended();
-        stages.add(Phase::Rank, Degree { refine: refine.in_part(TRIAL_STEPS) });
+        stages.add(Phase::Rank, Degree { refine: refine.with_step_fraction(TRIAL_STEPS) });
     }
 }
 
@@ -80,7 +80,7 @@ impl Degree {
     ) -> Result<ByteLimitFit> {
         let all = scored.count();
         let key = scene.work.key(&(self.refine.key(), ranked, template, fits));
-        journal.kept_stage(NAME, all, scene, key, |journal| {
+        journal.run_cached_stage(NAME, all, scene, key, |journal| {
             let targets = Targets::new(scene, self.refine.pictures)?;
             let mut tried: Vec<(ByteLimitFit, f64)> = Vec::new();
             for &fit in fits {

@@ -7,17 +7,17 @@ use crate::error::Result;
 use crate::journal::Journal;
 use crate::journal::records::FieldSummary;
 use crate::limits::Limits;
-use crate::memory_plan::{PICTURE_ON_ALL_THREADS, RENDER, ResourceEstimate, Workload, of_left};
+use crate::memory_plan::{RENDER, ResourceEstimate, SHARED_VIEW_BYTES_PER_GAUSSIAN, Workload, bytes_of_survivors};
 use crate::metrics::psnr;
-use crate::model::{Columns, Picture};
+use crate::model::{Attributes, FrameView};
 use crate::outputs::kind::OutputKind;
-use crate::passes::{Batch, Subject, show, spread};
+use crate::passes::{Batch, RenderedSource, show, spread};
 use crate::pipeline::planning::Planning;
 use crate::pipeline::request::Request;
 use crate::pipeline::stage::{EstimateInput, Phase, RunState, Stage, StageList};
 use crate::pruning::score::scored_memory;
 use crate::recipe::Precision;
-use crate::refinement::CLOSE_ENOUGH;
+use crate::refinement::MAX_USEFUL_PSNR;
 use crate::render::{self, render};
 use crate::scene::Scene;
 use crate::source::FrameSource;
@@ -52,7 +52,7 @@ impl Stage for FieldPrecisionStage {
         let (count, key) = (result.len(), scene.work.key(&(self.margin, &result)));
         run.result = run
             .journal
-            .kept_stage(NAME, count, scene, key, |journal| Ok((self.round(scene, result, journal)?, count)))?;
+            .run_cached_stage(NAME, count, scene, key, |journal| Ok((self.round(scene, result, journal)?, count)))?;
         Ok(())
     }
 }
@@ -68,20 +68,20 @@ impl FieldPrecisionStage {
     /// Returns the estimate: two states, rendered views, and a second copy of the field. The fraction `left` of the
     /// Gaussians stays.
     pub(crate) fn need(&self, work: &Workload, limits: &Limits, left: f64) -> ResourceEstimate {
-        let whole = work.state(Columns::all());
+        let whole = work.state(Attributes::all());
         let per_gaussian = vec![
-            ("kept", of_left(left, 24)),
-            ("states", whole + of_left(left, whole)),
-            ("result", of_left(left, 2 * work.input.reduced)),
-            ("readers", work.input.reader + of_left(left, work.input.reader)),
-            ("pictures", PICTURE_ON_ALL_THREADS),
+            ("kept", bytes_of_survivors(left, 24)),
+            ("states", whole + bytes_of_survivors(left, whole)),
+            ("result", bytes_of_survivors(left, 2 * work.input.reduced)),
+            ("readers", work.input.reader + bytes_of_survivors(left, work.input.reader)),
+            ("pictures", SHARED_VIEW_BYTES_PER_GAUSSIAN),
         ];
         let pictures = (COMPARED_VIEWS as u64).min(work.pictures);
         ResourceEstimate {
             stage: NAME,
             seconds: work.reading(work.count(), 4.0 * pictures as f64)
-                + work.picturing(2.0 * pictures as f64, work.count(), RENDER)
-                + work.picturing(2.0 * pictures as f64, left * work.count(), RENDER),
+                + work.render_seconds(2.0 * pictures as f64, work.count(), RENDER)
+                + work.render_seconds(2.0 * pictures as f64, left * work.count(), RENDER),
             reads: work.reads(pictures, limits),
             per_gaussian: [scored_memory(limits), per_gaussian].concat(),
             fixed: vec![
@@ -111,12 +111,12 @@ impl FieldPrecisionStage {
         let [exact, half] = [&compressed, &halved].map(|model| scene.input.reduced(model));
         let (exact, half) = (exact?, half?);
         let rounding = closeness(scene, [&*exact, &*half], &pictures)?;
-        let result = match rounding >= CLOSE_ENOUGH {
+        let result = match rounding >= MAX_USEFUL_PSNR {
             true => None,
             false => Some(closeness(scene, [scene.source(), &*exact], &pictures)?),
         };
         drop((exact, half));
-        let least = result.map_or(CLOSE_ENOUGH, |result| least(result, self.margin));
+        let least = result.map_or(MAX_USEFUL_PSNR, |result| least(result, self.margin));
         let found = FieldSummary { pictures: pictures.len(), rounding, result, least, half: rounding >= least };
         let fits = found.half;
         if !fits {
@@ -128,16 +128,16 @@ impl FieldPrecisionStage {
 }
 
 /// Returns the minimum PSNR, dB, between renders of a result and of its coarser version, for which the coarser version
-/// is accepted: `margin` more than `result`, the PSNR of the result against the original, at most [`CLOSE_ENOUGH`].
+/// is accepted: `margin` more than `result`, the PSNR of the result against the original, at most [`MAX_USEFUL_PSNR`].
 pub(crate) fn least(result: f64, margin: f64) -> f64 {
-    CLOSE_ENOUGH.min(result + margin)
+    MAX_USEFUL_PSNR.min(result + margin)
 }
 
 /// Returns the mean PSNR between renders of two sources over `pictures`, dB.
-fn closeness(scene: &Scene, [a, b]: [&dyn FrameSource; 2], pictures: &[Picture]) -> Result<f64> {
+fn closeness(scene: &Scene, [a, b]: [&dyn FrameSource; 2], pictures: &[FrameView]) -> Result<f64> {
     let progress = scene.events.task(NAME, "pictures", pictures.len() as u64);
     let mut sum = 0.0;
-    let subjects = [Subject::all(a), Subject::all(b)];
+    let subjects = [RenderedSource::all(a), RenderedSource::all(b)];
     show(subjects, &scene.schedule.cameras, pictures, Batch::of_frame(&scene.limits), |views| {
         for view in views {
             let [a, b] = view.states.map(|state| render(state, view.camera, scene.background));

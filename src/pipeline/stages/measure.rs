@@ -16,7 +16,7 @@ use crate::pruning::score::{ScoreStage, Scored, UserOverrides};
 use crate::pruning::visible::{self, Visible};
 use crate::recipe::{Coverage, Recipe};
 use crate::scene::Scene;
-use crate::statistics::pass::{Scanned, scan_units};
+use crate::statistics::pass::{ScanResult, scan_units};
 
 /// Adds the stages that measure and score.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
@@ -90,7 +90,7 @@ impl Measure {
     ///
     /// # Errors
     /// Fails if frames cannot be read or their times cannot be scanned.
-    pub fn scan(&self, scene: &Scene, journal: &mut Journal) -> Result<Scanned> {
+    pub fn scan(&self, scene: &Scene, journal: &mut Journal) -> Result<ScanResult> {
         scene.set_absent(&[]);
         let scanned = self.scan.run(scene, journal)?;
         let absent = self.score.absent(&scanned.rows);

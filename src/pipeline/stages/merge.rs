@@ -17,14 +17,14 @@ use crate::journal::Journal;
 use crate::limits::Limits;
 use crate::memory_plan::{ResourceEstimate, Workload};
 use crate::merging;
-use crate::merging::known::{KnownPairs, Likeness};
+use crate::merging::known::{KnownPairs, PairSimilarity};
 use crate::merging::motion::MotionGate;
 use crate::merging::motion_pass;
 use crate::merging::motion_pass::PairMeter;
 use crate::merging::proxy::{Importance, weights};
 use crate::merging::voxels::voxel_order;
 use crate::merging::{Merged, RequestedPairs, Survivors};
-use crate::model::{Column, Columns, Gaussians};
+use crate::model::{AttributeValues, Attributes, Gaussians};
 use crate::models::trajectories::state_bytes;
 use crate::passes::{BLOCK, gather};
 use crate::pipeline::planning::Planning;
@@ -139,7 +139,7 @@ impl MergeStage {
         let pairs = (merging::BYTES_PER_PAIR + motion_pass::BYTES_PER_PAIR) as u64;
         // Only base colors are compared. There is at most one proxy for every two Gaussians, before and after a pass,
         // and then once with all SH coefficients.
-        let proxies = state_bytes(0, Columns::all()).max(work.state(Columns::all()).div_ceil(2));
+        let proxies = state_bytes(0, Attributes::all()).max(work.state(Attributes::all()).div_ceil(2));
         let per_gaussian = vec![
             // The importances C and Vis are read back from disk.
             ("importance", if limits.rows_aside { 16 } else { 0 }),
@@ -198,7 +198,7 @@ impl MergeStage {
                     }
                 };
                 drop(trial);
-                scene.work.not_divided(NAME)?;
+                scene.work.end_shard_before(NAME)?;
                 let MergeOutcome { compressed, summary } = &mut merged;
                 let proxies = scene.input.solve(&compressed.clusters, scored.reference, &self.recipe)?;
                 compressed.make(proxies);
@@ -346,11 +346,11 @@ impl<'a> Trial<'a> {
 fn measure(
     work: &Cache,
     meter: &mut PairMeter<'_>,
-    (pool, reference): (&[u32], &Column),
+    (pool, reference): (&[u32], &AttributeValues),
     mut pairs: Vec<(u32, u32)>,
     asked: &RequestedPairs<'_>,
     merge: &recipe::MergeParams,
-) -> Result<Vec<Likeness>> {
+) -> Result<Vec<PairSimilarity>> {
     if !work.keeps() || pairs.len() < MIN_DIVIDED_PAIRS {
         return meter.measure(pool, reference, pairs, asked.reach, asked.is_part);
     }
@@ -419,7 +419,7 @@ fn states_of(source: &dyn FrameSource, ids: &[u32], frame: usize) -> Result<(Gau
         return Ok((states, finite));
     }
     for (ids, start) in ids.chunks(GATHER_CHUNK).zip((0..).step_by(GATHER_CHUNK)) {
-        let whole = gather(source, ids, frame, Columns::all())?;
+        let whole = gather(source, ids, frame, Attributes::all())?;
         states.write_rows(start, &whole);
         for (row, finite) in finite[start..].iter_mut().take(ids.len()).enumerate() {
             *finite = merging::is_finite(&whole, row);

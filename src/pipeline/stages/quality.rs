@@ -17,15 +17,17 @@ use crate::files::atomic::ScratchFolder;
 use crate::journal::Journal;
 use crate::journal::records::{QualitySummary, RenderTime, ViewKind};
 use crate::limits::Limits;
-use crate::memory_plan::{PICTURE_ON_ALL_THREADS, RENDER, ResourceEstimate, Throughput, Workload, of_left};
+use crate::memory_plan::{
+    RENDER, ResourceEstimate, SHARED_VIEW_BYTES_PER_GAUSSIAN, Throughput, Workload, bytes_of_survivors,
+};
 use crate::metrics::{BYTES_PER_PIXEL, psnr, ssim};
-use crate::model::{Columns, Picture};
-use crate::passes::{Batch, Subject, ViewStates, show};
+use crate::model::{Attributes, FrameView};
+use crate::passes::{Batch, RenderedSource, ViewStates, show};
 use crate::pipeline::planning::Planning;
 use crate::pipeline::stage::{Archived, EstimateInput, MeasuredOnArrival, Phase, RunState, Stage, StageList};
 use crate::pruning::score::scored_memory;
 use crate::render;
-use crate::scene::pictures::{PictureSet, pictures, spread_views};
+use crate::scene::pictures::{ViewSet, pictures, spread_views};
 use crate::scene::{InputOptions, Scene, open_compressed};
 use crate::source::FrameSource;
 
@@ -60,7 +62,7 @@ impl Stage for QualityStage {
     }
 
     fn run(&self, run: &mut RunState<'_>) -> Result<()> {
-        run.scene.work.not_divided("measuring quality")?;
+        run.scene.work.end_shard_before("measuring quality")?;
         if run.result.is_empty() {
             return Ok(());
         }
@@ -76,15 +78,15 @@ impl Stage for QualityStage {
 impl QualityStage {
     /// Returns the estimate for rendering [`MOST_VIEWS`] views of both models; a fraction `left` of the Gaussians is in the result.
     fn need(&self, work: &Workload, limits: &Limits, left: f64) -> ResourceEstimate {
-        let whole = work.state(Columns::all());
+        let whole = work.state(Attributes::all());
         let together = work.threads.min(limits.pictures_together as u64);
         let views = (MOST_VIEWS as u64).min(work.pictures.max(1));
         let per_gaussian = vec![
-            ("kept", of_left(left, 24)),
-            ("states", whole + of_left(left, whole)),
-            ("result", of_left(left, 2 * work.input.reduced)),
-            ("readers", work.input.reader + of_left(left, work.input.reader)),
-            ("pictures", together * PICTURE_ON_ALL_THREADS),
+            ("kept", bytes_of_survivors(left, 24)),
+            ("states", whole + bytes_of_survivors(left, whole)),
+            ("result", bytes_of_survivors(left, 2 * work.input.reduced)),
+            ("readers", work.input.reader + bytes_of_survivors(left, work.input.reader)),
+            ("pictures", together * SHARED_VIEW_BYTES_PER_GAUSSIAN),
         ];
         ResourceEstimate {
             stage: NAME,
@@ -109,7 +111,7 @@ impl QualityStage {
             None if scene.has_cameras => ViewKind::Training,
             None => ViewKind::Virtual,
         };
-        let all = pictures(&scene.rig, times, PictureSet::HeldOut)?;
+        let all = pictures(&scene.rig, times, ViewSet::HeldOut)?;
         let views = spread_views(all, self.view_count(run));
         let folder;
         let (opened, reduced);
@@ -145,7 +147,7 @@ impl QualityStage {
         let left = run.result.len() as f64 / work.count().max(1.0);
         let input = EstimateInput { work: &work, limits: &Limits::NONE, left, measured: MeasuredOnArrival::default() };
         let seconds: f64 = run.stages.all().flat_map(|stage| stage.estimates(input)).map(|need| need.seconds).sum();
-        let per_view = work.picturing(1.0, (1.0 + left) * work.count(), RENDER)
+        let per_view = work.render_seconds(1.0, (1.0 + left) * work.count(), RENDER)
             + work.reading(work.count(), 2.0)
             + 2.0 * SCORE_SECONDS_PER_PIXEL * work.pixels as f64;
         ((SHARE * seconds / per_view.max(1e-9)) as usize).clamp(FEWEST_VIEWS, MOST_VIEWS)
@@ -156,10 +158,10 @@ impl QualityStage {
 const SCORE_SECONDS_PER_PIXEL: f64 = 6e-8;
 
 /// Returns the mean PSNR, dB, and the mean SSIM of `result` against the original over `views`.
-fn mean_scores(scene: &Scene, result: &dyn FrameSource, views: &[Picture]) -> Result<(f64, f64)> {
+fn mean_scores(scene: &Scene, result: &dyn FrameSource, views: &[FrameView]) -> Result<(f64, f64)> {
     let progress = scene.events.task(NAME, "views", views.len() as u64);
     let mut scores: Vec<(f64, f64)> = Vec::with_capacity(views.len());
-    let subjects = [scene.source(), result].map(Subject::all);
+    let subjects = [scene.source(), result].map(RenderedSource::all);
     show(subjects, &scene.rig.cameras, views, Batch::of_frame(&scene.limits), |batch| {
         let score = |view: &ViewStates<'_, 2>| {
             let [original, compressed] = [0, 1].map(|subject| view.render(subject, scene.background));
@@ -175,11 +177,11 @@ fn mean_scores(scene: &Scene, result: &dyn FrameSource, views: &[Picture]) -> Re
 
 /// Returns the median time of rendering one view of both models on one thread, in milliseconds, without the evaluation of the
 /// deformation field. The first render of each view warms the caches and is not counted.
-pub(crate) fn render_times(scene: &Scene, result: &dyn FrameSource, views: &[Picture]) -> Result<Option<RenderTime>> {
+pub(crate) fn render_times(scene: &Scene, result: &dyn FrameSource, views: &[FrameView]) -> Result<Option<RenderTime>> {
     let Ok(pool) = rayon::ThreadPoolBuilder::new().num_threads(1).build() else { return Ok(None) };
     let views = spread_views(views.to_vec(), TIMED_VIEWS);
     let mut times = [Vec::new(), Vec::new()];
-    let subjects = [scene.source(), result].map(Subject::all);
+    let subjects = [scene.source(), result].map(RenderedSource::all);
     show(subjects, &scene.rig.cameras, &views, Batch::of_frame(&scene.limits), |batch| {
         for view in batch {
             for (subject, times) in times.iter_mut().enumerate() {

@@ -5,8 +5,8 @@ use serde::Serialize;
 
 use crate::error::{Error, Result};
 use crate::metrics::{decibels_text, psnr};
-use crate::model::Picture;
-use crate::passes::{Batch, Subject, show, spread};
+use crate::model::FrameView;
+use crate::passes::{Batch, RenderedSource, show, spread};
 use crate::render::{Image, render};
 use crate::scene::Scene;
 use crate::source::FrameSource;
@@ -108,7 +108,7 @@ impl QualityTarget {
 /// Renders of the result before quantization, with which other renders are compared.
 pub(crate) struct ReferenceViews<'a> {
     scene: &'a Scene,
-    pictures: Vec<Picture>,
+    pictures: Vec<FrameView>,
     images: Vec<Image>,
 }
 
@@ -124,7 +124,7 @@ impl ReferenceViews<'_> {
     fn render<T: Send>(&self, source: &dyn FrameSource, finish: impl Fn(usize, Image) -> T + Sync) -> Result<Vec<T>> {
         let mut rendered = Vec::with_capacity(self.pictures.len());
         let batch = Batch::of_frame(&self.scene.limits);
-        show([Subject::all(source)], &self.scene.schedule.cameras, &self.pictures, batch, |views| {
+        show([RenderedSource::all(source)], &self.scene.schedule.cameras, &self.pictures, batch, |views| {
             let first = rendered.len();
             let view = |(k, view): (usize, &crate::passes::ViewStates<'_, 1>)| {
                 finish(first + k, render(view.states[0], view.camera, self.scene.background))

@@ -15,7 +15,7 @@ use crate::error::Result;
 use crate::journal::Journal;
 use crate::limits::Limits;
 use crate::memory_plan::{REMOVE, ResourceEstimate, Workload};
-use crate::model::{Columns, Picture};
+use crate::model::{Attributes, FrameView};
 use crate::passes::spread_over;
 use crate::pipeline::planning::Planning;
 use crate::pipeline::stage::{CountPlan, EstimateInput, Phase, RunState, Stage, StageList};
@@ -90,8 +90,8 @@ impl Stage for Rounds {
 impl Rounds {
     /// Returns the stage, or `None` if `recipe` ranks only once. `target` is the requested fraction of the Gaussians.
     /// The stage needs visible contributions.
-    pub(crate) fn from_recipe(recipe: &recipe::Select, target: Option<f64>) -> Option<Rounds> {
-        let recipe::Select {
+    pub(crate) fn from_recipe(recipe: &recipe::SelectParams, target: Option<f64>) -> Option<Rounds> {
+        let recipe::SelectParams {
             round_fraction: fraction,
             round_pictures: pictures,
             round_turns: turns,
@@ -104,7 +104,7 @@ impl Rounds {
 
     /// Returns the estimate: the ranking, and renders of all survivors.
     pub(crate) fn need(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
-        let (looking, fixed) = work.looking(limits, Columns::all(), 8);
+        let (looking, fixed) = work.looking(limits, Attributes::all(), 8);
         let all = (self.pictures as u64).min(work.pictures);
         let turns = (self.turns as u64).min(all).max(1);
         let per_gaussian =
@@ -113,7 +113,7 @@ impl Rounds {
         let seconds = (0..self.rounds(self.usual)).map(|round| {
             let left = work.count() * self.fraction.powi(round as i32);
             let pictures = all as f64 / if round == 0 { 1.0 } else { turns as f64 };
-            work.reading(left, pictures.min(work.frames as f64)) + work.picturing(pictures, left, REMOVE)
+            work.reading(left, pictures.min(work.frames as f64)) + work.render_seconds(pictures, left, REMOVE)
         });
         // The first round renders all groups, each with its own frames.
         let frames = all.min(work.frames).div_ceil(turns);
@@ -123,7 +123,7 @@ impl Rounds {
     }
 
     /// Returns the number of rounds until at most the fraction `fewest` is left. It is at most 2207, because the
-    /// fraction of a recipe is at most [`MOST_LEFT_BY_ROUND`](recipe::MOST_LEFT_BY_ROUND) and there are at most
+    /// fraction of a recipe is at most [`MAX_ROUND_FRACTION`](recipe::MOST_LEFT_BY_ROUND) and there are at most
     /// `u32::MAX` Gaussians.
     fn rounds(&self, fewest: f64) -> u32 {
         let fewest = fewest.max(1.0 / f64::from(u32::MAX));
@@ -138,9 +138,9 @@ impl Rounds {
     }
 
     /// Divides the views into groups (turns), by frames if there are enough frames, otherwise one by one.
-    fn turns(&self, scene: &Scene, scored: &Scored) -> Vec<Vec<Picture>> {
+    fn turns(&self, scene: &Scene, scored: &Scored) -> Vec<Vec<FrameView>> {
         let pictures = spread_over(&scene.schedule, self.pictures, scored.frames_to_see);
-        let by_frame: Vec<&[Picture]> = pictures.chunk_by(|a, b| a.frame == b.frame).collect();
+        let by_frame: Vec<&[FrameView]> = pictures.chunk_by(|a, b| a.frame == b.frame).collect();
         let parts = if by_frame.len() < self.turns { pictures.chunks(1).collect() } else { by_frame };
         let mut turns = vec![Vec::new(); self.turns.min(parts.len())];
         let count = turns.len().max(1);
@@ -215,7 +215,7 @@ impl Rounds {
         &self,
         scene: &Scene,
         scored: &Scored,
-        (mut state, turns): (RoundState, &[Vec<Picture>]),
+        (mut state, turns): (RoundState, &[Vec<FrameView>]),
         round: usize,
         (key, left): (CacheKey, usize),
         progress: &Progress,
@@ -284,7 +284,7 @@ fn entry_name(round: usize) -> String {
 }
 
 /// Returns the groups of views that a round renders: all in the first round, then one after the other.
-fn active_turns(turns: &[Vec<Picture>], round: usize) -> impl Iterator<Item = usize> {
+fn active_turns(turns: &[Vec<FrameView>], round: usize) -> impl Iterator<Item = usize> {
     let count = turns.len().max(1);
     let active = if round == 0 { turns.len() } else { 1.min(turns.len()) };
     (0..active).map(move |k| (round + k) % count)
@@ -329,8 +329,8 @@ mod tests {
         let all: Vec<u32> = (0..1500).collect();
         for target in [150, 500] {
             let quality = |kept: &[u32]| -> f64 {
-                let view_psnr = |picture: &Picture| {
-                    let original = gather(scene.source(), &all, picture.frame, Columns::all()).unwrap();
+                let view_psnr = |picture: &FrameView| {
+                    let original = gather(scene.source(), &all, picture.frame, Attributes::all()).unwrap();
                     let camera = &scene.schedule.cameras[picture.camera as usize];
                     psnr(&render(&original.pick(kept), camera, [0.0; 3]), &render(&original, camera, [0.0; 3]))
                 };
@@ -367,10 +367,10 @@ mod tests {
             let parts = rounds.turns(&scene, &scored);
             let all = spread_over(&scene.schedule, rounds.pictures, scored.frames_to_see);
             assert_eq!(parts.len(), turns.min(all.len()));
-            let mut together: Vec<Picture> = parts.concat();
+            let mut together: Vec<FrameView> = parts.concat();
             together.sort_by_key(|picture| (picture.frame, picture.view));
             assert_eq!(together, all, "{turns} turns");
-            let frames = |part: &Vec<Picture>| part.chunk_by(|a, b| a.frame == b.frame).count();
+            let frames = |part: &Vec<FrameView>| part.chunk_by(|a, b| a.frame == b.frame).count();
             let read: usize = parts.iter().map(frames).sum();
             assert_eq!(read == all.chunk_by(|a, b| a.frame == b.frame).count(), frames_apart, "{turns} turns");
         }
@@ -379,7 +379,7 @@ mod tests {
     #[test]
     fn every_round_removes_a_gaussian_whatever_the_fraction() {
         let recipe = Recipe::preset("default").unwrap();
-        for fraction in [0.1, 0.5, 0.9, recipe::MOST_LEFT_BY_ROUND, 0.999_999_999_9, 1.0 - f64::EPSILON / 2.0] {
+        for fraction in [0.1, 0.5, 0.9, recipe::MAX_ROUND_FRACTION, 0.999_999_999_9, 1.0 - f64::EPSILON / 2.0] {
             let rounds = Rounds { fraction, ..Rounds::from_recipe(&recipe.select, None).unwrap() };
             for (count, protected) in (0..=50).flat_map(|count| [(count, 0), (count, 7)]) {
                 for fewest in 0..=count {
@@ -399,7 +399,7 @@ mod tests {
     fn number_of_rounds_is_bounded_even_for_a_zero_target() {
         let recipe = Recipe::preset("default").unwrap();
         let rounds =
-            Rounds { fraction: recipe::MOST_LEFT_BY_ROUND, ..Rounds::from_recipe(&recipe.select, Some(0.0)).unwrap() };
+            Rounds { fraction: recipe::MAX_ROUND_FRACTION, ..Rounds::from_recipe(&recipe.select, Some(0.0)).unwrap() };
         assert_eq!([0.0, 1e-300, 1.0, 2.0].map(|fewest| rounds.rounds(fewest)), [2207, 2207, 0, 0]);
     }
 

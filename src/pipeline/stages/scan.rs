@@ -4,13 +4,13 @@ use crate::error::Result;
 use crate::journal::Journal;
 use crate::limits::Limits;
 use crate::memory_plan::{ResourceEstimate, Workload};
-use crate::model::{Columns, Rows};
+use crate::model::{Attributes, Rows};
 use crate::passes::BLOCK;
 use crate::recipe;
 use crate::scene::Scene;
 use crate::statistics;
 use crate::statistics::ScanPlan;
-use crate::statistics::pass::{Scanned, scan_blocks, scan_units};
+use crate::statistics::pass::{ScanResult, scan_blocks, scan_units};
 
 /// Name of the stage.
 pub(crate) const NAME: &str = "scan";
@@ -31,7 +31,7 @@ impl ScanStage {
     /// Returns the estimate: one block of Gaussians per thread, and the joined rows of all.
     pub fn need(&self, work: &Workload, _: &Limits) -> ResourceEstimate {
         // Within the stage a second reader may decode while the first is read.
-        let block = statistics::BYTES_PER_GAUSSIAN as u64 + 2 * work.held(&Limits::NONE, Columns::all());
+        let block = statistics::BYTES_PER_GAUSSIAN as u64 + 2 * work.held(&Limits::NONE, Attributes::all());
         // Number of alive Gaussians per frame, for the blocks of all threads, and the steps between uneven frames.
         let frames = work.frames * (4 * work.threads + 8);
         ResourceEstimate {
@@ -55,7 +55,7 @@ impl ScanStage {
     ///
     /// # Errors
     /// Fails if frames cannot be read or their times cannot be scanned.
-    pub fn run(&self, scene: &Scene, journal: &mut Journal) -> Result<Scanned> {
+    pub fn run(&self, scene: &Scene, journal: &mut Journal) -> Result<ScanResult> {
         let source = scene.source();
         let info = source.info();
         let plan = ScanPlan::new(&self.recipe, &info.times, &scene.schedule)?;
@@ -63,7 +63,7 @@ impl ScanStage {
         journal.stage(NAME, info.count, source, |_| {
             let units = scan_units(info);
             let found = scene.work.divided(NAME, scene.work.key(&plan), units, compute, |parts| {
-                let mut all = Scanned { alive_per_frame: vec![0; info.times.len()], ..Scanned::default() };
+                let mut all = ScanResult { alive_per_frame: vec![0; info.times.len()], ..ScanResult::default() };
                 for part in parts {
                     all.join(part?);
                 }

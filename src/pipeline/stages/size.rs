@@ -7,13 +7,13 @@ use crate::error::{Error, Result};
 use crate::journal::Journal;
 use crate::memory_plan::ResourceEstimate;
 use crate::outputs::kind::OutputKind;
-use crate::passes::{VIEWS_AT_ONCE, spread};
+use crate::passes::{VIEWS_PER_FRAME, spread};
 use crate::pipeline::planning::Planning;
 use crate::pipeline::request::Goal;
 use crate::pipeline::stage::{ByteLimitFit, EstimateInput, Phase, RunState, Stage, StageList};
 use crate::pipeline::stages::archive;
 use crate::pipeline::stages::field::FieldPrecisionStage;
-use crate::pipeline::stages::write::Emit;
+use crate::pipeline::stages::write::WriteStage;
 use crate::pruning::removal::removal_error;
 use crate::pruning::score::Scored;
 use crate::recipe::Precision;
@@ -87,7 +87,7 @@ impl Stage for ShrinkToBytes {
 #[derive(Debug, Clone)]
 struct ByteLimit {
     /// Stage that writes the files.
-    writer: Emit,
+    writer: WriteStage,
     /// Maximum number of bytes.
     most: u64,
     /// Assumed precision of the field: half precision if the field may be rounded.
@@ -99,7 +99,7 @@ impl ByteLimit {
         let Some(Goal::Bytes(most)) = planning.request.goal else { return None };
         let is_rounded = FieldPrecisionStage::from_request(planning.request, planning.output).is_some();
         let field = if is_rounded { Precision::Half } else { Precision::Exact };
-        Some(ByteLimit { writer: Emit::from_planning(planning), most, field })
+        Some(ByteLimit { writer: WriteStage::from_planning(planning), most, field })
     }
 
     /// Returns the numbers of Gaussians `ids` that fit for the SH degree of `template` and, if degrees may be dropped,
@@ -147,7 +147,7 @@ impl ByteLimit {
         journal: &mut Journal,
     ) -> Result<usize> {
         let (all, most) = (ids.len(), self.most);
-        journal.kept_stage(NAME, all, scene, self.key(scene, recipe, template), |_| {
+        journal.run_cached_stage(NAME, all, scene, self.key(scene, recipe, template), |_| {
             let bytes = |count: usize| {
                 let kept = (0..count).map(|k| ids[k * all / count]).collect();
                 let some = template.with(kept);
@@ -204,7 +204,7 @@ impl ByteLimit {
         journal: &mut Journal,
     ) -> Result<CompressedModel> {
         let key = self.key(scene, recipe, &compressed).and(&scored.protected);
-        journal.kept_stage(NAME, compressed.len(), scene, key, |_| {
+        journal.run_cached_stage(NAME, compressed.len(), scene, key, |_| {
             let bytes = |compressed: &CompressedModel| self.writer.bytes(scene, compressed, recipe);
             let empty = bytes(&compressed.pick(&[]))?;
             let mut tried = 0;
@@ -235,10 +235,10 @@ impl ByteLimit {
     fn best(&self, scene: &Scene, scored: &Scored, compressed: &CompressedModel, count: usize) -> Result<Vec<u32>> {
         let result = scene.input.reduced(compressed)?;
         let places: Vec<u32> = (0..compressed.len() as u32).collect();
-        let pictures = spread(&scene.schedule, RANKING_VIEWS, VIEWS_AT_ONCE);
+        let pictures = spread(&scene.schedule, RANKING_VIEWS, VIEWS_PER_FRAME);
         let looked_at = (&scene.schedule.cameras[..], &pictures[..]);
         let errors = removal_error(&*result, &places, looked_at, scene.background, 0.0, scene.limits, || ())?;
-        Ok(errors.most_missed(count, |place| scored.is_protected(compressed.kept[place])))
+        Ok(errors.top_by_error(count, |place| scored.is_protected(compressed.kept[place])))
     }
 }
 

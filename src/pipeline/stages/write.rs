@@ -15,8 +15,8 @@ use crate::files::atomic::{
 use crate::files::names::name_of;
 use crate::journal::Journal;
 use crate::limits::Limits;
-use crate::memory_plan::{ResourceEstimate, Workload, of_left};
-use crate::model::Columns;
+use crate::memory_plan::{ResourceEstimate, Workload, bytes_of_survivors};
+use crate::model::Attributes;
 use crate::models::{InputModel, Size};
 use crate::outputs::bounds::Bounds;
 use crate::outputs::container::{FRAME_BLOCK, write_container};
@@ -36,7 +36,7 @@ const NAME: &str = "emit";
 /// Usual fraction of the Gaussians that is written, for time estimates.
 const USUAL_LEFT: f64 = 0.5;
 /// Time to encode and write a state, seconds (`benches/pack.rs`).
-pub const ENCODING: f64 = 3.5e-7;
+pub const SECONDS_TO_ENCODE: f64 = 3.5e-7;
 
 /// Assumed maximum bytes of the summary and a file header beside a result; long lists of files or notes may exceed it.
 const MAX_SUMMARY_BYTES: u64 = 16 << 10;
@@ -67,7 +67,7 @@ pub fn beside_names(output: &Path, kind: OutputKind) -> impl Iterator<Item = Str
 
 /// Stage that writes the result.
 #[derive(Debug, Clone)]
-pub struct Emit {
+pub struct WriteStage {
     /// Kind of output.
     pub kind: OutputKind,
     /// Whether the result may have proxies.
@@ -78,10 +78,10 @@ pub struct Emit {
 
 /// Adds the stage.
 pub(super) fn plan(planning: &Planning<'_>, stages: &mut StageList) {
-    stages.add(Phase::Write, Emit::from_planning(planning));
+    stages.add(Phase::Write, WriteStage::from_planning(planning));
 }
 
-impl Stage for Emit {
+impl Stage for WriteStage {
     fn estimates(&self, EstimateInput { work, limits, left, .. }: EstimateInput<'_>) -> Vec<ResourceEstimate> {
         vec![self.need(work, limits, left)]
     }
@@ -92,7 +92,7 @@ impl Stage for Emit {
     }
 
     fn run(&self, run: &mut RunState<'_>) -> Result<()> {
-        run.scene.work.not_divided("writing")?;
+        run.scene.work.end_shard_before("writing")?;
         let scored = run.scored()?;
         let mut map = run.result.index_map(run.scene.source().info().count);
         if let Some(Archived::Content(encoded)) = &run.archived {
@@ -145,11 +145,11 @@ fn reorder(map: &mut [Option<u32>], order: &[u32]) {
     map.iter_mut().flatten().for_each(|place| *place = places[*place as usize]);
 }
 
-impl Emit {
+impl WriteStage {
     /// Returns the stage for the output of a run.
-    pub(in crate::pipeline) fn from_planning(planning: &Planning<'_>) -> Emit {
+    pub(in crate::pipeline) fn from_planning(planning: &Planning<'_>) -> WriteStage {
         let Planning { request, output, merges, .. } = *planning;
-        Emit { kind: output, merges, output: request.output.clone(), overwrite: request.overwrite }
+        WriteStage { kind: output, merges, output: request.output.clone(), overwrite: request.overwrite }
     }
 
     /// Checks, before any work, that a run which reads `inputs` can write the result and the files beside it.
@@ -178,17 +178,18 @@ impl Emit {
 
     /// Returns the estimate: the result with the fraction `left` of the Gaussians, and write buffers.
     pub fn need(&self, work: &Workload, limits: &Limits, left: f64) -> ResourceEstimate {
-        let whole = work.state(Columns::all());
+        let whole = work.state(Attributes::all());
         let is_solved = work.input.reduced > 0;
         let mut per_gaussian =
-            [scored_memory(limits), vec![("kept", 40), ("result", of_left(left, work.input.reduced))]].concat();
+            [scored_memory(limits), vec![("kept", 40), ("result", bytes_of_survivors(left, work.input.reduced))]]
+                .concat();
         let within = if self.kind == OutputKind::Archive { bounds::storing_memory(work) } else { Vec::new() };
         let mut fixed = if within.is_empty() { work.writing() } else { within };
         match self.kind {
             OutputKind::Gseq if self.merges && !is_solved => {
                 // Frames of one block, and one state, of each member and of each proxy.
-                let mixed = Columns::all().difference(Columns::SH) | work.varying;
-                let waiting = work.held(&Limits::NONE, Columns::all()) + FRAME_BLOCK as u64 * work.state(mixed);
+                let mixed = Attributes::all().difference(Attributes::SH) | work.varying;
+                let waiting = work.held(&Limits::NONE, Attributes::all()) + FRAME_BLOCK as u64 * work.state(mixed);
                 let together = (limits.gaussians_together as u64).min(work.gaussians);
                 per_gaussian.push(("members", CLUSTERED));
                 fixed.push(("merged", together * (waiting + 2 * whole + work.input.reader + 24)));
@@ -199,9 +200,9 @@ impl Emit {
             _ => {
                 // The trajectories of proxies are computed from all members.
                 let merging = if is_solved { left } else { 1.0 };
-                per_gaussian.push(("readers", of_left(merging, work.input.reader)));
-                per_gaussian.push(("held", of_left(merging, work.held(limits, Columns::all()))));
-                let rows = of_left(left, work.threads * (work.input.file + 2 * whole));
+                per_gaussian.push(("readers", bytes_of_survivors(merging, work.input.reader)));
+                per_gaussian.push(("held", bytes_of_survivors(merging, work.held(limits, Attributes::all()))));
+                let rows = bytes_of_survivors(left, work.threads * (work.input.file + 2 * whole));
                 per_gaussian.push(("files", work.input.file + rows));
                 per_gaussian.push(("members", CLUSTERED));
             }
@@ -222,7 +223,7 @@ impl Emit {
         };
         let frames = if is_solved && !self.kind.holds_frames() { 0.0 } else { work.frames as f64 };
         let left = USUAL_LEFT * work.count();
-        let seconds = work.reading(left, frames) + left * frames * ENCODING;
+        let seconds = work.reading(left, frames) + left * frames * SECONDS_TO_ENCODE;
         ResourceEstimate { stage: NAME, reads, seconds, per_gaussian, fixed }
     }
 

@@ -27,7 +27,7 @@ fn looked() -> Looked {
     let folder = tempfile::tempdir().unwrap();
     let made = Scene::new(3000, 12);
     let path = folder.path().join("scene.gseq");
-    write_container(&made, &path, gseq::Compression::Raw, Default::default(), |_| ()).unwrap();
+    write_container(&made, &path, gseq::Compression::StoredParams, Default::default(), |_| ()).unwrap();
     let input = Box::new(Container::open(&path).unwrap());
     let rig = made.rig();
     let scene = crate::scene::Scene::new(path, input, rig, Some(Split::Train)).unwrap();
@@ -53,7 +53,7 @@ impl Looked {
         let left: Vec<u32> = all.iter().copied().filter(|&i| !lost(i as usize)).collect();
         let (mut seen, mut names) = (Vec::new(), Vec::new());
         for frame in (0..self.made.info().times.len()).step_by(3) {
-            let state = gather(&self.made, &all, frame, crate::model::Columns::all()).unwrap();
+            let state = gather(&self.made, &all, frame, crate::model::Attributes::all()).unwrap();
             for view in [1usize, 2, 4] {
                 let camera = &rig.cameras[view];
                 let taken = RenderedViews {

@@ -4,7 +4,7 @@ use std::ops::Range;
 use std::sync::{Mutex, PoisonError};
 
 use crate::error::Result;
-use crate::model::{Camera, Columns, Gaussians, Rows, Schedule};
+use crate::model::{Attributes, Camera, Gaussians, Rows, ViewSchedule};
 use crate::passes::BLOCK;
 use crate::progress::Progress;
 use crate::source::{BlockReader, FrameSource, Ids};
@@ -14,7 +14,7 @@ use crate::statistics::{BlockScan, ScanPlan, wanted};
 pub(crate) struct BlockScans<'a> {
     pub(crate) source: &'a dyn FrameSource,
     /// Cameras of each frame.
-    pub(crate) schedule: &'a Schedule,
+    pub(crate) schedule: &'a ViewSchedule,
     pub(crate) plan: &'a ScanPlan,
     /// Blocks to scan.
     pub(crate) blocks: Range<usize>,
@@ -40,7 +40,7 @@ impl<'a> BlockScans<'a> {
     }
 
     /// Returns the columns that may have changed since the previous frame.
-    pub(crate) fn changed(&self, frame: usize) -> Columns {
+    pub(crate) fn changed(&self, frame: usize) -> Attributes {
         wanted(frame, self.source.info().varying)
     }
 

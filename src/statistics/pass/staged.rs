@@ -142,16 +142,16 @@ fn accumulate<'a>(
 mod tests {
     use super::*;
     use crate::diagnostics::demo_scene::Scene;
-    use crate::model::{Columns, Gaussians, Schedule, SequenceInfo};
+    use crate::model::{Attributes, Gaussians, SequenceInfo, ViewSchedule};
     use crate::passes::BLOCK;
     use crate::recipe::Recipe;
     use crate::source::FrameSource;
     use crate::statistics::ScanPlan;
-    use crate::statistics::pass::Scanned;
+    use crate::statistics::pass::ScanResult;
     use crate::statistics::pass::scan;
 
     /// Gaussians, frames and columns of one call of `fetch`.
-    type Fetched = (Range<usize>, Range<usize>, Columns);
+    type Fetched = (Range<usize>, Range<usize>, Attributes);
 
     /// Scene that asks to be fetched in blocks of `frame_block` frames, and whose frames from `fails_from` on cannot be
     /// read.
@@ -167,9 +167,9 @@ mod tests {
             SlowScene { scene: Scene::new(4 * BLOCK + 77, 7), frame_block, fails_from, fetched: Mutex::default() }
         }
 
-        fn scan(&self, threads: usize) -> Result<Scanned> {
+        fn scan(&self, threads: usize) -> Result<ScanResult> {
             let info = self.scene.info();
-            let schedule: Schedule = self.scene.rig().schedule(&info.times, None).unwrap();
+            let schedule: ViewSchedule = self.scene.rig().schedule(&info.times, None).unwrap();
             let plan = ScanPlan::new(&Recipe::preset("default").unwrap().scan, &info.times, &schedule).unwrap();
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
             pool.install(|| scan(self, &schedule, &plan))
@@ -195,7 +195,7 @@ mod tests {
             self.frame_block.unwrap_or_default()
         }
 
-        fn fetch(&self, gaussians: Range<usize>, frames: Range<usize>, want: Columns) {
+        fn fetch(&self, gaussians: Range<usize>, frames: Range<usize>, want: Attributes) {
             self.fetched.lock().unwrap().push((gaussians, frames, want));
         }
     }
@@ -206,7 +206,7 @@ mod tests {
     }
 
     impl BlockReader for SlowReader<'_> {
-        fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
+        fn read(&mut self, frame: usize, want: Attributes, out: &mut Gaussians) -> Result<()> {
             if frame >= self.fails_from {
                 return Err(Error::usage(format!("frame {frame} is gone")));
             }
@@ -226,7 +226,7 @@ mod tests {
             let mut states = 0;
             for (gaussians, frames, want) in scene.fetched.into_inner().unwrap() {
                 states += gaussians.len() * frames.len();
-                assert_eq!(want, if frames.start == 0 { Columns::all() } else { scene.scene.info().varying });
+                assert_eq!(want, if frames.start == 0 { Attributes::all() } else { scene.scene.info().varying });
             }
             assert_eq!(states, scene.scene.info().count * 7, "each unit is fetched once");
         }

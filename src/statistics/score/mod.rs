@@ -42,14 +42,14 @@ impl Scores {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Term {
     /// Quantity that is normalized.
-    pub of: Graded,
+    pub of: Quantity,
     /// Normalization of the quantity.
     pub norm: Norm,
 }
 
 /// Quantity that grades Gaussians: a statistic, or a combination of several.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-pub enum Graded {
+pub enum Quantity {
     /// A single statistic.
     By(Statistic),
     /// √(C·W).
@@ -60,34 +60,34 @@ pub enum Graded {
     Dynamic,
 }
 
-impl From<StaticTerm> for Graded {
-    fn from(term: StaticTerm) -> Graded {
+impl From<StaticTerm> for Quantity {
+    fn from(term: StaticTerm) -> Quantity {
         match term {
-            StaticTerm::Mean => Graded::By(Statistic::C),
-            StaticTerm::Peak => Graded::By(Statistic::W),
-            StaticTerm::Geometric => Graded::Geometric,
+            StaticTerm::Mean => Quantity::By(Statistic::C),
+            StaticTerm::Peak => Quantity::By(Statistic::W),
+            StaticTerm::Geometric => Quantity::Geometric,
         }
     }
 }
 
-impl Graded {
+impl Quantity {
     /// Returns the name used in summaries and reports.
     pub fn name(self) -> &'static str {
         match self {
-            Graded::By(statistic) => statistic.name(),
-            Graded::Geometric => "sqrt(C*W)",
-            Graded::Static => "S_static",
-            Graded::Dynamic => "S_dynamic",
+            Quantity::By(statistic) => statistic.name(),
+            Quantity::Geometric => "sqrt(C*W)",
+            Quantity::Static => "S_static",
+            Quantity::Dynamic => "S_dynamic",
         }
     }
 
     /// Returns the property of a Gaussian that the quantity measures, in words.
     pub fn property(self) -> &'static str {
         match self {
-            Graded::By(statistic) => statistic.property(),
-            Graded::Geometric => Statistic::C.property(),
-            Graded::Static => "the static score",
-            Graded::Dynamic => "the dynamic score",
+            Quantity::By(statistic) => statistic.property(),
+            Quantity::Geometric => Statistic::C.property(),
+            Quantity::Static => "the static score",
+            Quantity::Dynamic => "the dynamic score",
         }
     }
 }
@@ -97,12 +97,12 @@ impl Graded {
 /// Rows with [`Flags::NON_FINITE`] are excluded from the percentiles and have score 0 throughout. `rows.e` is used only
 /// if λ > 0. An empty list of rows gives empty scores.
 pub fn score(rows: &Rows, frames: usize, recipe: &recipe::ScoreParams) -> Scores {
-    score_by(PercentilePasses::Two, rows, frames, recipe)
+    score_with_passes(PercentilePasses::Two, rows, frames, recipe)
 }
 
 /// Computes the scores as [`score`] does, with percentiles found in the given number of passes.
-pub fn score_by(passes: PercentilePasses, rows: &Rows, frames: usize, recipe: &recipe::ScoreParams) -> Scores {
-    use Graded::By;
+pub fn score_with_passes(passes: PercentilePasses, rows: &Rows, frames: usize, recipe: &recipe::ScoreParams) -> Scores {
+    use Quantity::By;
     use Statistic::{C, D, E, Kappa, Life, V, W};
     let is_finite: Vec<bool> = rows.flags.iter().map(|flags| !flags.contains(Flags::NON_FINITE)).collect();
     let life = |i: usize| f64::from(rows.life[i]) / frames.max(1) as f64;
@@ -113,7 +113,7 @@ pub fn score_by(passes: PercentilePasses, rows: &Rows, frames: usize, recipe: &r
     match recipe.static_term {
         StaticTerm::Peak if !rows.w.is_empty() => sum.add(&mut static_score, By(W), 1.0, |i| rows.w[i]),
         StaticTerm::Geometric if !rows.w.is_empty() => {
-            sum.add(&mut static_score, Graded::Geometric, 1.0, |i| (rows.c[i] * rows.w[i]).sqrt());
+            sum.add(&mut static_score, Quantity::Geometric, 1.0, |i| (rows.c[i] * rows.w[i]).sqrt());
         }
         _ => sum.add(&mut static_score, By(C), 1.0, |i| rows.c[i]),
     }
@@ -127,9 +127,9 @@ pub fn score_by(passes: PercentilePasses, rows: &Rows, frames: usize, recipe: &r
     let score =
         static_score.iter().zip(&dynamic_score).map(|(s, d)| recipe.w_static * s + recipe.w_dynamic * d).collect();
     let mut static_norm = vec![0.0; rows.len()];
-    sum.add(&mut static_norm, Graded::Static, 1.0, |i| static_score[i]);
+    sum.add(&mut static_norm, Quantity::Static, 1.0, |i| static_score[i]);
     let mut dynamic_norm = vec![0.0; rows.len()];
-    sum.add(&mut dynamic_norm, Graded::Dynamic, 1.0, |i| dynamic_score[i]);
+    sum.add(&mut dynamic_norm, Quantity::Dynamic, 1.0, |i| dynamic_score[i]);
     let terms = sum.terms;
     Scores { static_score, dynamic_score, score, static_norm, dynamic_norm, terms }
 }
@@ -145,7 +145,7 @@ struct Summation<'a> {
 impl Summation<'_> {
     /// Adds weight · norm(value) to `total` in all rows that are finite, and records the term. Does nothing if the
     /// weight is 0.
-    fn add(&mut self, total: &mut [f64], of: Graded, weight: f64, value: impl Fn(usize) -> f64) {
+    fn add(&mut self, total: &mut [f64], of: Quantity, weight: f64, value: impl Fn(usize) -> f64) {
         if weight == 0.0 {
             return;
         }
@@ -215,7 +215,7 @@ mod tests {
         let mut rows = rows(100);
         rows.e = vec![f64::NAN; 100];
         let scores = score(&rows, 100, &preset("default"));
-        assert!(scores.terms.iter().all(|term| ![Statistic::E, Statistic::Life].map(Graded::By).contains(&term.of)));
+        assert!(scores.terms.iter().all(|term| ![Statistic::E, Statistic::Life].map(Quantity::By).contains(&term.of)));
         assert!(scores.score.iter().all(|s| s.is_finite()));
     }
 
@@ -284,7 +284,7 @@ mod tests {
         rows.life = vec![50; 200];
         let plain = score(&rows, 100, &preset("paper"));
         let weighed = score(&rows, 100, &recipe::ScoreParams { weigh_motion_by_life: true, ..preset("paper") });
-        let d = |scores: &Scores| scores.terms.iter().find(|t| t.of == Graded::By(Statistic::D)).unwrap().norm.p99;
+        let d = |scores: &Scores| scores.terms.iter().find(|t| t.of == Quantity::By(Statistic::D)).unwrap().norm.p99;
         assert_eq!(d(&weighed), 0.5 * d(&plain));
     }
 }

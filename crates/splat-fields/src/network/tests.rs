@@ -10,9 +10,9 @@ fn network(kind: DeepVariant) -> Network {
 }
 
 /// Returns random positions.
-fn positions(rows: usize) -> Column {
+fn positions(rows: usize) -> AttributeValues {
     let mut noise = Noise(11);
-    let mut values = Column::zeros(3, rows);
+    let mut values = AttributeValues::zeros(3, rows);
     values.planes_mut().iter_mut().for_each(|x| *x = 1.5 * noise.next());
     values
 }
@@ -73,11 +73,14 @@ fn row(motion: &PredictedMotion, i: usize) -> Vec<f64> {
 fn every_variant_matches_the_f64_oracle() {
     for kind in KINDS {
         let (network, oracle, positions) = (network(kind), NetworkOracle(tensors(kind)), positions(37));
-        assert_eq!((network.has_screws(), network.active().contains(Columns::SH)), (kind.screws, kind.all_heads));
+        assert_eq!(
+            (network.predicts_screw_motion(), network.active().contains(Attributes::SH)),
+            (kind.screws, kind.all_heads)
+        );
         let encoded = network.encode(&positions);
         let mut motion = PredictedMotion::default();
         for time in [0.0f32, 0.37, 1.0] {
-            network.motion(&encoded, f64::from(time), Columns::all(), &mut motion).unwrap();
+            network.motion(&encoded, f64::from(time), Attributes::all(), &mut motion).unwrap();
             for i in 0..positions.len() {
                 let expected = oracle.motion(kind, positions.row::<3>(i).map(f64::from), f64::from(time));
                 let found = row(&motion, i);
@@ -144,13 +147,13 @@ fn motion_does_not_depend_on_block_or_requested_heads() {
     let network = network(KINDS[0]);
     let all = positions(70);
     let mut whole = PredictedMotion::default();
-    network.motion(&network.encode(&all), 0.6, Columns::all(), &mut whole).unwrap();
+    network.motion(&network.encode(&all), 0.6, Attributes::all(), &mut whole).unwrap();
     for ids in [vec![0], vec![3, 69, 4], (20..55).collect()] {
         let mut part = PredictedMotion::default();
         let encoded = network.encode(&all.pick(&ids));
-        network.motion(&encoded, 0.6, Columns::LOG_SCALE, &mut part).unwrap();
+        network.motion(&encoded, 0.6, Attributes::LOG_SCALE, &mut part).unwrap();
         assert!(part.warp.is_empty());
-        network.motion(&encoded, 0.6, Columns::POSITION, &mut part).unwrap();
+        network.motion(&encoded, 0.6, Attributes::POSITION, &mut part).unwrap();
         assert_eq!((&part.scaling, &part.warp), (&whole.scaling.pick(&ids), &whole.warp.pick(&ids)));
     }
 }
@@ -197,7 +200,7 @@ fn tensors_that_do_not_fit_are_named_in_the_error() {
     }
     assert!(
         network(KINDS[0])
-            .motion(&Encoded::default(), f64::NAN, Columns::all(), &mut PredictedMotion::default())
+            .motion(&Encoded::default(), f64::NAN, Attributes::all(), &mut PredictedMotion::default())
             .is_err()
     );
 }

@@ -6,14 +6,14 @@
 
 use std::sync::OnceLock;
 
-use crate::CutShortMessage;
+use crate::TruncatedMapMessage;
 
 /// Text of the handler. It is set before the handler is installed.
-static MESSAGE: OnceLock<CutShortMessage> = OnceLock::new();
+static MESSAGE: OnceLock<TruncatedMapMessage> = OnceLock::new();
 
 /// Installs a handler for access to a mapped file that has been truncated. The handler writes `message` with the path
 /// of the file to standard error and ends the process with code 1. The message of the first call stays.
-pub fn report_cut_short_maps(message: CutShortMessage) {
+pub fn report_cut_short_maps(message: TruncatedMapMessage) {
     MESSAGE.get_or_init(|| message);
     let mut action: libc::sigaction = unsafe {
         // SAFETY: all fields of `sigaction` are integers or pointers that may be null, so zero bytes are a valid value.

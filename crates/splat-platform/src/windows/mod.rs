@@ -19,7 +19,7 @@ use windows_sys::Win32::Storage::FileSystem::{
 use windows_sys::Win32::System::Console::{CTRL_BREAK_EVENT, CTRL_C_EVENT, SetConsoleCtrlHandler};
 use windows_sys::core::BOOL;
 
-use crate::{CutShortMessage, FileIdentity, FileStatus};
+use crate::{FileIdentity, FileStatus, TruncatedMapMessage};
 pub use folder::FolderHandle;
 pub use memory::{memory_limits, peak_memory_bytes, reset_peak_memory};
 
@@ -146,7 +146,7 @@ pub fn is_cached(_file: &File, _offset: u64) -> Option<bool> {
 }
 
 /// Does nothing: on Windows a mapped file cannot be truncated.
-pub fn report_cut_short_maps(_message: CutShortMessage) {}
+pub fn report_cut_short_maps(_message: TruncatedMapMessage) {}
 
 /// Function that ends the process because of the signal with this number.
 type End = Box<dyn FnOnce(u8) + Send>;

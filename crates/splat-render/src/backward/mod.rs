@@ -21,7 +21,7 @@ use super::blend::SampledPixels;
 use super::convention::BLOCK;
 use super::project::CameraTerms;
 use super::renderer::{BYTES_PER_VISIBLE, Image, Renderer, fill_pairs};
-use splat_core::{Camera, Columns, Gaussians, GradientSpan, Gradients};
+use splat_core::{Attributes, Camera, Gaussians, GradientSpan, Gradients};
 use sums::{ImageGradientSums, SplatSums};
 use tile::{GradientSink, PixelGradients};
 
@@ -58,7 +58,7 @@ impl Renderer {
     ) -> f64 {
         assert_eq!(out.len(), gaussians.len(), "expected as many gradients as Gaussians");
         assert!(
-            out.column(Columns::SH).width() <= gaussians.sh.width(),
+            out.column(Attributes::SH).width() <= gaussians.sh.width(),
             "expected gradients of at most the SH degree of the Gaussians"
         );
         let view = CameraTerms::new(camera);
@@ -71,7 +71,7 @@ impl Renderer {
             "expected a derivative of the size of the render"
         );
 
-        if Columns::SH.contains(out.columns()) {
+        if Attributes::SH.contains(out.columns()) {
             self.backward_pass::<false>(&view, &image, &pixel_gradient);
         } else {
             self.backward_pass::<true>(&view, &image, &pixel_gradient);

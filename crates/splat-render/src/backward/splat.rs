@@ -12,7 +12,7 @@ use super::super::color;
 use super::super::convention::BLOCK;
 use super::super::project::{CameraTerms, LOGARITHM_LIMIT, ProjectedShape, Splat, cross, dot, opacity};
 use super::sums::SplatSums;
-use splat_core::{Columns, Gaussians, GradientSpan, sh_coefficients};
+use splat_core::{Attributes, Gaussians, GradientSpan, sh_coefficients};
 
 /// Adds the gradients of the Gaussians of `splats` to `out`, which contains these Gaussians. `sums` holds the gradient
 /// sums of each splat.
@@ -82,17 +82,17 @@ fn add_blocks(
         block.fill(&splats[..count], &sums[..count], start);
         (splats, sums) = (&splats[count..], &sums[count..]);
         let columns = out.columns();
-        let needs_direction = columns.contains(Columns::POSITION) && color::coefficients(gaussians) > 1;
-        if needs_direction || columns.contains(Columns::SH) {
+        let needs_direction = columns.contains(Attributes::POSITION) && color::coefficients(gaussians) > 1;
+        if needs_direction || columns.contains(Attributes::SH) {
             let directions = Directions::new(gaussians, ids.clone(), view);
-            if columns.contains(Columns::SH) {
+            if columns.contains(Attributes::SH) {
                 block.add_harmonics(gaussians, ids.clone(), &directions, out);
             }
             if needs_direction {
                 block.add_direction(gaussians, ids.clone(), &directions, out);
             }
         }
-        if !Columns::SH.contains(columns) {
+        if !Attributes::SH.contains(columns) {
             block.add_shape(gaussians, ids, view, out);
         }
     }
@@ -177,7 +177,7 @@ impl GradientBlock {
         for (k, values) in values.iter().enumerate().take(color::coefficients(gaussians)) {
             for (c, color) in self.color.iter().enumerate() {
                 let parts = values[..n].iter().zip(&color[..n]).map(|(value, color)| value * color);
-                out.add(Columns::SH, 3 * k + c, ids.start, parts);
+                out.add(Attributes::SH, 3 * k + c, ids.start, parts);
             }
         }
     }
@@ -217,7 +217,7 @@ impl GradientBlock {
             }
         }
         for (axis, parts) in parts.iter().enumerate() {
-            out.add(Columns::POSITION, axis, ids.start, parts[..n].iter().copied());
+            out.add(Attributes::POSITION, axis, ids.start, parts[..n].iter().copied());
         }
     }
 
@@ -225,11 +225,11 @@ impl GradientBlock {
     #[inline(always)]
     fn add_shape(&self, gaussians: &Gaussians, ids: Range<usize>, view: &CameraTerms, out: &mut GradientSpan<'_>) {
         let n = ids.len().min(BLOCK);
-        let plane = |column: Columns, c: usize| &gaussians.column(column).plane(c)[ids.clone()][..n];
-        let position: [&[f32]; 3] = std::array::from_fn(|c| plane(Columns::POSITION, c));
-        let rotation: [&[f32]; 4] = std::array::from_fn(|c| plane(Columns::ROTATION, c));
-        let log_scale: [&[f32]; 3] = std::array::from_fn(|c| plane(Columns::LOG_SCALE, c));
-        let logit = plane(Columns::OPACITY, 0);
+        let plane = |column: Attributes, c: usize| &gaussians.column(column).plane(c)[ids.clone()][..n];
+        let position: [&[f32]; 3] = std::array::from_fn(|c| plane(Attributes::POSITION, c));
+        let rotation: [&[f32]; 4] = std::array::from_fn(|c| plane(Attributes::ROTATION, c));
+        let log_scale: [&[f32]; 3] = std::array::from_fn(|c| plane(Attributes::LOG_SCALE, c));
+        let logit = plane(Attributes::OPACITY, 0);
         let mut parts = [[0.0f32; BLOCK]; 11];
         let GradientBlock { p, first, second, .. } = self;
         for i in 0..n {
@@ -251,10 +251,10 @@ impl GradientBlock {
             parts[10][i] = ((1.0 - opacity(logit[i])) * p[i]) as f32;
         }
         let places = [
-            (Columns::POSITION, 0, 3),
-            (Columns::ROTATION, 3, 4),
-            (Columns::LOG_SCALE, 7, 3),
-            (Columns::OPACITY, 10, 1),
+            (Attributes::POSITION, 0, 3),
+            (Attributes::ROTATION, 3, 4),
+            (Attributes::LOG_SCALE, 7, 3),
+            (Attributes::OPACITY, 10, 1),
         ];
         for (column, first, width) in places {
             for c in 0..width {

@@ -7,15 +7,15 @@ mod flip;
 mod ssim;
 
 pub use flip::flip;
-pub use ssim::{ssim, ssim_slope};
+pub use ssim::{ssim, ssim_gradient};
 
 use crate::Image;
 
 /// Bytes per pixel to compare two images. SSIM needs the most.
 pub const BYTES_PER_PIXEL: usize = 5 * size_of::<f64>();
 
-/// Bytes per pixel for [`ssim_slope`]: the sums of SSIM for three channels, and their derivatives twice.
-pub const BYTES_PER_PIXEL_OF_SLOPE: usize = 3 * (BYTES_PER_PIXEL + size_of::<f64>() + size_of::<f32>());
+/// Bytes per pixel for [`ssim_gradient`]: the sums of SSIM for three channels, and their derivatives twice.
+pub const SSIM_SLOPE_BYTES_PER_PIXEL: usize = 3 * (BYTES_PER_PIXEL + size_of::<f64>() + size_of::<f32>());
 
 /// Maximum PSNR in dB, returned for equal images. It keeps the mean over views finite.
 pub const PSNR_CAP_DB: f64 = 100.0;

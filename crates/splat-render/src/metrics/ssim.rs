@@ -48,7 +48,7 @@ pub fn ssim(a: &Image, b: &Image) -> f64 {
 ///
 /// # Panics
 /// If the sizes differ.
-pub fn ssim_slope(a: &Image, b: &Image) -> Image {
+pub fn ssim_gradient(a: &Image, b: &Image) -> Image {
     assert_same_size(a, b);
     let (width, count) = (a.width as usize, a.data.len() / 3);
     let channel_slopes = |channel: usize| {

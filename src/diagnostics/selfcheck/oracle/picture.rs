@@ -127,7 +127,12 @@ pub fn blended(gaussians: &Gaussians, camera: &Camera) -> Vec<Vec<usize>> {
 }
 
 /// Renders a view with the lists `blended` held fixed, which makes the image a smooth function of the parameters.
-pub fn decided(gaussians: &Gaussians, camera: &Camera, background: [f32; 3], blended: &[Vec<usize>]) -> Vec<[f64; 3]> {
+pub fn render_blended(
+    gaussians: &Gaussians,
+    camera: &Camera,
+    background: [f32; 3],
+    blended: &[Vec<usize>],
+) -> Vec<[f64; 3]> {
     let footprints: Vec<Option<Footprint>> = (0..gaussians.len()).map(|id| footprint(gaussians, id, camera)).collect();
     let pixel = |(at, ids): (usize, &Vec<usize>)| {
         let place = DVec2::new((at % camera.width as usize) as f64, (at / camera.width as usize) as f64);

@@ -1,7 +1,7 @@
 //! Oracle of the statistics: whole sequences in memory, the definitions of method.md written out in f64, sharing no
 //! code with the streaming scan.
 
-use crate::model::{Camera, Gaussians, Schedule};
+use crate::model::{Camera, Gaussians, ViewSchedule};
 use crate::recipe::{MotionParams, ScanParams};
 
 /// Statistics of one Gaussian.
@@ -16,7 +16,7 @@ pub(crate) struct OracleRow {
 }
 
 /// Returns the statistics of Gaussian `i`; frames are evenly spaced.
-pub(crate) fn row(i: usize, frames: &[Gaussians], schedule: &Schedule, scan: &ScanParams) -> OracleRow {
+pub(crate) fn row(i: usize, frames: &[Gaussians], schedule: &ViewSchedule, scan: &ScanParams) -> OracleRow {
     let last = frames.len() - 1;
     let x = |t: usize| frames[t].position.row::<3>(i).map(f64::from);
     let alpha: Vec<f64> =

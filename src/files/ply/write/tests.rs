@@ -3,7 +3,7 @@ use std::path::PathBuf;
 
 use super::*;
 use crate::files::ply::tests::{file, names, shared_data};
-use crate::model::{ALL_HARMONICS, Column};
+use crate::model::{AttributeValues, NO_SH_LIMIT};
 
 struct TempPly(tempfile::TempDir);
 
@@ -26,7 +26,7 @@ impl TempPly {
     }
 
     fn write_changed(&self, template: &Ply, rows: &[OutRow], proxies: &Gaussians, change: &ParamDelta) -> Vec<u8> {
-        write_like(template, rows, proxies, change, ALL_HARMONICS, &self.path("out.ply")).unwrap();
+        write_like(template, rows, proxies, change, NO_SH_LIMIT, &self.path("out.ply")).unwrap();
         fs::read(self.path("out.ply")).unwrap()
     }
 }
@@ -37,14 +37,14 @@ fn kept(ids: impl IntoIterator<Item = u32>) -> Vec<OutRow> {
 
 fn all(ply: &Ply) -> Gaussians {
     let mut out = Gaussians::zeros(0, ply.sh_degree());
-    ply.gaussians(0..ply.count(), Columns::all(), &mut out).unwrap();
+    ply.gaussians(0..ply.count(), Attributes::all(), &mut out).unwrap();
     out
 }
 
 /// Returns `len` Gaussians whose values are all different and exact in an i16.
 fn proxies(len: usize, sh_degree: usize) -> Gaussians {
     let mut out = Gaussians::zeros(len, sh_degree);
-    for (k, column) in Columns::all().iter().enumerate() {
+    for (k, column) in Attributes::all().iter().enumerate() {
         let fill = |(i, value): (usize, &mut f32)| *value = (1000 * (k + 1) + i) as f32;
         out.column_mut(column).planes_mut().iter_mut().enumerate().for_each(fill);
     }
@@ -52,7 +52,7 @@ fn proxies(len: usize, sh_degree: usize) -> Gaussians {
 }
 
 /// Returns the bits of all values, because NaN is not equal to itself.
-fn bits(column: &Column) -> Vec<u32> {
+fn bits(column: &AttributeValues) -> Vec<u32> {
     column.planes().iter().map(|x| x.to_bits()).collect()
 }
 
@@ -134,7 +134,7 @@ fn a_proxy_replaces_attributes_and_keeps_extra_properties() {
             let folder = TempPly::new();
             let out = folder.open(&written);
             let (before, after) = (all(&ply), all(&out));
-            for column in Columns::all().iter() {
+            for column in Attributes::all().iter() {
                 for plane in 0..after.column(column).width() {
                     let source = |gaussians: &Gaussians, i: usize| gaussians.column(column).plane(plane)[i];
                     let expected = [source(&proxies, 1), source(&before, 2), source(&proxies, 0)];
@@ -158,13 +158,13 @@ fn deltas_are_added_and_zeros_leave_the_bytes() {
         let rows = [OutRow { source: 2, proxy: None }, OutRow { source: 0, proxy: Some(0) }];
         let plain = temp.write(&ply, &rows, &proxies);
         let mut by = Gaussians::zeros(2, 0);
-        for column in Columns::all().difference(Columns::LOG_SCALE).iter() {
+        for column in Attributes::all().difference(Attributes::LOG_SCALE).iter() {
             by.column_mut(column).plane_mut(0).copy_from_slice(&[3.0, -2.0]);
         }
         let written = temp.write_changed(&ply, &rows, &proxies, &ParamDelta(by.clone()));
         let (folder, other) = (TempPly::new(), TempPly::new());
         let mut expected = all(&folder.open(&plain));
-        ParamDelta(by).add_to(&mut expected, Columns::all());
+        ParamDelta(by).add_to(&mut expected, Attributes::all());
         assert!(all(&other.open(&written)) == expected, "{format} {kind}");
         let zeros = temp.write_changed(&ply, &rows, &proxies, &ParamDelta(Gaussians::zeros(2, 1)));
         assert!(zeros == plain, "{format} {kind}");
@@ -179,7 +179,7 @@ fn lowering_the_sh_degree_gives_a_file_of_that_degree() {
     let ply = Ply::open(&temp.path("whole.ply")).unwrap();
     for degree in 0..=4 {
         let mut fewer = whole.clone();
-        fewer.drop_bands(degree);
+        fewer.truncate_sh(degree);
         assert_eq!(fewer.sh_degree(), degree.min(3));
         let [expected, found] = ["expected.ply", "found.ply"].map(|name| temp.path(name));
         write_inria(&fewer, ply.comments(), &expected).unwrap();
@@ -193,7 +193,7 @@ fn lowering_the_sh_degree_gives_a_file_of_that_degree() {
     let ply = temp.open(&file("binary_big_endian", "double", &names(), 3, "\r\n"));
     write_like(&ply, &rows, &proxies(1, 1), &change, 0, &temp.path("out.ply")).unwrap();
     let found = Ply::open(&temp.path("out.ply")).unwrap();
-    expected.drop_bands(0);
+    expected.truncate_sh(0);
     assert!(all(&found) == expected);
     let left: Vec<String> = names().into_iter().filter(|name| !name.starts_with("f_rest_")).collect();
     assert_eq!(found.properties().iter().map(|property| property.name.clone()).collect::<Vec<_>>(), left);
@@ -222,7 +222,7 @@ fn missing_rows_and_proxies_are_refused() {
     let temp = TempPly::new();
     let ply = temp.open(&file("binary_little_endian", "float", &names(), 2, "\n"));
     let refusal = |rows: &[OutRow], proxies: &Gaussians| {
-        write_like(&ply, rows, proxies, &ParamDelta::default(), ALL_HARMONICS, &temp.path("none.ply"))
+        write_like(&ply, rows, proxies, &ParamDelta::default(), NO_SH_LIMIT, &temp.path("none.ply"))
             .unwrap_err()
             .to_string()
     };
@@ -231,7 +231,7 @@ fn missing_rows_and_proxies_are_refused() {
     assert!(refusal(&[OutRow { source: 0, proxy: Some(0) }], &proxies(1, 3)).contains("48 SH planes"));
     let short = ParamDelta(Gaussians::zeros(1, 1));
     let path = temp.path("none.ply");
-    let message = write_like(&ply, &kept([0, 1]), &Gaussians::default(), &short, ALL_HARMONICS, &path);
+    let message = write_like(&ply, &kept([0, 1]), &Gaussians::default(), &short, NO_SH_LIMIT, &path);
     assert!(message.unwrap_err().to_string().contains("1 changes of 2 rows"));
     assert!(!temp.path("none.ply").exists());
 }
@@ -247,7 +247,7 @@ fn the_inria_layout_round_trips_at_every_degree() {
         let ply = Ply::open(&path).unwrap();
         assert_eq!(ply.comments(), ["SplatRenderMode: mip", "two lines"]);
         let back = all(&ply);
-        for column in Columns::all().iter() {
+        for column in Attributes::all().iter() {
             assert_eq!(bits(back.column(column)), bits(gaussians.column(column)), "{degree} {}", column.name());
         }
         if degree == 3 {

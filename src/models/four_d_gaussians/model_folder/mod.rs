@@ -13,8 +13,8 @@ use xxhash_rust::xxh3::Xxh3;
 use crate::deform::{Deltas, Field, Prepared, Scratch};
 use crate::error::{Error, Result};
 use crate::limits::ReadLimit;
-use crate::model::{Column, Columns, Gaussians, Jacobian, Raw, SequenceInfo};
-use crate::passes::{BLOCK, BlockSlices, InBlocks};
+use crate::model::{AttributeValues, Attributes, Gaussians, Jacobian, SequenceInfo, StoredParams};
+use crate::passes::{BLOCK, BlockSlices, BlockwiseReader};
 use crate::source::{BlockReader, Count, Deformation, FrameSource, Ids, ReadPlan, Reads};
 
 use super::cfg_args::ModelConfig;
@@ -93,7 +93,7 @@ impl ModelPaths {
 pub struct ModelFolder {
     paths: ModelPaths,
     config: ModelConfig,
-    canonical: Arc<Raw>,
+    canonical: Arc<StoredParams>,
     field: Arc<Field>,
     tensor_bytes: u64,
     info: SequenceInfo,
@@ -108,7 +108,12 @@ impl ModelFolder {
     ///
     /// # Errors
     /// Fails if a file cannot be read, contradicts another, or needs more than `memory`.
-    pub fn with_cloud(paths: ModelPaths, canonical: Gaussians, sh_degree: usize, memory: ReadLimit) -> Result<Self> {
+    pub fn with_gaussians(
+        paths: ModelPaths,
+        canonical: Gaussians,
+        sh_degree: usize,
+        memory: ReadLimit,
+    ) -> Result<Self> {
         let config = ModelConfig::read(&paths.cfg_args)?;
         let tensors = read_state_dict(&paths.deformation, memory)?;
         let notes = config.contradicted_by(&tensors);
@@ -137,7 +142,7 @@ impl ModelFolder {
     pub fn open_with(root: &Path, iteration: Option<u32>, options: &PlyOptions) -> Result<Self> {
         let paths = ModelPaths::locate(root, iteration)?;
         let ply = Ply::open_with(&paths.point_cloud, options)?;
-        Self::with_cloud(paths, ply.whole()?, ply.sh_degree(), options.memory)
+        Self::with_gaussians(paths, ply.whole()?, ply.sh_degree(), options.memory)
     }
 
     /// Returns the memory limit for reading the files of the model again.
@@ -214,10 +219,10 @@ impl ModelFolder {
     ///
     /// # Errors
     /// Fails if the field cannot be evaluated.
-    pub fn deltas_at(&self, position: &Column, time: f64) -> Result<Deltas> {
+    pub fn deltas_at(&self, position: &AttributeValues, time: f64) -> Result<Deltas> {
         let prepared = self.field.prepare(position);
         let mut deltas = Deltas::new(self.info.sh_degree);
-        self.field.deltas(&prepared, time, Columns::all(), &mut Scratch::default(), &mut deltas)?;
+        self.field.deltas(&prepared, time, Attributes::all(), &mut Scratch::default(), &mut deltas)?;
         Ok(deltas)
     }
 }
@@ -233,7 +238,7 @@ impl FrameSource for ModelFolder {
             return Err(Error::internal(format!("Gaussian {id} was asked for; the model has {count}")));
         }
         let mut raw = Gaussians::zeros(ids.len(), self.info.sh_degree);
-        for column in Columns::all().iter() {
+        for column in Attributes::all().iter() {
             let (from, to) = (self.canonical().column(column), raw.column_mut(column));
             for c in 0..from.width() {
                 let plane = from.plane(c);
@@ -251,7 +256,7 @@ impl FrameSource for ModelFolder {
 
     /// Reads blocks one by one: no frames are decoded together, so a reader of all Gaussians has nothing to keep.
     fn open_all(&self, _: &ReadPlan) -> Option<Result<Box<dyn BlockReader + '_>>> {
-        Some(Ok(Box::new(InBlocks::new(self))))
+        Some(Ok(Box::new(BlockwiseReader::new(self))))
     }
 
     fn deformation(&self) -> Option<&dyn Deformation> {
@@ -265,17 +270,17 @@ impl FrameSource for ModelFolder {
 
 /// Evaluates blocks of Gaussians in parallel.
 impl Deformation for ModelFolder {
-    fn stored(&self) -> &Raw {
+    fn stored(&self) -> &StoredParams {
         &self.canonical
     }
 
     /// Excludes positions if the field has a mask. Derivatives treat the mask as constant, so a moved position would be
     /// worse than an unchanged one.
-    fn movable(&self) -> Columns {
-        if self.field.has_mask() { Columns::all().difference(Columns::POSITION) } else { Columns::all() }
+    fn movable(&self) -> Attributes {
+        if self.field.has_mask() { Attributes::all().difference(Attributes::POSITION) } else { Attributes::all() }
     }
 
-    fn state(&self, frame: usize, stored: &Raw, want: Columns, out: &mut Gaussians) -> Result<()> {
+    fn state(&self, frame: usize, stored: &StoredParams, want: Attributes, out: &mut Gaussians) -> Result<()> {
         let time = self.frame_time(frame)?;
         let ids: Vec<u32> = (0..stored.len() as u32).collect();
         let nothing = || Gaussians::zeros(0, self.info.sh_degree);
@@ -283,7 +288,7 @@ impl Deformation for ModelFolder {
         ids.par_chunks(BLOCK).zip(parts).try_for_each_init(
             || (nothing(), nothing(), Scratch::default(), Deltas::new(self.info.sh_degree)),
             |(raw, state, scratch, deltas), (ids, parts)| {
-                for column in (want | Columns::POSITION).iter() {
+                for column in (want | Attributes::POSITION).iter() {
                     *raw.column_mut(column) = stored.gaussians.column(column).pick(ids);
                 }
                 self.field.deltas(&self.field.prepare(&raw.position), time, want, scratch, deltas)?;
@@ -294,12 +299,12 @@ impl Deformation for ModelFolder {
         )
     }
 
-    fn jacobian(&self, frame: usize, stored: &Raw, want: Columns) -> Result<Jacobian> {
+    fn jacobian(&self, frame: usize, stored: &StoredParams, want: Attributes) -> Result<Jacobian> {
         let time = self.frame_time(frame)?;
         let ids: Vec<u32> = (0..stored.len() as u32).collect();
         let of_block = |ids: &[u32]| {
             let mut raw = Gaussians::zeros(0, self.info.sh_degree);
-            for column in (want & Columns::ROTATION | Columns::POSITION).iter() {
+            for column in (want & Attributes::ROTATION | Attributes::POSITION).iter() {
                 *raw.column_mut(column) = stored.gaussians.column(column).pick(ids);
             }
             self.field.jacobian(&raw, time, want)
@@ -319,7 +324,7 @@ struct FieldReader<'a> {
 }
 
 impl BlockReader for FieldReader<'_> {
-    fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
+    fn read(&mut self, frame: usize, want: Attributes, out: &mut Gaussians) -> Result<()> {
         let time = self.model.frame_time(frame)?;
         if !want.is_empty() {
             self.model.states.add(self.raw.len() as u64);

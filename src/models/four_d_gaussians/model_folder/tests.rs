@@ -41,7 +41,7 @@ fn load(name: &str) -> (PathBuf, ModelFolder) {
     let root = shared_model(name);
     let paths = ModelPaths::locate(&root, None).unwrap();
     let cloud = read_cloud(&paths.point_cloud);
-    (root, ModelFolder::with_cloud(paths, cloud, 3, ReadLimit::NONE).unwrap())
+    (root, ModelFolder::with_gaussians(paths, cloud, 3, ReadLimit::NONE).unwrap())
 }
 
 /// Reads every array of an npz as f64.
@@ -81,7 +81,7 @@ fn states_agree(name: &str) {
     let mut state = Gaussians::zeros(0, 3);
     let mut worst = [0f64; 5];
     for (frame, t) in arrays["frames"].iter().enumerate() {
-        reader.read(frame, Columns::all(), &mut state).unwrap();
+        reader.read(frame, Attributes::all(), &mut state).unwrap();
         for i in 0..n {
             let row = frame * n + i;
             let at = |what: &str| format!("{name}, {what} of Gaussian {i} at frame {t}");
@@ -146,13 +146,13 @@ fn any_list_of_gaussians_reads_the_bits_of_the_whole() {
     let n = model.info().count;
     let read = |ids: Ids<'_>, frame| {
         let mut state = Gaussians::zeros(0, 3);
-        model.open(ids).unwrap().read(frame, Columns::all(), &mut state).unwrap();
+        model.open(ids).unwrap().read(frame, Attributes::all(), &mut state).unwrap();
         state
     };
     let whole = read(Ids::Range(0..n), 1);
     let list: Vec<u32> = (0..n as u32).rev().step_by(37).collect();
     let part = std::thread::scope(|scope| scope.spawn(|| read(Ids::List(&list), 1)).join().unwrap());
-    for column in Columns::all().iter() {
+    for column in Attributes::all().iter() {
         for c in 0..whole.column(column).width() {
             for (at, &id) in list.iter().enumerate() {
                 let (got, expected) = (part.column(column).plane(c)[at], whole.column(column).plane(c)[id as usize]);
@@ -167,9 +167,9 @@ fn any_list_of_gaussians_reads_the_bits_of_the_whole() {
 fn columns_that_do_not_vary_are_the_canonical_ones() {
     let (_, model) = load("deform2");
     let model = model.with_times(vec![0.25]).unwrap();
-    assert_eq!(model.info().varying, Columns::POSITION | Columns::LOG_SCALE | Columns::ROTATION);
+    assert_eq!(model.info().varying, Attributes::POSITION | Attributes::LOG_SCALE | Attributes::ROTATION);
     let mut state = Gaussians::zeros(0, 3);
-    model.open(Ids::Range(0..100)).unwrap().read(0, Columns::OPACITY | Columns::SH, &mut state).unwrap();
+    model.open(Ids::Range(0..100)).unwrap().read(0, Attributes::OPACITY | Attributes::SH, &mut state).unwrap();
     for i in 0..100 {
         assert_eq!(state.opacity_logit.row::<1>(i), model.canonical().opacity_logit.row::<1>(i));
         assert_eq!(state.sh.row::<48>(i), model.canonical().sh.row::<48>(i));
@@ -183,9 +183,9 @@ fn deltas_at_the_canonical_positions_lead_to_the_states() {
     let deltas = model.deltas_at(&model.canonical().position, 0.3).unwrap();
     let model = model.with_times(vec![0.3]).unwrap();
     let mut state = Gaussians::zeros(0, 3);
-    model.open(Ids::Range(0..model.info().count)).unwrap().read(0, Columns::all(), &mut state).unwrap();
+    model.open(Ids::Range(0..model.info().count)).unwrap().read(0, Attributes::all(), &mut state).unwrap();
     let mut applied = Gaussians::zeros(0, 3);
-    deltas.apply(model.canonical(), Columns::all(), &mut applied);
+    deltas.apply(model.canonical(), Attributes::all(), &mut applied);
     assert!(applied == state, "apply(deltas_at) differs from read");
 }
 
@@ -204,7 +204,7 @@ fn times_that_do_not_increase_are_refused_with_their_frames() {
     let model = model.with_times(vec![0.0]).unwrap();
     assert!(model.open(Ids::List(&[1 << 30])).is_err(), "a Gaussian beyond the last");
     let mut reader = model.open(Ids::Range(0..1)).unwrap();
-    assert!(reader.read(1, Columns::all(), &mut Gaussians::zeros(0, 3)).is_err(), "a frame beyond the last");
+    assert!(reader.read(1, Attributes::all(), &mut Gaussians::zeros(0, 3)).is_err(), "a frame beyond the last");
 }
 
 /// Creates a folder with the layout of a model and placeholder files.
@@ -264,32 +264,36 @@ fn jacobian_agrees_with_differences_on_any_thread_count() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/tiny_model");
     let model = ModelFolder::open(&root, None).unwrap().with_times(vec![0.0, 0.4, 1.0]).unwrap();
     let n = model.info().count;
-    let mut by_state = Gradients::new(n, Columns::all(), 3);
-    for column in Columns::all().iter() {
+    let mut by_state = Gradients::new(n, Attributes::all(), 3);
+    for column in Attributes::all().iter() {
         // Low-discrepancy values serve as noise.
         let sums = by_state.column_mut(column).planes_mut().iter_mut().enumerate();
         sums.for_each(|(k, sum)| *sum = (k as f32 * 0.618_034).fract() - 0.5);
     }
     let mut by_raw = by_state.clone();
-    let jacobian = model.jacobian(1, model.stored(), Columns::all()).unwrap();
+    let jacobian = model.jacobian(1, model.stored(), Attributes::all()).unwrap();
     jacobian.pull_back(&mut by_raw);
     for threads in [1, 2, 3] {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        let again = pool.install(|| model.jacobian(1, model.stored(), Columns::all())).unwrap();
+        let again = pool.install(|| model.jacobian(1, model.stored(), Attributes::all())).unwrap();
         assert!(again == jacobian, "{threads} threads");
     }
-    for column in Columns::all().difference(Columns::POSITION).iter() {
+    for column in Attributes::all().difference(Attributes::POSITION).iter() {
         assert!(by_raw.column(column) == by_state.column(column), "{} follows the field", column.name());
     }
 
-    let weights = by_state.column(Columns::POSITION);
+    let weights = by_state.column(Attributes::POSITION);
     let (mut off, mut through_field) = (0, 0);
     for axis in 0..3 {
         let placed = |step: f32| {
             let mut moved = model.canonical().clone();
             moved.position.plane_mut(axis).iter_mut().for_each(|x| *x += step);
-            let state =
-                gather(&model.with_canonical(moved.clone()), &(0..n as u32).collect::<Vec<_>>(), 1, Columns::POSITION);
+            let state = gather(
+                &model.with_canonical(moved.clone()),
+                &(0..n as u32).collect::<Vec<_>>(),
+                1,
+                Attributes::POSITION,
+            );
             (moved.position, state.unwrap().position)
         };
         let ((low, at_low), (high, at_high)) = (placed(-2e-4), placed(2e-4));
@@ -297,7 +301,7 @@ fn jacobian_agrees_with_differences_on_any_thread_count() {
             let apart = f64::from(high.plane(axis)[i]) - f64::from(low.plane(axis)[i]);
             let change = |c: usize| f64::from(at_high.plane(c)[i]) - f64::from(at_low.plane(c)[i]);
             let expected = (0..3).map(|c| f64::from(weights.plane(c)[i]) * change(c)).sum::<f64>() / apart;
-            let got = f64::from(by_raw.column(Columns::POSITION).plane(axis)[i]);
+            let got = f64::from(by_raw.column(Attributes::POSITION).plane(axis)[i]);
             // States are f32: an error of about 1e-7 over 4e-4, times three.
             off += usize::from((got - expected).abs() > 3e-3 * (1.0 + expected.abs()));
             through_field += usize::from((got - f64::from(weights.plane(axis)[i])).abs() > 1e-2);
@@ -306,5 +310,5 @@ fn jacobian_agrees_with_differences_on_any_thread_count() {
     // Within a step some positions cross the edge of a texel or a ReLU, where the derivative is not unique.
     assert!(off * 50 < 3 * n, "{off} of {} derivatives are off", 3 * n);
     assert!(through_field > n, "the field adds to {through_field} of {} derivatives only", 3 * n);
-    assert!(model.jacobian(3, model.stored(), Columns::all()).is_err(), "there are three frames");
+    assert!(model.jacobian(3, model.stored(), Attributes::all()).is_err(), "there are three frames");
 }
