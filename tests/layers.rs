@@ -238,7 +238,8 @@ fn folders_use_only_those_before_them() {
         let own = folder_index(folder).unwrap_or_else(|| panic!("{folder} is missing in FOLDERS"));
         for home in used {
             let other = &home[0];
-            let is_before = FROM_CRATES.contains(&other.as_str()) || folder_index(other).is_some_and(|index| index <= own);
+            let is_before =
+                FROM_CRATES.contains(&other.as_str()) || folder_index(other).is_some_and(|index| index <= own);
             seen += 1;
             assert!(is_before, "{} uses {}, which comes after it", at.join("::"), home.join("::"));
         }

@@ -123,8 +123,14 @@ fn named_minimum_memory_works_and_changes_no_byte() {
         workplace.done(&format!("{} --memory {minimum_memory}MiB", request("tight")));
         let [free, tight] = ["free", "tight"].map(|name| workplace.path(name));
         if let Some(peak_memory) = peak_memory(&tight.join("small.gseq")) {
-            assert!(peak_memory <= minimum_memory, "{input} {rest}: {peak_memory} MiB resident, {minimum_memory} promised");
-            assert!(minimum_memory < 63 || rest != "--no-refine", "{input} {rest}: {minimum_memory} MiB would hold the scene");
+            assert!(
+                peak_memory <= minimum_memory,
+                "{input} {rest}: {peak_memory} MiB resident, {minimum_memory} promised"
+            );
+            assert!(
+                minimum_memory < 63 || rest != "--no-refine",
+                "{input} {rest}: {minimum_memory} MiB would hold the scene"
+            );
         }
         assert!(lasting_files(&free) == lasting_files(&tight), "{input} {rest}: other bytes at {minimum_memory} MiB");
     }

@@ -133,7 +133,12 @@ fn report_in_shards_equals_one_run_and_reuses_evaluate() {
 fn container_packed_in_shards_equals_one_run() {
     let workplace = workplace(1500);
     for how in ["", "--raw", "--max-error position=0.1%,sh=1e-2"] {
-        assert_joined_equals_single_run(&workplace, &format!("pack scene.gseq -o packed.gseq {how}"), "packed.gseq", &SHARD_COUNTS);
+        assert_joined_equals_single_run(
+            &workplace,
+            &format!("pack scene.gseq -o packed.gseq {how}"),
+            "packed.gseq",
+            &SHARD_COUNTS,
+        );
     }
     assert_joined_equals_single_run(&workplace, "pack {tiny} -o packed.gseq", "packed.gseq", &[2]);
 }

@@ -34,7 +34,8 @@ fn stderr_text(output: &Output) -> String {
 
 fn workplace_with_scene(gaussians: usize) -> Workplace {
     let workplace = Workplace::new();
-    let output = run_program(&workplace, &format!("demo --gaussians {gaussians} --frames 8 -o scene --quiet --no-refine"));
+    let output =
+        run_program(&workplace, &format!("demo --gaussians {gaussians} --frames 8 -o scene --quiet --no-refine"));
     assert!(output.status.success(), "{}", stderr_text(&output));
     workplace
 }
@@ -197,7 +198,11 @@ fn streams_cannot_resume_and_shards_need_a_cache() {
         ("work nowhere", "nowhere"),
     ] {
         let output = run_program(&workplace, arguments);
-        assert!(!output.status.success() && stderr_text(&output).contains(part), "{arguments}: {}", stderr_text(&output));
+        assert!(
+            !output.status.success() && stderr_text(&output).contains(part),
+            "{arguments}: {}",
+            stderr_text(&output)
+        );
     }
 }
 
@@ -216,7 +221,10 @@ fn full_cache_disk_is_named_and_a_larger_one_resumes() {
     let output = shell.args(["sh", "-c", &script]).current_dir(workplace.path("")).output().unwrap();
     let stderr_text = stderr_text(&output);
     assert!(output.status.success(), "{stderr_text}");
-    assert!(stderr_text.contains("code 1") && stderr_text.contains("disk/work") && stderr_text.contains("No space left"), "{stderr_text}");
+    assert!(
+        stderr_text.contains("code 1") && stderr_text.contains("disk/work") && stderr_text.contains("No space left"),
+        "{stderr_text}"
+    );
     assert!(run_program(&workplace, &format!("{RUN} -o plain.gseq")).status.success());
     assert_eq!(result_files(&workplace, "full.gseq"), result_files(&workplace, "plain.gseq"));
 }

@@ -89,7 +89,8 @@ fn defective_rows_are_counted_and_left_out_or_kept() {
     let summary = workplace.summary(&format!("odd.splatv -o small.splatv {options}"));
     assert_eq!((&summary["input"]["gaussians"], &summary["gaussians"]), (&192.into(), &150.into()));
     assert_said(&notes(&summary), &parts);
-    let places: Vec<[f32; 3]> = (0..ROWS).filter(|row| !DROPPED.contains(row)).map(|row| valid_gaussian(row).position).collect();
+    let places: Vec<[f32; 3]> =
+        (0..ROWS).filter(|row| !DROPPED.contains(row)).map(|row| valid_gaussian(row).position).collect();
     let small = rows_of(&workplace.path("small.splatv"));
     assert!(small.len() == 150 && small.iter().all(|row| places.contains(&row.position)));
     let map = index_map(&workplace.path("small.splatv.index_map.npy"));

@@ -86,7 +86,10 @@ fn archive_reads_like_the_folder_it_unpacks_to() {
     workplace.done("render small.gsz --cameras {tiny} --all -o pictures");
     workplace.done("info small.gsz");
     workplace.done("compress small.gsz --cameras {tiny} --target-ratio 0.5 --no-refine --prune-only -o smaller");
-    assert_eq!(point_cloud(&workplace.path("smaller")).rows.len(), point_cloud(&workplace.path("small")).rows.len().div_ceil(2));
+    assert_eq!(
+        point_cloud(&workplace.path("smaller")).rows.len(),
+        point_cloud(&workplace.path("small")).rows.len().div_ceil(2)
+    );
     // The decoded scratch folder is removed.
     let left = files(&workplace.path(""));
     assert!(left.keys().all(|name| !name.to_string_lossy().contains("scratch")), "{:?}", left.keys());

@@ -272,6 +272,6 @@ fn target_size_picks_the_best_sh_degree() {
     let said = |note: &&Value| note.as_str().unwrap().contains("SH degree 0 gives the best quality");
     assert_eq!(chosen["notes"].as_array().unwrap().iter().filter(said).count(), 1, "{}", chosen["notes"]);
     assert!(chosen["bands"].is_null() && chosen["output_bytes"].as_u64().unwrap() <= 85_000);
-    let of = |summary: &Value| summary["gaussians"].as_u64().unwrap();
-    assert!(of(&chosen) > 2 * of(&all), "{} at degree 0, {} at degree 3", of(&chosen), of(&all));
+    let count = |summary: &Value| summary["gaussians"].as_u64().unwrap();
+    assert!(count(&chosen) > 2 * count(&all), "{} at degree 0, {} at degree 3", count(&chosen), count(&all));
 }

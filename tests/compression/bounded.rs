@@ -44,7 +44,10 @@ fn every_attribute_keeps_its_bound_and_names_it() {
         let column = Columns::all().iter().find(|column| column.name() == name).unwrap();
         let (largest_difference, kept) = largest_difference(&workplace, column);
         assert!(largest_difference <= bound && kept, "{name}: {largest_difference} off, {bound} promised");
-        assert!(largest_difference > 0.3 * bound, "{name}: a bound of {bound} is not made use of, {largest_difference} off");
+        assert!(
+            largest_difference > 0.3 * bound,
+            "{name}: a bound of {bound} is not made use of, {largest_difference} off"
+        );
         let column = info["columns"].as_array().unwrap().iter().find(|column| column["name"] == name).unwrap();
         assert_eq!(column["max_error"].as_f64(), Some(bound), "{info}");
     }
@@ -69,7 +72,10 @@ fn unbounded_attributes_are_exact_percent_is_of_extent() {
     }
     let bound = Reader::open(workplace.path("within.gseq")).unwrap().layout().columns[0].max_error;
     let (largest_difference, _) = largest_difference(&workplace, Columns::POSITION);
-    assert!(largest_difference <= bound && largest_difference > 0.3 * bound, "{largest_difference} off, {bound} promised");
+    assert!(
+        largest_difference <= bound && largest_difference > 0.3 * bound,
+        "{largest_difference} off, {bound} promised"
+    );
     // The Gaussians of the tiny model lie in a box of a few units.
     assert!((1e-4..1e-1).contains(&bound), "{bound}");
 }

@@ -165,8 +165,9 @@ fn keep_box_keeps_gaussians_in_it_at_the_reference_frame() {
     let scene = crate::scene::scene(&tiny());
     let state = state(scene.source(), frame);
     let map = index_map(&workplace.path("out/index_map.npy"));
-    let inside: Vec<usize> =
-        (1..COUNT).filter(|&i| state.position.row::<3>(i).iter().all(|x| (-0.4..=0.4).contains(&f64::from(*x)))).collect();
+    let inside: Vec<usize> = (1..COUNT)
+        .filter(|&i| state.position.row::<3>(i).iter().all(|x| (-0.4..=0.4).contains(&f64::from(*x))))
+        .collect();
     assert!(inside.len() > 30, "{} inside", inside.len());
     for id in inside {
         assert!(map[id] >= 0, "Gaussian {id} is in the box");

@@ -63,7 +63,8 @@ fn unreachable_psnr_keeps_all_and_no_refine_holds() {
 fn max_loss_compares_with_photographs() {
     let workplace = with_demo();
     workplace.done("render demo/scene.gseq --cameras demo/cameras.json --all --split all -o photographs");
-    let summary = workplace.summary(&format!("{SHORT_REFINEMENT} --max-loss 60dB --ground-truth photographs -o small.gseq"));
+    let summary =
+        workplace.summary(&format!("{SHORT_REFINEMENT} --max-loss 60dB --ground-truth photographs -o small.gseq"));
     let goal = &summary["goal"];
     // Photographs that are renders of the original reach 59 dB with their 8 bits.
     assert_eq!(goal["name"], "max_loss");
@@ -94,7 +95,11 @@ fn output_size_is_just_below_the_target() {
         assert!(written <= most && written > most * 9 / 10 - 24_576, "{output}: {written} of {most}, {summary}");
         assert!(summary["gaussians"].as_u64().unwrap() > 30, "{summary}");
     }
-    workplace.refused(2, &format!("compress {SHORT_REFINEMENT} --target-size 20KB -o none.gseq"), &["one Gaussian", "20000"]);
+    workplace.refused(
+        2,
+        &format!("compress {SHORT_REFINEMENT} --target-size 20KB -o none.gseq"),
+        &["one Gaussian", "20000"],
+    );
 }
 
 #[test]
@@ -119,6 +124,7 @@ fn contradictory_targets_are_refused() {
 #[ignore = "needs time"]
 fn target_size_above_the_input_only_drops_named_ids() {
     let workplace = with_demo();
-    let summary = workplace.summary(&format!("{SHORT_REFINEMENT} --no-refine --target-size 10MB --drop-ids 5-14 -o small.gseq"));
+    let summary =
+        workplace.summary(&format!("{SHORT_REFINEMENT} --no-refine --target-size 10MB --drop-ids 5-14 -o small.gseq"));
     assert_eq!(summary["gaussians"], 790);
 }

@@ -130,14 +130,12 @@ fn clusters(all_frames: &AllFrames, scored: &Scored, kept: &[usize], recipe: &Re
     let mut groups: Vec<Vec<usize>> = kept.iter().map(|&id| vec![id]).collect();
     for pass in &merge.passes {
         // State of a node: that of its Gaussian, or of its proxy so far.
-        let mut nodes = all_frames.frames[all_frames.reference].pick(&groups.iter().map(|g| g[0] as u32).collect::<Vec<_>>());
+        let mut nodes =
+            all_frames.frames[all_frames.reference].pick(&groups.iter().map(|g| g[0] as u32).collect::<Vec<_>>());
         for (node, group) in groups.iter().enumerate().filter(|(_, group)| group.len() > 1) {
             let members = weighted(scored, group);
-            merge_state(&members, &all_frames.frames[all_frames.reference], group[0] as u32, merge, Columns::all()).write(
-                Columns::all(),
-                node,
-                &mut nodes,
-            );
+            merge_state(&members, &all_frames.frames[all_frames.reference], group[0] as u32, merge, Columns::all())
+                .write(Columns::all(), node, &mut nodes);
         }
         let rows = scored.rows().unwrap();
         let size = |node: usize| groups[node].iter().map(|&id| rows.c[id]).sum::<f64>();
@@ -217,7 +215,13 @@ fn assert_merges_as_specified(recipe: &Recipe, only: Only) -> usize {
 /// Checks a merged state against its definition over the members with weights w: position μ = Σ w x, or that of the
 /// leader; covariance Σ w (Σᵢ + (xᵢ − μ)(xᵢ − μ)ᵀ); colors Σ w c; opacity by its rule, in which the area is a quarter
 /// of the surface of the ellipsoid.
-fn assert_is_mixture(merged: &ProxyState, members: &[(u32, f64)], states: &Gaussians, leader: usize, merge: &MergeParams) {
+fn assert_is_mixture(
+    merged: &ProxyState,
+    members: &[(u32, f64)],
+    states: &Gaussians,
+    leader: usize,
+    merge: &MergeParams,
+) {
     let position = |i: usize| DVec3::from(states.position.row::<3>(i).map(f64::from));
     let mean = match merge.placement {
         Placement::Leader => position(leader),
@@ -251,7 +255,9 @@ fn assert_is_mixture(merged: &ProxyState, members: &[(u32, f64)], states: &Gauss
     let opacity = match merge.opacity {
         ProxyOpacity::Sum => members.iter().map(|&(i, _)| opacity_and_area(i).0).sum::<f64>(),
         ProxyOpacity::Union => 1.0 - members.iter().map(|&(i, _)| 1.0 - opacity_and_area(i).0).product::<f64>(),
-        ProxyOpacity::Area => members.iter().map(|&(i, _)| opacity_and_area(i).0 * opacity_and_area(i).1).sum::<f64>() / surface(scales),
+        ProxyOpacity::Area => {
+            members.iter().map(|&(i, _)| opacity_and_area(i).0 * opacity_and_area(i).1).sum::<f64>() / surface(scales)
+        }
     };
     let found = 1.0 / (1.0 + (-merged.opacity_logit).exp());
     assert!((found - opacity.min(1.0)).abs() <= 1e-5, "opacity {found}, expected {opacity}");
@@ -300,7 +306,12 @@ fn assert_solved_at_leaders(
         let found = &frames[all_frames.reference];
         for c in 0..3 {
             let value = |state: &Gaussians, i: usize| state.position.plane(c)[i];
-            columns.push((["x", "y", "z"][c].into(), merged.position[c], value(at_reference, leader), value(found, place)));
+            columns.push((
+                ["x", "y", "z"][c].into(),
+                merged.position[c],
+                value(at_reference, leader),
+                value(found, place),
+            ));
             let value = |state: &Gaussians, i: usize| state.log_scale.plane(c)[i];
             columns.push((format!("scale_{c}"), merged.log_scale[c], value(at_reference, leader), value(found, place)));
         }
@@ -478,7 +489,8 @@ fn proxies_that_drift_from_members_return_to_leaders() {
     let output = folder.path().join("out");
     let scene = crate::scene::scene(&tiny());
     let (_, map) = compress_scene(&scene, &options(&output, &recipe, Only::Merge)).unwrap();
-    let (scored, all_frames) = (score_scene(&scene, &recipe, &UserOverrides::default()).unwrap(), AllFrames::read(&scene));
+    let (scored, all_frames) =
+        (score_scene(&scene, &recipe, &UserOverrides::default()).unwrap(), AllFrames::read(&scene));
     let cloud = "point_cloud/iteration_7/point_cloud.ply";
     let (before, after) = (PlyRows::read(&tiny().join(cloud)), PlyRows::read(&output.join(cloud)));
     let result = splatsieve::models::ModelFolder::open(&output, None).unwrap();

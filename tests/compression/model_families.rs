@@ -185,7 +185,8 @@ fn every_command_accepts_dynamic_3d_gaussians() {
         println!("{ratio}: {pruned} dB pruned, {default} with merging, {refined} refined");
         assert!(default >= pruned && refined > pruned + 1.0, "{pruned} {default} {refined}");
     }
-    workplace.done(&format!("compress {model} --cameras {model} -o merged.gseq --merge-only --preset strong --no-refine"));
+    workplace
+        .done(&format!("compress {model} --cameras {model} -o merged.gseq --merge-only --preset strong --no-refine"));
     workplace.done(&format!("pack {model} -o packed.gseq"));
     workplace.done(&format!("score {model} --cameras {model} -o rows.csv"));
     workplace.done(&format!("render {model} --cameras {model} --frame 3 --view 1 -o picture.png"));
@@ -347,7 +348,10 @@ fn native_4d_gaussians_states_match_their_trainer() {
             }
         }
     }
-    println!("position {:e}, opacity {:e}, covariance {:e}, harmonics {:e}", errors[0], errors[1], errors[2], errors[3]);
+    println!(
+        "position {:e}, opacity {:e}, covariance {:e}, harmonics {:e}",
+        errors[0], errors[1], errors[2], errors[3]
+    );
     assert!(errors[0] <= 2e-6 && errors[1] <= 5e-7 && errors[2] <= 5e-6 && errors[3] <= 1e-6, "{errors:?}");
 }
 

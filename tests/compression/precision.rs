@@ -30,7 +30,9 @@ fn held_out(cameras: &Value) -> Value {
 /// Returns the curves of a setting.
 fn curves<'a>(found: &'a Value, knob: &str) -> &'a Vec<Value> {
     let knobs = found["knobs"].as_array().unwrap();
-    knobs.iter().find(|entry| entry["name"] == knob).unwrap_or_else(|| panic!("no {knob}"))["curves"].as_array().unwrap()
+    knobs.iter().find(|entry| entry["name"] == knob).unwrap_or_else(|| panic!("no {knob}"))["curves"]
+        .as_array()
+        .unwrap()
 }
 
 /// Returns the errors of one kind at all marks of a curve.
@@ -77,7 +79,11 @@ fn exact_settings_have_no_error_and_others_converge() {
     let rounds = curves(&found, "rounds");
     for curve in rounds {
         let values = errors(curve, "kept");
-        assert!(values[0] > 0.0 && values[0] > values[values.len() - 2] && values.last() == Some(&0.0), "{}: {values:?}", curve["name"]);
+        assert!(
+            values[0] > 0.0 && values[0] > values[values.len() - 2] && values.last() == Some(&0.0),
+            "{}: {values:?}",
+            curve["name"]
+        );
     }
 
     let percentiles = &curves(&found, "percentiles")[0];

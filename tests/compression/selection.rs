@@ -66,7 +66,8 @@ fn plain_scores(rows: &Rows, recipe: &Recipe) -> PlainScores {
         (score.eta, rows.v.clone()),
         (score.xi, life.clone()),
     ]);
-    let sum: Vec<f64> = (0..COUNT).map(|i| score.w_static * static_score[i] + score.w_dynamic * dynamic_score[i]).collect();
+    let sum: Vec<f64> =
+        (0..COUNT).map(|i| score.w_static * static_score[i] + score.w_dynamic * dynamic_score[i]).collect();
 
     let mut best: Vec<usize> = (0..COUNT).collect();
     best.sort_by(|&a, &b| sum[b].partial_cmp(&sum[a]).unwrap().then(hash(a).cmp(&hash(b))));

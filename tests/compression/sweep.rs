@@ -95,7 +95,8 @@ fn refinement_step_points_equal_compress() {
     let settings = knob["settings"].as_array().unwrap();
     assert_eq!(settings.iter().map(|setting| setting["value"].as_u64().unwrap()).collect::<Vec<_>>(), [0, 25]);
     // Each prune step during refinement takes 8% of the steps, as in the preset.
-    workplace.done("compress {tiny} --cameras {tiny} -o small --target-ratio 0.3 --refine-steps 25 --refine-cut-steps 2");
+    workplace
+        .done("compress {tiny} --cameras {tiny} -o small --target-ratio 0.3 --refine-steps 25 --refine-cut-steps 2");
     let evaluated = json(&workplace.done("evaluate {tiny} small --cameras {tiny} --max-frames 2 --json"));
     let unrefined = swept["points"].as_array().unwrap().iter().find(|point| point["asked"] == 0.3).unwrap();
     for name in ["psnr", "ssim"] {
