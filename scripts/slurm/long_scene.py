@@ -1,17 +1,17 @@
 #!/usr/bin/env python3
-"""Prints, or submits, the Slurm jobs that compress one long scene: an array for every stage that can be divided, each
-when the one before is done, and a job for the rest.
+"""Prints or submits the Slurm jobs that compress one long scene: a job array for every stage that can be divided, each
+after the previous one, and a job for the rest.
 
     scripts/slurm/long_scene.py --parts 8 --work WORK -- MODEL --cameras DATA -o SMALL            # prints the commands
     scripts/slurm/long_scene.py --parts 8 --work WORK --submit --partition=short --time=1:00:00 --cpus-per-task=4 \\
         --mem=8G -- MODEL --cameras DATA -o SMALL --target-ratio 0.3
 
-Options that it does not know are handed to every sbatch; behind -- stands what `splatsieve compress` takes. Paths are as
-from the folder it is called in, which must be the same folder, with the same files, on all nodes. A task that is
-preempted, or loses its node, starts again and loses at most the part in work; the same command a second time takes up
-what is in WORK. How many stages there will be (rounds above all) is known only at most: an array for a stage that does
-not come to pass takes the next one that does, or finds nothing to do. `--arrays` submits fewer; the last job does what
-they have left.
+Options that the script does not know are passed to every sbatch; arguments after -- are those of `splatsieve compress`.
+Paths are relative to the current folder, which must be the same folder with the same files on all nodes. A task that is
+preempted or loses its node starts again and loses at most its current shard; the same command a second time resumes
+from WORK. Only an upper bound of the number of stages is known in advance (mainly of pruning rounds): an array for a
+stage that does not take place works on the next one, or finds nothing to do. `--arrays` submits fewer arrays; the last
+job does the rest.
 """
 
 import argparse
@@ -27,7 +27,7 @@ OPTIONS = ["--parsable", "--requeue", "--signal=B:TERM@60", "--open-mode=append"
 
 
 def found(program):
-    """The program by a path that holds in every folder."""
+    """Returns the absolute path of the program."""
     path = shutil.which(program)
     if path is None:
         sys.exit(f"no program {program} (--program names another)")
@@ -39,7 +39,7 @@ def quoted(words):
 
 
 def stages(compress):
-    """Stages that --part divides."""
+    """Returns the stages that --part divides."""
     listed = subprocess.run([*compress, "--list-stages"], stdout=subprocess.PIPE, text=True, check=False)
     if listed.returncode != 0:
         sys.exit(listed.returncode)
@@ -47,11 +47,11 @@ def stages(compress):
 
 
 def lines(args, sbatch, compress):
-    """A script that submits it all and prints the number of the last job."""
+    """Yields a script that submits all jobs and prints the number of the last one."""
     common = ["sbatch", *OPTIONS, f"--chdir={os.getcwd()}", *sbatch]
     names = stages(compress)[: args.arrays]
     compress = [*compress, "--work", args.work]
-    # What the job has, unless its user says otherwise.
+    # Resources of the job, unless the user gives other values.
     for option, value in (("--threads", "@THREADS@"), ("--memory", "@MEMORY@")):
         if not any(word.split("=")[0] == option for word in compress):
             compress.append(f"{option}={value}")
