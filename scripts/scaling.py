@@ -123,8 +123,8 @@ def plain_seconds(found):
 def stage_table(found):
     """Yields a table row for every stage and number of shards."""
     yield (
-        "| stage | parts | processor s, all parts | of a plain run's | longest part, s | a part of nothing, s "
-        "| read, MB | written, MB | pieces, MB | peak, MiB |"
+        "| stage | shards | processor s, all shards | of one run | longest shard, s | shard without work, s "
+        "| read, MB | written, MB | cache entries, MB | peak, MiB |"
     )
     yield "|" + "---|" * 10
     plain = plain_seconds(found)
@@ -171,8 +171,8 @@ def split(found):
 def chain_table(found):
     """Yields rows with sum and longest chain of whole runs: the time on one node, and on one node per shard."""
     yield (
-        "| parts | sum of all parts, s | the rest, s | together, of a plain run's | longest chain, s | of a plain run's "
-        "| chain by work / parts + start, s |"
+        "| shards | sum of all shards, s | rest, s | total, of one run | longest chain, s | of one run "
+        "| predicted chain: work / shards + start, s |"
     )
     yield "|" + "---|" * 7
     plain = found["plain"]["processor"]
@@ -185,7 +185,7 @@ def chain_table(found):
             f"| {run['of']} | {total:.1f} | {rest:.1f} | {(total + rest) / plain:.2f} | {longest + rest:.1f} "
             f"| {(longest + rest) / plain:.2f} | {told + rest:.1f} |"
         )
-    yield f"\nA plain run takes {plain:.1f} s of one processor."
+    yield f"\nA run without shards takes {plain:.1f} s of one processor."
 
 
 def estimate(found, args):
@@ -223,9 +223,9 @@ def estimate(found, args):
         cells = [f"{sum(cost):.0f} ({cost[0]:.0f} + {cost[1]:.0f} + {cost[2]:.0f})" for cost in costs]
         yield f"| {name}{f' ({count} times)' if count > 1 else ''} | {work:.0f} | {' | '.join(cells)} |"
     rest = many["rest"]["processor"] * more
-    yield f"| the rest, on one node | {rest:.0f} | {' | '.join([f'{rest / args.cores:.0f}'] * len(args.nodes))} |"
+    yield f"| rest, on one node | {rest:.0f} | {' | '.join([f'{rest / args.cores:.0f}'] * len(args.nodes))} |"
     together = [rest / args.cores + sum(sum(costs[2][k]) for costs in stages.values()) for k in range(len(args.nodes))]
-    yield f"| together, s | | {' | '.join(f'**{seconds:.0f}**' for seconds in together)} |"
+    yield f"| total, s | | {' | '.join(f'**{seconds:.0f}**' for seconds in together)} |"
 
 
 def main():

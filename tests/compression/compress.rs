@@ -66,7 +66,7 @@ fn assert_kept_are_untouched(workplace: &Workplace, model: &Path, preset: &str, 
 }
 
 #[test]
-fn kept_gaussians_of_the_tiny_model_are_untouched_at_every_frame() {
+fn kept_gaussians_of_the_tiny_model_are_untouched() {
     let workplace = Workplace::new();
     for preset in ["paper", "default"] {
         assert_kept_are_untouched(&workplace, &tiny(), preset, &(0..10).collect::<Vec<_>>());

@@ -422,7 +422,7 @@ fn a_long_line_of_points_in_a_reconstruction_is_passed_over() {
 }
 
 #[test]
-fn an_array_of_poses_larger_than_memory_is_refused_by_its_header() {
+fn pose_array_larger_than_memory_is_refused_by_its_header() {
     let folder = Folder::new();
     let header = "{'descr': '<f8', 'fortran_order': False, 'shape': (1000000, 17), }";
     let file =
