@@ -182,7 +182,7 @@ fn states(criterion: &mut Criterion<Processor>) {
         ("spacetime", "stg_lite", Columns::all()),
         ("free_time", "ftgs", still),
         ("native_4d", "yang4d", still),
-        ("native_4d_colours", "yang4d", Columns::all()),
+        ("native_4d_colors", "yang4d", Columns::all()),
     ] {
         let model = folder.join("families").join(model);
         let (path, count) = match name {

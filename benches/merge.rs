@@ -178,7 +178,7 @@ fn neighbors(criterion: &mut Criterion) {
     cases.push(("one voxel".into(), evenly_distributed(100_000).0.position, 2.0));
     cases.push(("one point".into(), Column::zeros(3, 100_000), 0.1));
     for (name, position, epsilon) in cases {
-        let mut group = criterion.benchmark_group(format!("neighbours/{name}"));
+        let mut group = criterion.benchmark_group(format!("neighbors/{name}"));
         group.sample_size(10).throughput(Throughput::Elements(position.len() as u64));
         let mut rivals: Vec<(&str, Find)> = vec![("voxels", by_voxels), ("tree", by_tree)];
         if name.starts_with("strewn") && position.len() <= 100_000 {

@@ -52,7 +52,7 @@ await reader.parseSplats(
   (i, alpha) => compare('opacity', alpha, 1 / (1 + Math.exp(-valueOf(i, 'opacity'))), 0.5 / 255),
   (i, ...rgb) => rgb.forEach((x, c) => {
     const half = 0.5 / 0.15;
-    compare('colour', x, 0.5 + C0 * valueOf(i, `f_dc_${c}`), (0.5 / 255 / 0.15) * C0, [0.5 - C0 * half, 0.5 + C0 * half]);
+    compare('color', x, 0.5 + C0 * valueOf(i, `f_dc_${c}`), (0.5 / 255 / 0.15) * C0, [0.5 - C0 * half, 0.5 + C0 * half]);
   }),
   (i, ...scale) => scale.forEach((x, c) => compare('log scale', Math.log(x), valueOf(i, `scale_${c}`), 0.5 / 16, [-10, 5.9])),
   (i, x, y, z, w) => {

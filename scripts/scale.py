@@ -166,7 +166,7 @@ def main():
     parser.add_argument("--every", type=int, default=10, help="frames from one that is rendered to the next")
     parser.add_argument("--sh-degree", type=int, choices=range(4), default=3)
     parser.add_argument("--raw", action="store_true", help="store tiles raw")
-    parser.add_argument("--keep", action="store_true", help="leave the sequences in FOLDER, use those that are there")
+    parser.add_argument("--keep", action="store_true", help="keep the sequences in FOLDER, and reuse existing ones")
     parser.add_argument("--extra", nargs=argparse.REMAINDER, default=[], help="all that follows goes to compress")
     args = parser.parse_args()
 

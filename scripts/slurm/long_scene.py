@@ -70,12 +70,12 @@ def lines(args, sbatch, compress):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False)
-    parser.add_argument("--parts", type=int, required=True, help="tasks of every array")
-    parser.add_argument("--work", required=True, help="work folder, on a file system that all nodes share")
+    parser.add_argument("--parts", type=int, required=True, help="number of tasks of every array")
+    parser.add_argument("--work", required=True, help="cache folder on a file system that all nodes share")
     parser.add_argument("--submit", action="store_true", help="submit the jobs; print the number of the last one")
-    parser.add_argument("--arrays", type=int, help="at most so many arrays before the last job [default: one a stage]")
-    parser.add_argument("--name", default="splatsieve", help="first word of the jobs' names [default: splatsieve]")
-    parser.add_argument("--logs", help="folder of their logs [default: WORK.logs]")
+    parser.add_argument("--arrays", type=int, help="maximum number of arrays before the last job [default: one per stage]")
+    parser.add_argument("--name", default="splatsieve", help="prefix of the job names [default: splatsieve]")
+    parser.add_argument("--logs", help="folder of the logs [default: WORK.logs]")
     parser.add_argument("--program", default="splatsieve", help="splatsieve [default: the one on the PATH]")
     words = sys.argv[1:]
     cut = words.index("--") if "--" in words else len(words)

@@ -254,17 +254,17 @@ def page(title, rows, failed):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False)
-    parser.add_argument("list", help="list of scenes; with --task and --summary the folder that was made of it")
+    parser.add_argument("list", help="list of scenes; with --task and --summary the folder made from it")
     parser.add_argument("--submit", action="store_true", help="submit the jobs; print the number of the last one")
-    parser.add_argument("--at-once", type=int, help="at most so many scenes at a time")
-    parser.add_argument("--folder", help="folder of work, logs and summary [default: LIST.run]")
-    parser.add_argument("--keep-work", action="store_true", help="keep the work folder of a scene that is done")
+    parser.add_argument("--at-once", type=int, help="maximum number of scenes at a time")
+    parser.add_argument("--folder", help="folder of caches, logs and summary [default: LIST.run]")
+    parser.add_argument("--keep-work", action="store_true", help="keep the cache of a finished scene")
     parser.add_argument("--name", default="splatsieve", help="name of the array [default: splatsieve]")
     parser.add_argument("--program", default="splatsieve", help="splatsieve [default: the one on the PATH]")
-    parser.add_argument("--task", type=int, metavar="N", help="compress the Nth scene of a folder, here and now")
+    parser.add_argument("--task", type=int, metavar="N", help="compress scene N of a folder now, in this process")
     parser.add_argument("--threads", help="of --task")
     parser.add_argument("--memory", help="of --task")
-    parser.add_argument("--summary", action="store_true", help="write the summary of a folder; ends with 1 if a scene failed")
+    parser.add_argument("--summary", action="store_true", help="write the summary of a folder; exits with 1 if a scene failed")
     args, sbatch = parser.parse_known_args()
     if args.task is not None or args.summary:
         if sbatch:

@@ -104,7 +104,7 @@ fn check_file_and_stream(sequence: LongSequence, budget: u64) {
 }
 
 #[test]
-fn memory_for_many_frames_is_that_for_few() {
+fn hundred_thousand_frames_fit_40_mib() {
     check_file_and_stream(LongSequence { gaussians: 10, frames: 100_000 }, 40);
 }
 

@@ -126,7 +126,7 @@ fn targets_out_of_reach_are_refused() {
 }
 
 #[test]
-fn only_options_leave_out_a_stage() {
+fn prune_only_and_merge_only_leave_out_a_stage() {
     let workplace = Workplace::new();
     let pruned = workplace.summary("{tiny} -o pruned --preset paper --prune-only");
     assert_eq!(pruned["gaussians"], 240, "stage 1 keeps 80% of 300");

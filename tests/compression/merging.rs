@@ -16,7 +16,7 @@ use splatsieve::scene::{InputOptions, Scene, open_scene};
 /// Change to the merging parameters that tightens one test.
 type Tighten = fn(&mut MergeParams);
 
-/// All frames of a model in memory.
+/// Model with all its frames in memory.
 struct AllFrames {
     frames: Vec<Gaussians>,
     alive: Vec<Vec<bool>>,

@@ -1,4 +1,4 @@
-//! All readers of user-supplied bytes as functions of those bytes. The saved corpus (`tests/corpus`) and the fuzz
+//! Readers of user-supplied bytes as functions of those bytes. The saved corpus (`tests/corpus`) and the fuzz
 //! targets (`fuzz`) run them.
 //!
 //! Input: bytes. Result: success, or the message that refuses them. Formats with checksums are read a second time with
@@ -88,7 +88,7 @@ const CONTAINER_BYTES: usize = 640 << 20;
 /// An archive may decode to 64 MiB plus 512 times its own bytes (format/ARCHIVE.md).
 const ARCHIVE_BYTES: usize = 256 << 20;
 
-/// All readers of user-supplied bytes.
+/// List of all readers of user-supplied bytes.
 pub(crate) const ENTRIES: [Entry; 18] = [
     Entry {
         name: "archive",

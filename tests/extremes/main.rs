@@ -42,16 +42,16 @@
 //! | 37 | threads, memory, tiles | `tests/compression/compress.rs: compressed_bytes_ignore_thread_count`, `tests/command_line/memory.rs: named_minimum_memory_works_and_changes_no_byte`; selfcheck "1 and 2 threads" |
 //! | 38 | opposite, 10 v | `merging::different_motion_or_life_never_merges` |
 //! | 39 | run killed at any time | `tests/command_line/memory.rs: next_run_cleans_up_after_a_killed_run`, `tests/command_line/beside_others.rs: killed_run_leaves_old_or_new_output_and_foreign_files` |
-//! | 40 | translated, rotated, scaled | `laws::*`, `clouds::without_cameras_survivors_ignore_the_length_unit` |
+//! | 40 | translated, rotated, scaled | `invariance::*`, `clouds::without_cameras_survivors_ignore_the_length_unit` |
 //! | 41 | time stamps | `streams::nonincreasing_time_stamps_are_named` |
 //! | 42 | T = 1,000,000; N = 10,000,000 | `tests/command_line/long.rs` |
 //! | 43 | another N, other attributes | `clouds::frames_with_unequal_counts_are_named`, `streams::frames_of_another_size_or_attributes_are_named` |
 //!
 //! C, E and Vis, which no case names, are compared with slow definitions in selfcheck "projected area", "needle on screen"
-//! and "contributions", and E in `laws`.
+//! and "contributions", and E in `invariance`.
 
 mod clouds;
-mod laws;
+mod invariance;
 mod merging;
 mod motion;
 #[path = "../scene/mod.rs"]

@@ -92,7 +92,7 @@ fn different_colors_never_merge() {
         |dc: [[f32; 3]; 2]| count_after_merging(1, |_, cloud| (0..2).for_each(|i| cloud.sh.set_row(i, dc[i])));
     assert_eq!(colored([[-1.772; 3]; 2]), 1);
     for gray in [-1.2, -0.9, -0.5, -0.1] {
-        assert_eq!(colored([[-1.772; 3], [gray; 3]]), 2, "black beside a grey of {gray}");
+        assert_eq!(colored([[-1.772; 3], [gray; 3]]), 2, "black beside a gray of {gray}");
     }
     // Coefficients below black are also black.
     assert_eq!(colored([[-1.78; 3], [-2.5; 3]]), 1);

@@ -93,7 +93,7 @@ fn archive_of_a_ply_with_a_large_tail_names_the_limit() {
 }
 
 #[test]
-fn ply_headers_of_bombs_end_soon_and_small() {
+fn malicious_ply_headers_are_refused_in_little_memory() {
     let folder = Folder::new();
     let whole = ply_header("binary_little_endian", 10, 0);
     let more = |count: usize, line: &str| {
@@ -134,7 +134,7 @@ fn ply_of_a_gigabyte_without_a_line_end_is_refused() {
 }
 
 #[test]
-fn text_ply_is_parsed_once_however_many_blocks_it_has() {
+fn text_ply_is_parsed_once_for_any_number_of_blocks() {
     let folder = Folder::new();
     let rows = if is_optimized() { 200_000 } else { 30_000 };
     text_ply(&folder, "text.ply", rows);
@@ -240,7 +240,7 @@ fn archives_that_decompress_to_gigabytes_are_refused() {
 }
 
 #[test]
-fn sparse_archives_are_refused_by_their_head() {
+fn sparse_archives_are_refused_by_their_header() {
     let folder = Folder::new();
     sparse(&folder, "zeros.gsz", "", 3 << 30);
     folder.attack("info zeros.gsz").run().refused(1, &["zeros.gsz, byte 0"]).within(SMALL_MEMORY.1);
@@ -312,7 +312,7 @@ fn arrays_that_unpack_to_far_more_than_their_file_are_refused() {
 }
 
 #[test]
-fn zip_ends_that_announce_too_many_files_are_refused() {
+fn zip_directories_with_too_many_files_are_refused() {
     let folder = Folder::new();
     let end = |files: u16, list: u32| {
         let mut end = b"PK\x05\x06\0\0\0\0".to_vec();
@@ -351,7 +351,7 @@ fn splatv_of_100_mib_of_zeros_keeps_within_memory() {
 }
 
 #[test]
-fn container_with_2_to_the_27_announced_frames_is_refused() {
+fn container_declaring_2_to_the_27_frames_is_refused() {
     let folder = Folder::new();
     let path = folder.path("bomb.gseq");
     let columns = [("position", 3), ("rotation", 4), ("log_scale", 3), ("opacity_logit", 1), ("sh", 3)];
@@ -395,7 +395,7 @@ fn files_of_other_kinds_are_refused_by_name_without_waiting() {
 }
 
 #[test]
-fn pipe_as_a_frame_or_a_picture_is_not_waited_for() {
+fn pipe_as_a_frame_or_an_image_is_not_waited_for() {
     let folder = Folder::new();
     let pipe = |name: &str| {
         let path = folder.path(name);
@@ -419,7 +419,7 @@ fn pipe_as_a_frame_or_a_picture_is_not_waited_for() {
 }
 
 #[test]
-fn input_cut_short_while_it_is_read_is_an_error_that_names_it() {
+fn input_cut_short_while_read_is_an_error_that_names_it() {
     cut_while_read(if is_optimized() { 24 } else { 6 });
 }
 

@@ -200,7 +200,7 @@ fn folder_with_edit(edit: &Edit) -> Folder {
 
 #[test]
 #[ignore = "slow: 225 runs"]
-fn slow_tiny_counts_by_every_size_to_every_kind_end() {
+fn slow_few_gaussians_end_for_every_target_and_output() {
     let sizes = ["", "--target-ratio 0.5", "--target-count 2", "--min-psnr 20dB", "--target-size 200kB"];
     for count in [0u64, 1, 2, 3, 4, 5, 7, 16, 50] {
         let cloud = cloud(count as usize);
@@ -225,7 +225,7 @@ fn slow_tiny_counts_by_every_size_to_every_kind_end() {
 
 #[test]
 #[ignore = "slow: 136 runs"]
-fn slow_values_that_are_not_finite_are_refused_dropped_or_kept() {
+fn slow_nonfinite_values_are_refused_dropped_or_kept() {
     for edit in &NOT_FINITE {
         let folder = folder_with_edit(edit);
         for size in ["", "--target-ratio 0.5"] {
@@ -244,7 +244,7 @@ fn slow_values_that_are_not_finite_are_refused_dropped_or_kept() {
 
 #[test]
 #[ignore = "slow: 120 runs"]
-fn slow_values_that_are_kept_though_not_finite_end() {
+fn slow_runs_that_keep_nonfinite_values_end() {
     for edit in &NOT_FINITE {
         for size in ["", "--target-ratio 0.5", "--min-psnr 20dB"] {
             for output in OUTPUTS {

@@ -141,7 +141,7 @@ fn slow_many_pickle_instructions_stay_within_memory() {
 }
 
 #[test]
-fn a_long_name_shared_by_many_is_not_copied_for_each() {
+fn shared_long_names_are_not_copied_for_each_use() {
     let folder = Folder::new();
     let length = 4u32 << 20;
     let pickle = vec![
@@ -167,7 +167,7 @@ fn deeply_nested_pickles_are_refused_by_their_depth() {
 }
 
 #[test]
-fn lengths_that_a_pickle_does_not_hold_are_refused() {
+fn pickle_lengths_beyond_its_end_are_refused() {
     let folder = Folder::new();
     for start in [
         &b"\x80\x02\x8b\xff\xff\xff\x7f"[..],
@@ -228,7 +228,7 @@ fn many_empty_files_in_a_checkpoint_are_counted_first() {
 }
 
 #[test]
-fn a_checkpoint_that_announces_billions_of_files_is_refused() {
+fn checkpoint_declaring_billions_of_files_is_refused() {
     let folder = Folder::new();
     write_zip(&folder.path("b.pt"), [Entry::stored("a/data.pkl", once(b"N."))], Some(0xffff));
     let mut bytes = fs::read(folder.path("b.pt")).unwrap();
@@ -351,7 +351,7 @@ fn slow_165_mb_of_views_are_refused_within_memory() {
 }
 
 #[test]
-fn a_huge_text_number_or_nesting_in_json_is_refused() {
+fn huge_json_texts_numbers_and_nesting_are_refused() {
     let folder = Folder::new();
     for (start, piece, expected) in [
         ("{\"note\": \"", "x".repeat(1 << 16), "a text of at most 1048576 bytes"),

@@ -244,7 +244,7 @@ fn extremes_give_finite_gradients_and_undrawn_ones_zero() {
 }
 
 #[test]
-fn alpha_gradient_of_an_image_filling_gaussian() {
+fn gradient_of_an_image_filling_gaussian_is_its_alpha() {
     let mut wall = single(2.0, 1.0, 0.6);
     wall.log_scale.set_row(0, [40.0f32; 3]);
     let camera = plain_camera(40);
@@ -266,7 +266,7 @@ fn clamped_alpha_has_gradients_only_for_color() {
     }
     let got = f64::from(found.column(Columns::SH).plane(0)[0]);
     let expected = splatsieve::model::SH_C0 * 0.99 * 1600.0;
-    assert!((got / expected - 1.0).abs() < 1e-5, "colour: got {got}, expected {expected}");
+    assert!((got / expected - 1.0).abs() < 1e-5, "color: got {got}, expected {expected}");
 }
 
 #[test]

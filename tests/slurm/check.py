@@ -224,7 +224,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("program")
     parser.add_argument("model", nargs="?", type=Path)
-    parser.add_argument("--start", action="store_true", help="start a Slurm, stop it, and do nothing else")
+    parser.add_argument("--start", action="store_true", help="only start and stop a Slurm")
     parser.add_argument("--only", nargs="+", choices=[case.__name__ for case in CASES])
     args = parser.parse_args()
     if lacks := missing():
