@@ -19,8 +19,8 @@
 //! render alone; `picture/large` misses it with 2.7. The ratio of medians, measured in alternation, is printed before
 //! each group. It includes the subtraction of two images for the loss. `picture/demo` is a view of the demo scene.
 //!
-//! Times are wall-clock times: on a busy machine they are several times the cost. Criterion arguments filter: `cargo
-//! bench --bench render -- picture`.
+//! Times are wall-clock times: on a busy machine they are several times the cost. Criterion arguments filter:
+//! `cargo bench --bench render -- picture`.
 
 #[path = "../tests/models/mod.rs"]
 mod models;

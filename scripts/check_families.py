@@ -278,7 +278,7 @@ def load(path):
 
 
 def leaves(node, place=""):
-    """Returns every leaf of a tree with its path, in order."""
+    """Yields every leaf of a tree with its path, in order."""
     if isinstance(node, dict):
         for key, value in node.items():
             yield from leaves(value, f"{place}[{key!r}]")

@@ -151,7 +151,7 @@ class Tensor:
         self.offset, self.shape, self.stride = offset, tuple(shape), tuple(stride)
 
     def places(self):
-        """Yields the place of every element in the storage, the last index fastest."""
+        """Returns the places of all elements in the storage, the last index fastest."""
         steps = [range(0, extent * step, step) if step else [0] * extent for extent, step in zip(self.shape, self.stride)]
         return (self.offset + sum(at) for at in itertools.product(*steps))
 

@@ -47,7 +47,7 @@ def run(command, stdin=None):
 
 
 def cases(binary, data, scratch):
-    """Returns (name, function that writes to a given path, name of the output) of every case."""
+    """Yields (name, function that writes to a given path, name of the output) of every case."""
     models = sorted(path.parent for path in data.glob("*/cfg_args"))
     small = models[0]
     box = "-1,-1,-1,0,0,0"

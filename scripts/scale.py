@@ -79,7 +79,7 @@ def memory(budget):
 
 
 def runs(args, gaussians, frames):
-    """Compresses one sequence under every memory limit. Returns one table entry for each."""
+    """Compresses one sequence under every memory limit. Yields one table entry for each."""
     packed = args.folder / f"{gaussians}x{frames}{'_raw' * args.raw}.gseq"
     cameras, output = args.folder / "cameras.json", args.folder / "compressed.gseq"
     cameras.write_text(cameras_json(args.views))

@@ -300,8 +300,7 @@ fn assert_solved_at_leaders(
         let merged = merge_state(&members, at_reference, leader as u32, merge, Columns::all());
         assert_is_mixture(&merged, &members, at_reference, leader, merge);
         let length = at_reference.rotation.row::<4>(leader).iter().map(|x| f64::from(x * x)).sum::<f64>().sqrt();
-        // (property, merged state, state of the leader, raw value of the leader); then the state of the result is
-        // compared.
+        // (property, merged state, state of the leader, state of the proxy in the result)
         let mut columns: Vec<(String, f64, f32, f32)> = Vec::new();
         let found = &frames[all_frames.reference];
         for c in 0..3 {

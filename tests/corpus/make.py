@@ -213,7 +213,7 @@ def zipped(entries, method=zipfile.ZIP_STORED, folder="archive/"):
 
 
 def checkpoint(tensors, change=lambda data: data, method=zipfile.ZIP_STORED):
-    """Writes a file like torch.save; `tensors` by name: shape and values."""
+    """Returns a file like those of torch.save; `tensors` by name: shape and values."""
     state, data = OrderedDict(), {}
     for name, (shape, values) in tensors.items():
         storage = Storage(str(len(data)), values)
@@ -421,7 +421,7 @@ TRACKS = 24
 
 
 def make_colmap():
-    """Writes the length of the camera part, cameras, images: in the binary and in the text format."""
+    """Writes COLMAP inputs (length of the camera part, cameras, images) in the binary and in the text format."""
 
     def both(cameras, images):
         return struct.pack("<I", len(cameras)) + cameras + images
@@ -457,7 +457,7 @@ def make_colmap():
 
 
 def stream(frames):
-    """Returns frames whose positions move smoothly, so that their tiles are filtered (format/STREAM.md)."""
+    """Returns a stream of frames whose positions move smoothly, so that their tiles are filtered (format/STREAM.md)."""
     out = struct.pack("<8sIIQII", b"\x89GSTR\r\n\x1a", 1, 0, TRACKS, 1, 0)
     # Similar rotations and colors, so that some constant tiles are compressed and some are not.
     out += floats([1.0] * TRACKS + [0.0] * 3 * TRACKS + normal(3 * TRACKS, 0.5, -3) + normal(TRACKS) + [0.5] * 3 * TRACKS)
@@ -587,7 +587,7 @@ def make_sections(archive):
 
 
 def saved(make, change=lambda data: data):
-    """Writes a file like torch.save with the result of `make`, which calls its argument to get a tensor of a shape and
+    """Returns a file like those of torch.save with the result of `make`, which calls its argument to get a tensor of a shape and
     values.
     """
     storages = []

@@ -146,7 +146,7 @@ class Cluster:
             end(pid, signal.SIGKILL)
 
     def processes(self):
-        """Returns all processes of this Slurm: number, name, environment."""
+        """Yields all processes of this Slurm: number, name, environment."""
         for entry in Path("/proc").iterdir():
             if not entry.name.isdigit():
                 continue
