@@ -43,14 +43,14 @@ fn write_faint_above(workplace: &Workplace, degree: usize) -> PathBuf {
     model
 }
 
-const UNREFINED: &str = "model --cameras {tiny} --no-refine --prune-only --field exact --overwrite";
+const QUICKLY: &str = "model --cameras {tiny} --no-refine --prune-only --field exact --overwrite";
 
 #[test]
 fn invisible_sh_coefficients_and_their_degree_go() {
     for degree in [0, 1, 2] {
         let workplace = Workplace::new();
         let model = write_faint_above(&workplace, degree);
-        let summary = workplace.summary(&format!("{UNREFINED} --target-ratio 0.5 --bands-margin 90 -o small"));
+        let summary = workplace.summary(&format!("{QUICKLY} --target-ratio 0.5 --bands-margin 90 -o small"));
         let bands = &summary["bands"];
         assert_eq!((&bands["sh_degree"], reason_left_out(&summary)), (&Value::from(degree), None), "{bands}");
         let of_degree = |tried: &Value| tried[0] == degree && tried[1].as_f64() >= bands["least"].as_f64();
@@ -85,7 +85,7 @@ fn invisible_sh_coefficients_and_their_degree_go() {
 fn visible_sh_coefficients_stay_and_are_reported() {
     let workplace = Workplace::new();
     let model = write_faint_above(&workplace, 3);
-    let summary = workplace.summary(&format!("{UNREFINED} --target-ratio 0.5 --bands-margin 90 -o small"));
+    let summary = workplace.summary(&format!("{QUICKLY} --target-ratio 0.5 --bands-margin 90 -o small"));
     let why = reason_left_out(&summary).unwrap();
     assert!(why.contains("dB at degree 2") && why.contains("at least 60.0 dB against all degrees required"), "{why}");
     assert_eq!(summary["bands"]["sh_degree"], 3);
@@ -95,21 +95,21 @@ fn visible_sh_coefficients_stay_and_are_reported() {
     assert_eq!(after, before);
 
     // Without the request nothing is searched and nothing reported.
-    let all = workplace.summary(&format!("{UNREFINED} --target-ratio 0.5 --bands all -o small"));
+    let all = workplace.summary(&format!("{QUICKLY} --target-ratio 0.5 --bands all -o small"));
     assert!(all["bands"].is_null() && reason_left_out(&all).is_none());
 }
 
 #[test]
 fn sh_coefficients_stay_with_an_sh_head_or_at_degree_0() {
     let workplace = Workplace::new();
-    let quickly = UNREFINED.replacen("model", "{tiny}", 1);
+    let quickly = QUICKLY.replacen("model", "{tiny}", 1);
     let summary = workplace.summary(&format!("{quickly} --target-ratio 0.5 --bands-margin 0 -o small"));
     assert!(reason_left_out(&summary).unwrap().contains("SH head") && summary["bands"].is_null());
     assert_eq!(PlyRows::read(&point_cloud(&workplace.path("small"))).names.len(), 62);
 
     write_faint_above(&workplace, 0);
-    workplace.done(&format!("compress {UNREFINED} -o plain"));
-    let again = UNREFINED.replacen("model", "plain", 1);
+    workplace.done(&format!("compress {QUICKLY} -o plain"));
+    let again = QUICKLY.replacen("model", "plain", 1);
     let summary = workplace.summary(&format!("{again} --target-ratio 0.5 -o small"));
     assert!(reason_left_out(&summary).unwrap().contains("degree 0") && summary["bands"].is_null());
 }
@@ -158,7 +158,7 @@ fn lower_degree_passes_the_loader_check_and_a_wrong_one_fails() {
     let workplace = Workplace::new();
     let model = write_faint_above(&workplace, 1);
     let small = workplace.path("small");
-    workplace.done(&format!("compress {UNREFINED} --target-ratio 0.4 -o small"));
+    workplace.done(&format!("compress {QUICKLY} --target-ratio 0.4 -o small"));
     let (accepted, text) = check_model_folder(&model, &small);
     assert!(accepted && text.contains("SH degree 1 of 3") && text.contains("can open it"), "{text}");
 
