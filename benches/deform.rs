@@ -1,11 +1,11 @@
-//! How long does the deformation field take per Gaussian and frame, on one thread?
+//! Measures the time of the deformation field per Gaussian and frame, on one thread.
 //!
-//! Two synthetic fields of the shapes real models have: D-NeRF style (width 64, two levels of 32 channels;
-//! position, scale and rotation) and DyNeRF style (width 128, two levels of 16 channels; all five heads).
-//! The rival is the original PyTorch code, which needs 2.3 to 3.1 µs and 4.6 µs on one core of the machine
-//! these were first run on. Positions alone are measured too: the scan of a model without opacity
-//! deformation asks for no more; and the derivative of a state by positions, which a refinement asks for in every step.
-//! Invert the throughput to get the time per Gaussian and frame.
+//! Two synthetic fields have the shapes of real models: D-NeRF style (width 64, two levels of 32 channels; position,
+//! scale and rotation) and DyNeRF style (width 128, two levels of 16 channels; all five heads). For comparison, the
+//! original PyTorch code needs 2.3 to 3.1 µs and 4.6 µs on one core of the machine on which these benchmarks were first
+//! run. Positions alone are measured too, because the scan of a model without opacity deformation reads nothing else;
+//! and the derivative of a frame state by positions, which refinement needs in every step. The time per Gaussian and
+//! frame is the inverse of the throughput.
 
 use std::path::Path;
 
@@ -15,7 +15,7 @@ use splatsieve::model::{AttributeValues, Attributes, Gaussians};
 
 const BLOCK: usize = 1024;
 
-/// Values in [−1, 1), the same on every run.
+/// Returns a value in [−1, 1), the same in every run.
 fn noise(seed: &mut u64) -> f32 {
     *seed = seed.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
     (*seed >> 40) as f32 / (1 << 23) as f32 - 1.0
@@ -82,7 +82,7 @@ fn deform(criterion: &mut Criterion) {
             });
         });
     }
-    // How states change with positions: forward to the position's head, and back for each component.
+    // Derivative of states by positions: forward to the position head, and backward for each component.
     let mut raw = Gaussians::zeros(BLOCK, 3);
     raw.position = position;
     for (name, field) in

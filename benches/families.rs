@@ -1,14 +1,17 @@
-//! How long does a state of other families take per Gaussian and frame, on one thread?
+//! Measures the time of a frame state of the other model formats per Gaussian and frame, on one thread.
 //!
-//! `network`: what the network of Deformable-3D-Gaussians says, with a time network, of 1024 Gaussians prepared once; it makes
-//! 0.5 million multiplications. The rival is a bare product of the same matrices by `matrixmultiply`, without biases, ReLUs and
-//! sines. With trained models at hand, whole states of Deformable-3D-Gaussians (a covariance is decomposed beside), with
-//! screws, and of SC-GS, with each Gaussian 64 times, as the network's outputs for nodes, made anew at every time, are shared by
-//! all Gaussians; of SpacetimeGaussians and FreeTimeGS,
-//! which are polynomials and a window; of native 4D Gaussians, which are slices of covariances, without colors and with.
-//! `open`: what a block of these takes once for all frames. `scripts/torch_speed.py` has the same figures of PyTorch.
-//! Time is that of a processor: what else the machine does does not count. Invert the throughput to get the time per Gaussian
-//! and frame.
+//! - `network`: the network of Deformable-3D-Gaussians with a time network, for 1024 Gaussians that are prepared once;
+//! it makes 0.5 million multiplications. It is compared with a product of the same matrices by `matrixmultiply`,
+//! without biases, ReLUs and sines.
+//! - `state`, if the trained models are available: complete frame states of Deformable-3D-Gaussians (which includes the
+//! decomposition of a covariance), with screws; of SC-GS, with each Gaussian 64 times, because all Gaussians share the
+//! network outputs for control nodes, which are computed for every time; of SpacetimeGaussians and FreeTimeGS, which
+//! are polynomials and a temporal window; of native 4D Gaussians, which are slices of covariances, without and with
+//! colors.
+//! - `open`: the time that a block of these takes once for all frames.
+//!
+//! `scripts/torch_speed.py` measures the same in PyTorch. Times are processor times, so other load on the machine does
+//! not count. The time per Gaussian and frame is the inverse of the throughput.
 
 #[path = "../tests/models/mod.rs"]
 mod models;
@@ -28,12 +31,12 @@ use splatsieve::source::Ids;
 
 const BLOCK: usize = 1024;
 const WIDTH: usize = 256;
-/// Copies of each Gaussian of SC-GS.
+/// Number of copies of each Gaussian of SC-GS.
 const REPEATED: usize = 64;
-/// Values of a position and of a time.
+/// Number of encoded values of a position and of a time.
 const INPUTS: usize = 63 + 30;
 
-/// Time that processors spend on this process.
+/// Measurement of the processor time of this process.
 struct Processor;
 
 impl Measurement for Processor {
@@ -66,13 +69,13 @@ impl Measurement for Processor {
     }
 }
 
-/// Values in [−1, 1), the same on every run.
+/// Returns a value in [−1, 1), the same in every run.
 fn noise(seed: &mut u64) -> f32 {
     *seed = seed.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
     (*seed >> 40) as f32 / (1 << 23) as f32 - 1.0
 }
 
-/// Outputs and inputs of the layers.
+/// Returns the numbers of outputs and inputs of every layer.
 fn layers() -> Vec<[usize; 2]> {
     let inputs = |k: usize| if k == 0 { INPUTS } else { WIDTH + if k == 5 { INPUTS } else { 0 } };
     (0..8).map(|k| [WIDTH, inputs(k)]).collect()
@@ -99,11 +102,11 @@ fn network() -> Network {
     Network::new(&tensors, "", Path::new("synthetic")).expect("a well-formed network")
 }
 
-/// y = W·x for `BLOCK` columns x.
+/// Computes y = W·x for `BLOCK` columns x.
 fn product([outputs, inputs]: [usize; 2], weight: &[f32], x: &[f32], y: &mut [f32]) {
     assert!(weight.len() >= outputs * inputs && x.len() >= inputs * BLOCK && y.len() >= outputs * BLOCK);
     let (rows, columns) = (inputs as isize, BLOCK as isize);
-    // SAFETY: the line above saw that the three matrices, row by row, lie within their slices.
+    // SAFETY: the assertion above checks that the three row-major matrices lie within their slices.
     unsafe {
         matrixmultiply::sgemm(
             outputs,
@@ -148,7 +151,7 @@ fn networks(criterion: &mut Criterion<Processor>) {
     group.finish();
 }
 
-/// A copy of the model at `path` in `to`, with each of its Gaussians so many times.
+/// Copies the model at `path` to `to` with each of its Gaussians [`REPEATED`] times.
 fn repeated(path: &Path, to: &Path) -> PathBuf {
     for file in ["cfg_args", "deform/iteration_80000/deform.pth", "point_cloud/iteration_80000/point_cloud.ply"] {
         let mut bytes = fs::read(path.join(file)).expect("a trained model");
@@ -168,7 +171,7 @@ fn repeated(path: &Path, to: &Path) -> PathBuf {
 fn states(criterion: &mut Criterion<Processor>) {
     let Some(folder) = models::found() else { return };
     let mut group = criterion.benchmark_group("state");
-    // More than those of which outputs for nodes are kept.
+    // More times than there are cached node outputs.
     let times: Vec<f64> = (0..1500).map(|frame| f64::from(frame) / 1499.0).collect();
     let scratch = tempfile::tempdir().expect("a folder for temporary files");
     let still = Attributes::all().difference(Attributes::SH);
@@ -179,7 +182,7 @@ fn states(criterion: &mut Criterion<Processor>) {
         ("spacetime", "stg_lite", Attributes::all()),
         ("free_time", "ftgs", still),
         ("native_4d", "yang4d", still),
-        ("native_4d_colours", "yang4d", Attributes::all()),
+        ("native_4d_colors", "yang4d", Attributes::all()),
     ] {
         let model = folder.join("families").join(model);
         let (path, count) = match name {

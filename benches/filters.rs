@@ -1,15 +1,17 @@
-//! Which filter should stand before zstd, by column, on what trained models give?
+//! Compares filters in front of zstd by attribute, on states of trained models.
 //!
-//! Candidates: the bits as they are, or zigzagged differences of their ranks to the frame before (`order1`) or to the line
-//! through two (`order2`); in place, or bytes of equal weight gathered (`shuffled`); zstd level 1 or 3. `gseq` takes
-//! the better order of each tile, shuffled, at the level asked for; its choices rest on this. Sizes in percent of the raw
-//! bytes are printed as a Markdown table, a row for every model and column; times are taken over all models.
+//! Candidates: the bits unchanged, or zigzag differences of their ranks to the frame before (`order1`) or to the line
+//! through the two frames before (`order2`); in place, or with bytes of equal weight gathered (`shuffled`); zstd level
+//! 1 or 3. `gseq` uses the better order of each tile, shuffled, at the requested level; this benchmark is the reason
+//! for that choice. Sizes in percent of the raw bytes are printed as a Markdown table with one row per model and
+//! attribute; times are taken over all models.
 //!
-//! A second table is of what a bound leaves: multiples of twice the bound, differences to the frame before, all of them or
-//! those of tracks that do not stand still, frame by frame or track by track; and as `gseq` stores them, which also has
-//! half the step for tracks that stand still where that is smaller. Times raw bytes over stored ones.
+//! A second table compares encodings within an error bound: multiples of twice the bound, as differences to the frame
+//! before, of all tracks or only of those that move, frame by frame or track by track; and the encoding of `gseq`,
+//! which also uses half the step for tracks that do not move if that is smaller. The figures are raw bytes divided by
+//! stored bytes.
 //!
-//! `cargo bench --bench filters`; `-- decode/position` measures one column only.
+//! Usage: `cargo bench --bench filters`; `cargo bench --bench filters -- decode/position` measures one attribute.
 
 mod trajectories;
 
@@ -26,7 +28,7 @@ struct Filter {
     level: i32,
 }
 
-/// Every candidate.
+/// Returns every candidate.
 fn filters() -> impl Iterator<Item = Filter> {
     let with = |order| {
         [(false, 1), (false, 3), (true, 1), (true, 3)].map(|(shuffled, level)| Filter { order, shuffled, level })
@@ -40,12 +42,12 @@ impl Filter {
         format!("order{}_{layout}_zstd{}", self.order, self.level)
     }
 
-    /// `bits` are frames of `plane` values.
+    /// Encodes `bits`, which are frames of `plane` values.
     fn encode(&self, bits: &[u32], plane: usize) -> Vec<u8> {
         let mut residuals = bits.to_vec();
         if self.order > 0 {
             residuals.iter_mut().for_each(|bits| *bits = rank(*bits));
-            // From the end, so that what predicts is still itself.
+            // From the last frame to the first, so that the predictors are still unchanged.
             for frame in (1..bits.len() / plane).rev() {
                 let (before, rest) = residuals.split_at_mut(frame * plane);
                 let (one, two) = predictors(before, frame, plane, self.order);
@@ -89,23 +91,23 @@ impl Filter {
     }
 }
 
-/// f32 bits as integers in numeric order.
+/// Returns the bits of an f32 as an integer in numeric order.
 fn rank(bits: u32) -> u32 {
     bits ^ (((bits as i32) >> 31) as u32 | 0x8000_0000)
 }
 
-/// The line through two frames at the next; through one twice it is that one.
+/// Extrapolates the line through two frames to the next; equal frames give the same value.
 fn predict(one: u32, two: u32) -> u32 {
     one.wrapping_mul(2).wrapping_sub(two)
 }
 
-/// The frame before `frame` and the one before that, which of order 1 is the same.
+/// Returns the frame before `frame` and the one before that; order 1 returns the first twice.
 fn predictors(before: &[u32], frame: usize, plane: usize, order: usize) -> (&[u32], &[u32]) {
     let back = |k: usize| &before[(frame - k) * plane..][..plane];
     (back(1), back(order.min(frame)))
 }
 
-/// Bound of a column in the second table.
+/// Returns the bound of an attribute in the second table.
 fn bound(column: Attributes) -> f64 {
     match column {
         Attributes::POSITION => 1e-3,
@@ -115,7 +117,8 @@ fn bound(column: Attributes) -> f64 {
     }
 }
 
-/// Gathered bytes of the multiples of twice `bound`: a bit for each track, the first frame, differences.
+/// Encodes the values as multiples of twice `bound` with gathered bytes: one bit per track, the first frame,
+/// differences.
 fn multiples(bits: &[u32], plane: usize, bound: f64, apart: bool, by_track: bool) -> Vec<u8> {
     let multiple = |&bits: &u32| (f64::from(f32::from_bits(bits)) / (2.0 * bound)).round() as i32;
     let values: Vec<i32> = bits.iter().map(multiple).collect();
@@ -138,10 +141,10 @@ fn multiples(bits: &[u32], plane: usize, bound: f64, apart: bool, by_track: bool
     out
 }
 
-/// Bits of a tile, and the values of one frame.
+/// Bits of a tile, and the number of values in one frame.
 type TileBits = (Vec<u32>, usize);
 
-/// The second table: a row of each column.
+/// Returns the row of an attribute in the second table.
 fn within_bounds(name: &str, column: Attributes, tiles: &[TileBits]) -> String {
     let raw: usize = tiles.iter().map(|(bits, _)| 4 * bits.len()).sum();
     let times =
@@ -171,7 +174,7 @@ fn benches(criterion: &mut Criterion) {
     eprintln!("| scene | column | {} |\n|---|---|{}", names.join(" | "), "---|".repeat(names.len()));
     let mut within = Vec::new();
     for (name, scene) in trajectories::scenes() {
-        for (column, all) in columns.iter_mut().filter(|(column, _)| scene.info().varying.contains(*column)) {
+        for (column, all_tiles) in columns.iter_mut().filter(|(column, _)| scene.info().varying.contains(*column)) {
             let tiles = trajectories::tiles(&scene, *column).into_iter();
             let tiles: Vec<TileBits> =
                 tiles.map(|tile| (bytemuck::cast_slice(&tile).to_vec(), tile.len() / scene.len())).collect();
@@ -183,9 +186,9 @@ fn benches(criterion: &mut Criterion) {
             let sizes: Vec<String> = filters().map(percent).collect();
             eprintln!("| {name} | {} | {} |", column.name(), sizes.join(" | "));
             within.push(within_bounds(name, *column, &tiles));
-            // Curves with noise say nothing about what models give.
+            // Generated curves with noise do not represent models.
             if name != "curves" {
-                all.extend(tiles);
+                all_tiles.extend(tiles);
             }
         }
     }
@@ -222,7 +225,7 @@ fn benches(criterion: &mut Criterion) {
 
 criterion_group! {
     name = all;
-    // Over a hundred benchmarks.
+    // There are more than a hundred benchmarks.
     config = Criterion::default().warm_up_time(std::time::Duration::from_millis(200)).measurement_time(std::time::Duration::from_millis(800));
     targets = benches
 }

@@ -1,12 +1,12 @@
-//! How many Gaussians of a frame are linked to the frame before, and looked at for lives that are one, in a second, on one
-//! thread and on all?
+//! Measures how many Gaussians per second are linked to the frame before and joined across lives, on one thread and on
+//! all.
 //!
-//! `still` repeats every Gaussian to the bit, `moving` moves each on its circle, `noisy` adds 2% of its size to that,
-//! `lives` lets a seventh of them be away in each frame, and `crowded` has fifty lie within the size of each. Frames come in
-//! a shuffled order. The rival, `nearest`, looks at all pairs in cells as wide as the mean distance and takes the nearest,
-//! whatever it looks like: what finding them costs without deciding anything.
+//! `still` repeats every Gaussian to the bit, `moving` moves each on its circle, `noisy` adds noise of 2% of its size,
+//! `lives` removes a seventh of them in each frame, and `crowded` puts fifty within the size of each. Frames have a
+//! shuffled order. For comparison, `nearest` searches all pairs in cells as wide as the mean distance and takes the
+//! nearest Gaussian, whatever its appearance; it shows the cost of the search without decisions.
 //!
-//! `cargo bench --bench link`; the goal is a million a second and core.
+//! Usage: `cargo bench --bench link`. The goal is a million Gaussians per second and core.
 
 use std::collections::HashMap;
 use std::hint::black_box;
@@ -23,7 +23,7 @@ fn uniform(k: u64) -> f32 {
     (hash_id(k) >> 40) as f32 / (1u64 << 24) as f32
 }
 
-/// Frames of a cloud in which about `crowd` lie within the size of each.
+/// Returns frames of a point cloud in which about `crowd` Gaussians lie within the size of each.
 fn frames(crowd: f32, motion: f32, noise: f32, lives: bool) -> Vec<Gaussians> {
     let size = (crowd / COUNT as f32).cbrt() * 0.5;
     let frame = |t: usize| {
@@ -34,8 +34,8 @@ fn frames(crowd: f32, motion: f32, noise: f32, lives: bool) -> Vec<Gaussians> {
         for (row, &i) in order.iter().enumerate() {
             let value = |k: u64| uniform(u64::from(i) * 64 + k);
             let angle = motion * t as f32 * if i % 2 == 0 { 1.0 } else { -1.0 };
-            let trembling = |c: u64| noise * size * (uniform(u64::from(i) * 64 + 32 + c + 3 * t as u64) - 0.5);
-            let [x, y, z] = [0, 1, 2].map(|c| value(c) + trembling(c));
+            let jitter = |c: u64| noise * size * (uniform(u64::from(i) * 64 + 32 + c + 3 * t as u64) - 0.5);
+            let [x, y, z] = [0, 1, 2].map(|c| value(c) + jitter(c));
             state.position.set_row(row, [x + 0.05 * angle.cos(), y + 0.05 * angle.sin(), z]);
             state.rotation.set_row(row, [3, 4, 5, 6].map(|k| value(k) - 0.5));
             state.log_scale.set_row(row, [7, 8, 9].map(|k| size.ln() + 2.0 * value(k) - 1.0));

@@ -1,16 +1,16 @@
-//! What does merging cost, on one thread?
+//! Measures the cost of merging on one thread.
 //!
-//! `neighbors`: the nearest neighbors within ε, per Gaussian, `voxels` being the index of the program, built and asked:
-//! in trained models with the ε of the presets, among Gaussians strewn evenly, with some or many neighbors each, and in
-//! clusters, and in crowds: all in one voxel, and all at one point. Rivals: one `tree` over all points, asked in voxel
-//! order too, which is what the program had; `all_pairs`, on few Gaussians, where that still has a chance; and a
-//! `plain_hash`, whose voxels list their points, looked up for each point anew.
-//! `pairs`: the motion of a pair, per pair and frame, positions in memory.
-//! `measure`: the same from a packed container, per pair and frame: at once, and in eight partitions, whose cost over
-//! the first is what gathering and reading again costs.
-//! `merge`: a whole pass without motion, per survivor: neighbors, gates, clusters, proxies.
+//! - `neighbors`: time per Gaussian of finding the nearest neighbors within ε. `voxels` is the index of the program,
+//! built and searched: in trained models with the ε of the presets, among evenly distributed Gaussians with few or many
+//! neighbors, in clusters, and in crowds (all in one voxel, and all at one point). It is compared with `tree`, one tree
+//! over all points searched in voxel order, which the program used earlier; with `all_pairs`, only for few Gaussians;
+//! and with `plain_hash`, whose voxels list their points and are looked up for each point.
+//! - `pairs`: time per pair and frame of measuring the motion of a pair, with positions in memory.
+//! - `measure`: the same from a packed container, at once and in eight partitions; the difference is the cost of
+//! gathering and reading again.
+//! - `merge`: time per survivor of a complete pass without motion: neighbors, tests, clusters, proxies.
 //!
-//! `cargo bench --bench merge`
+//! Usage: `cargo bench --bench merge`
 
 #[path = "../tests/models/mod.rs"]
 mod models;
@@ -39,15 +39,16 @@ use splatsieve::progress::Events;
 use splatsieve::recipe::{MotionParams, Recipe};
 use splatsieve::source::FrameSource;
 
-/// As many as the presets look at.
-const NEIGHBOURS: usize = 32;
+/// Number of neighbors that the presets use.
+const NEIGHBORS: usize = 32;
 
 fn random(k: usize) -> f32 {
     (hash_id(k as u64) >> 40) as f32 / (1 << 24) as f32
 }
 
-/// `n` similar Gaussians, strewn evenly over the unit cube, and a reach that finds a few neighbors each.
-fn strewn(n: usize) -> (Gaussians, f64) {
+/// Returns `n` similar Gaussians distributed evenly over the unit cube, and a radius that contains a few neighbors of
+/// each.
+fn evenly_distributed(n: usize) -> (Gaussians, f64) {
     let mut states = Gaussians::zeros(n, 0);
     let spacing = (n as f64).powf(-1.0 / 3.0);
     for i in 0..n {
@@ -60,7 +61,7 @@ fn strewn(n: usize) -> (Gaussians, f64) {
     (states, 1.2 * spacing)
 }
 
-/// Number of neighbors found in all, from positions and ε.
+/// Function that returns the total number of neighbors found, from positions and ε.
 type Find = fn(&AttributeValues, f64) -> usize;
 
 fn points(position: &AttributeValues) -> Vec<TreePoint> {
@@ -70,7 +71,7 @@ fn points(position: &AttributeValues) -> Vec<TreePoint> {
 fn by_voxels(position: &AttributeValues, epsilon: f64) -> usize {
     let index = PointIndex::new(points(position), epsilon);
     let mut search = index.search();
-    index.points().iter().map(|point| search.nearest(point.index, point.at, NEIGHBOURS).0.len()).sum()
+    index.points().iter().map(|point| search.nearest(point.index, point.at, NEIGHBORS).0.len()).sum()
 }
 
 fn by_tree(position: &AttributeValues, epsilon: f64) -> usize {
@@ -79,35 +80,35 @@ fn by_tree(position: &AttributeValues, epsilon: f64) -> usize {
     let mut points = points(position);
     let tree = Tree::new(&mut points);
     let mut nearest = Nearest::default();
-    let mut of_one = |row: u32| {
-        nearest.start(row, position.row(row as usize), NEIGHBOURS + 1, epsilon);
+    let mut count_neighbors = |row: u32| {
+        nearest.start(row, position.row(row as usize), NEIGHBORS + 1, epsilon);
         tree.search(&points, &mut nearest);
-        nearest.sorted().len().min(NEIGHBOURS)
+        nearest.sorted().len().min(NEIGHBORS)
     };
-    order.into_iter().map(&mut of_one).sum()
+    order.into_iter().map(&mut count_neighbors).sum()
 }
 
 fn squared(a: [f32; 3], b: [f32; 3]) -> f64 {
     (0..3).map(|c| (f64::from(a[c]) - f64::from(b[c])).powi(2)).sum()
 }
 
-/// The nearest of `near` (squared distance, index), as many as are asked for.
+/// Keeps the nearest [`NEIGHBORS`] of `near` (squared distance, index). Returns how many there are.
 fn nearest(near: &mut Vec<(f64, u32)>) -> usize {
     near.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
-    near.truncate(NEIGHBOURS);
+    near.truncate(NEIGHBORS);
     near.len()
 }
 
 fn by_all_pairs(position: &AttributeValues, epsilon: f64) -> usize {
     let mut near = Vec::new();
-    let of_one = |i: usize| {
+    let count_neighbors = |i: usize| {
         let at = position.row(i);
         let others = (0..position.len()).filter(|&j| j != i).map(|j| (squared(at, position.row(j)), j as u32));
         near.clear();
         near.extend(others.filter(|&(d2, _)| d2 <= epsilon * epsilon));
         nearest(&mut near)
     };
-    (0..position.len()).map(of_one).sum()
+    (0..position.len()).map(count_neighbors).sum()
 }
 
 fn by_plain_hash(position: &AttributeValues, epsilon: f64) -> usize {
@@ -115,7 +116,7 @@ fn by_plain_hash(position: &AttributeValues, epsilon: f64) -> usize {
     let mut voxels: HashMap<[i32; 3], Vec<u32>> = HashMap::new();
     (0..position.len()).for_each(|i| voxels.entry(voxel(i)).or_default().push(i as u32));
     let mut near = Vec::new();
-    let of_one = |i: usize| {
+    let count_neighbors = |i: usize| {
         let ([x, y, z], at) = (voxel(i), position.row(i));
         near.clear();
         for cell in 0..27 {
@@ -129,10 +130,10 @@ fn by_plain_hash(position: &AttributeValues, epsilon: f64) -> usize {
         }
         nearest(&mut near)
     };
-    (0..position.len()).map(of_one).sum()
+    (0..position.len()).map(count_neighbors).sum()
 }
 
-/// `n` points in clusters of 200, each some 0.005 wide.
+/// Returns `n` points in clusters of 200, each about 0.005 wide.
 fn clustered(n: usize) -> AttributeValues {
     let mut position = AttributeValues::zeros(3, n);
     for i in 0..n {
@@ -143,7 +144,7 @@ fn clustered(n: usize) -> AttributeValues {
     position
 }
 
-/// Largest side of the box between the 1st and the 99th percentile, as of a scene.
+/// Returns the largest side of the box between the 1st and the 99th percentile, which is the extent of a scene.
 fn extent(position: &AttributeValues) -> f64 {
     let side = |c: usize| {
         let mut plane = position.plane(c).to_vec();
@@ -161,23 +162,23 @@ fn neighbors(criterion: &mut Criterion) {
             let model = models::Model::open(&folder, name);
             let position = model.state(model.frames()[0]).position;
             let unit = extent(&position);
-            // Those of `default` and `strong`, of the extent, and of `paper`, in scene units.
+            // The radii of `default` and `strong`, in extents, and of `paper`, in scene units.
             for (preset, epsilon) in [("0.005", 0.005 * unit), ("0.01", 0.01 * unit), ("paper", 0.02)] {
                 cases.push((format!("{name} {preset}"), position.clone(), epsilon));
             }
         }
     }
     for n in [2_000, 100_000, 1_000_000] {
-        let (states, epsilon) = strewn(n);
+        let (states, epsilon) = evenly_distributed(n);
         cases.push((format!("strewn {n}"), states.position.clone(), epsilon));
         cases.push((format!("strewn densely {n}"), states.position, 2.5 * epsilon));
         cases.push((format!("clustered {n}"), clustered(n), 0.001));
         cases.push((format!("clustered densely {n}"), clustered(n), 0.01));
     }
-    cases.push(("one voxel".into(), strewn(100_000).0.position, 2.0));
+    cases.push(("one voxel".into(), evenly_distributed(100_000).0.position, 2.0));
     cases.push(("one point".into(), AttributeValues::zeros(3, 100_000), 0.1));
     for (name, position, epsilon) in cases {
-        let mut group = criterion.benchmark_group(format!("neighbours/{name}"));
+        let mut group = criterion.benchmark_group(format!("neighbors/{name}"));
         group.sample_size(10).throughput(Throughput::Elements(position.len() as u64));
         let mut rivals: Vec<(&str, Find)> = vec![("voxels", by_voxels), ("tree", by_tree)];
         if name.starts_with("strewn") && position.len() <= 100_000 {
@@ -196,8 +197,8 @@ fn neighbors(criterion: &mut Criterion) {
     }
 }
 
-/// Each with its nearest neighbors of higher index.
-fn pairs_of(position: &AttributeValues) -> Vec<(u32, u32)> {
+/// Returns pairs of each Gaussian with those of its eight nearest neighbors that have a higher index.
+fn neighbor_pairs(position: &AttributeValues) -> Vec<(u32, u32)> {
     let index = PointIndex::new(points(position), f64::INFINITY);
     let mut search = index.search();
     let mut pairs = Vec::new();
@@ -212,9 +213,9 @@ fn motion(criterion: &mut Criterion) {
     let one_thread = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
     let recipe = Recipe::preset("default").unwrap();
     let frames = 8;
-    let (states, _) = strewn(20_000);
+    let (states, _) = evenly_distributed(20_000);
     let position = &states.position;
-    let pairs = pairs_of(position);
+    let pairs = neighbor_pairs(position);
     let mut group = criterion.benchmark_group("pairs");
     group.sample_size(10).throughput(Throughput::Elements((frames * pairs.len()) as u64));
     group.bench_function("motion", |bencher| {
@@ -238,7 +239,7 @@ fn motion(criterion: &mut Criterion) {
     let container = Container::open(&path).unwrap();
     let ids: Vec<u32> = (0..scene.info().count as u32).collect();
     let reference = gather(&container, &ids, 0, Attributes::POSITION).unwrap().position;
-    let pairs = pairs_of(&reference);
+    let pairs = neighbor_pairs(&reference);
     let mut group = criterion.benchmark_group("measure");
     group.sample_size(10).throughput(Throughput::Elements((48 * pairs.len()) as u64));
     for partitions in [1, 8] {
@@ -266,7 +267,7 @@ fn motion(criterion: &mut Criterion) {
 fn whole(criterion: &mut Criterion) {
     let one_thread = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
     let n = 100_000;
-    let (states, epsilon) = strewn(n);
+    let (states, epsilon) = evenly_distributed(n);
     let mut recipe = Recipe::preset("default").unwrap().merge;
     recipe.passes.truncate(1);
     (recipe.passes[0].epsilon, recipe.passes[0].d0) = (epsilon, 2.0);

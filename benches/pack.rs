@@ -1,13 +1,13 @@
-//! How fast do tiles of a container become bytes and values again, per (Gaussian, frame), on one thread?
+//! Measures how fast tiles of a container are encoded and decoded, per (Gaussian, frame), on one thread.
 //!
-//! On made-up curves and on what the trained models give (skipped where they are absent), all columns that vary. The
-//! rivals in each group: zstd at the same level on the same bytes without a filter, and copying them. `encode/tile` is
-//! the codec alone, `encode/container` all of packing: states gathered into tiles, encoded, written, synced.
-//! `decode/tile` reads, verifies and decodes from the page cache, `decode/raw` copies raw tiles from there; `bounded` is
-//! the same of tiles within a bound of .001 in every column, by zstd at the level that `pack` has for them. The stored
-//! sizes are printed before each scene.
+//! The inputs are generated curves and states of the trained models (skipped if they are missing), all varying
+//! attributes. Each group is compared with zstd at the same level on the same bytes without a filter, and with copying
+//! them. `encode/tile` is the codec alone, `encode/container` all of packing: states gathered into tiles, encoded,
+//! written, synced. `decode/tile` reads, verifies and decodes from the page cache, `decode/raw` copies raw tiles from
+//! there; `bounded` does the same with tiles within a bound of 0.001 in every attribute, with the zstd level that
+//! `pack` uses for them. The stored sizes are printed before each scene.
 //!
-//! `cargo bench --bench pack`; invert the throughput for the time per (Gaussian, frame).
+//! Usage: `cargo bench --bench pack`. The time per (Gaussian, frame) is the inverse of the throughput.
 
 mod trajectories;
 
@@ -26,13 +26,13 @@ use splatsieve::source::FrameSource;
 const LEVEL: i32 = 1;
 const WITHIN: Compression = Compression::Bounded { max_error: 1e-3, level: 15 };
 
-/// Every tile of the varying columns, with its width.
-fn tiles_of(scene: &HeldFrames) -> Vec<(u32, Vec<f32>)> {
+/// Returns every tile of the varying attributes, with its width.
+fn all_tiles(scene: &HeldFrames) -> Vec<(u32, Vec<f32>)> {
     let info = scene.info();
-    let of = |column: Attributes| {
+    let tiles_with_width = |column: Attributes| {
         trajectories::tiles(scene, column).into_iter().map(move |tile| (column.width(info.sh_degree) as u32, tile))
     };
-    info.varying.iter().flat_map(of).collect()
+    info.varying.iter().flat_map(tiles_with_width).collect()
 }
 
 fn write(scene: &HeldFrames, path: &Path, packing: impl Into<Packing>) {
@@ -41,8 +41,8 @@ fn write(scene: &HeldFrames, path: &Path, packing: impl Into<Packing>) {
 
 fn decode_all(reader: &Reader, varying: Attributes, buffer: &mut TileBuffer) {
     for gaussian_block in 0..reader.layout().gaussian_blocks() {
-        for (column, of) in Attributes::all().iter().enumerate() {
-            if varying.contains(of) {
+        for (column, tiles_with_width) in Attributes::all().iter().enumerate() {
+            if varying.contains(tiles_with_width) {
                 let at = TileId { column: column as u32, gaussian_block, frame_block: 0 };
                 black_box(reader.read_tile(at, buffer).unwrap().values());
             }
@@ -55,7 +55,7 @@ fn benches(criterion: &mut Criterion) {
     let one_thread = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
     for (name, scene) in trajectories::scenes() {
         let (frames, varying) = (scene.len() as u32, scene.info().varying);
-        let tiles = tiles_of(&scene);
+        let tiles = all_tiles(&scene);
         let bytes = |(_, tile): &(u32, Vec<f32>)| bytemuck::cast_slice::<f32, u8>(tile).to_vec();
         let raw: Vec<Vec<u8>> = tiles.iter().map(bytes).collect();
         let plain: Vec<Vec<u8>> = raw.iter().map(|raw| zstd::bulk::compress(raw, LEVEL).unwrap()).collect();

@@ -1,10 +1,10 @@
-//! How many (Gaussian, view) projections per second does one core make?
+//! Measures how many (Gaussian, view) projections per second one core makes.
 //!
-//! A block of 16,384 Gaussians, all four needed columns decoded once, seen by 16 cameras: the inner
-//! loop of the scan as a multi-view data set runs it. `scan/1 view` adds the decoding of every column in
-//! every frame, the worst case of a monocular capture.
+//! A block of 16,384 Gaussians, with the four needed attributes decoded once, is projected into 16 cameras: the inner
+//! loop of the scan for a multi-view data set. `scan/1 view` adds the decoding of every attribute in every frame, the
+//! worst case of a monocular capture.
 //!
-//! `cargo bench --bench projection`
+//! Usage: `cargo bench --bench projection`
 
 use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
 use glam::{DMat3, DVec3};

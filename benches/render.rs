@@ -1,26 +1,25 @@
-//! Question: what does one picture cost on one core, where does that go, how far is it from what the machine can do, and
-//! how does it grow from 10,000 to a million Gaussians? What does scoring one (Gaussian, frame, view) cost, with and
-//! without a pixel stride? And what does a picture cost together with its derivative?
+//! Measures the time of a render on one core, its parts, its distance from the limits of the machine, and its growth
+//! from 10,000 to a million Gaussians; the cost of scoring one (Gaussian, frame, view) with and without a pixel stride;
+//! and the cost of a render with its gradients.
 //!
-//! `picture/*` renders and scores a view of each trained model, its state known (skipped where the models
-//! are absent); the bar is 25 ms for `room2_big`. `picture/large` is a 1352×1014 view of 200,313 Gaussians:
-//! `room2_dynerf` with each Gaussian split in nine. `size/*` does the same for synthetic clouds in a 640×512
-//! picture. criterion's throughput is Gaussians per second, so for `score` its inverse is the cost of one
-//! (Gaussian, frame, view); before each group the Gaussians, pixels and blend events (pixels that a Gaussian
-//! changed, counted by the tests' oracle) of the picture are printed, and how many of each a second at the
-//! median time of some renders. The rival is the C++ AVX-512 port of the
-//! original rasteriser, measured elsewhere: 26, 14 and 12 ms for `room2_big`, `room2_dynerf`, `deform2`.
+//! `picture/*` renders and scores one view of each trained model, with its frame state given (skipped if the models are
+//! missing); the goal is 25 ms for `room2_big`. `picture/large` is a 1352×1014 view of 200,313 Gaussians:
+//! `room2_dynerf` with each Gaussian split into nine. `size/*` does the same for synthetic point clouds in a 640×512
+//! image. The throughput that criterion prints is in Gaussians per second, so for `score` its inverse is the cost of
+//! one (Gaussian, frame, view). Before each group the benchmark prints the numbers of Gaussians, pixels and blend
+//! events of the render (pixels that a Gaussian changed, counted by the oracle of the tests), and how many of each per
+//! second at the median time of some renders. For comparison, the C++ AVX-512 port of the original rasterizer takes 26,
+//! 14 and 12 ms for `room2_big`, `room2_dynerf` and `deform2`, measured elsewhere.
 //!
-//! Then where the time goes: parts are differences of medians taken by turns, of pictures that lack one part after the
-//! other. Beside them stands what they cannot go below: for the blend, [`OPERATIONS`] on every 16 events at two a cycle
-//! of the clock that is measured; for the rest, the bytes that must be moved at the rate at which memory is read here.
+//! The parts of a render are differences of medians, measured in alternation, of renders that lack one part after the
+//! other. Their lower bounds are printed beside them: for the blend, [`OPERATIONS`] on every 16 events at two per cycle
+//! of the measured clock; for the rest, the bytes that must be moved at the measured memory bandwidth.
 //!
-//! The bar for `gradient`, a picture with the derivative of its squared error by every stored value, is 2.6 times the
-//! picture alone; `picture/large` misses it with 2.7. Before each group the ratio is printed, of medians of
-//! pictures and derivatives taken by turns. What the loss takes to subtract two pictures counts. `picture/demo` is a view
-//! of the demo scene.
+//! The goal for `gradient`, a render with the derivative of its squared error by every stored value, is 2.6 times the
+//! render alone; `picture/large` misses it with 2.7. The ratio of medians, measured in alternation, is printed before
+//! each group. It includes the subtraction of two images for the loss. `picture/demo` is a view of the demo scene.
 //!
-//! Times are wall-clock: on a busy machine they are several times the cost. Criterion arguments filter:
+//! Times are wall-clock times: on a busy machine they are several times the cost. Criterion arguments filter:
 //! `cargo bench --bench render -- picture`.
 
 #[path = "../tests/models/mod.rs"]
@@ -38,13 +37,13 @@ use splatsieve::model::{Attributes, Camera, Gaussians, Gradients};
 use splatsieve::render::{Contribution, Image, Renderer};
 use splatsieve::source::{FrameSource, Ids};
 
-/// Pictures, without and with their derivative, whose median times give the rates and the ratio.
+/// Number of renders, and of renders with gradients, whose median times give the rates and the ratio.
 const PICTURES: usize = 21;
 
-/// Operations of the blend on one vector of pixels, loads and stores apart: 6 from place to exponent, 20 for 2 to its
-/// power, 10 from there to weight and transmittance, 6 for the color.
+/// Operations of the blend on one vector of pixels, without loads and stores: 6 from position to exponent, 20 for the
+/// power of 2, 10 from there to weight and transmittance, 6 for the color.
 const OPERATIONS: f64 = 42.0;
-/// Pixels of a vector, at the widest.
+/// Number of pixels in the widest vector.
 const LANES: f64 = 16.0;
 
 /// Renders and scores one view.
@@ -53,13 +52,13 @@ fn measure(criterion: &mut Criterion, group: &str, name: &str, state: &Gaussians
     let (count, pixels) = (state.len(), u64::from(camera.width) * u64::from(camera.height));
     let mut renderer = Renderer::new();
     let target = renderer.render(state, camera, [0.5; 3]);
-    // The derivative of half the squared error; nobody reads its value.
+    // Derivative of half the squared error; its value is not used.
     let squared_error = |picture: &Image| {
         let pull: Vec<f32> = picture.data.iter().zip(&target.data).map(|(a, b)| a - b).collect();
         (0.0, Image { data: pull, ..*picture })
     };
     let mut gradients = Gradients::new(count, Attributes::all(), state.sh_degree());
-    // By turns, so that what else the machine does slows both.
+    // In alternation, so that other load on the machine slows both.
     let (mut pictures, mut derivatives) = (Vec::new(), Vec::new());
     for _ in 0..PICTURES {
         let start = Instant::now();
@@ -97,7 +96,7 @@ fn measure(criterion: &mut Criterion, group: &str, name: &str, state: &Gaussians
     group.finish();
 }
 
-/// Prints what the parts of a picture with so many blend events cost, and what they cannot go below.
+/// Prints the cost of the parts of a render with `events` blend events, and their lower bounds.
 fn print_parts(renderer: &mut Renderer, state: &Gaussians, camera: &Camera, events: f64) {
     let gray = Gaussians { sh: Gaussians::zeros(state.len(), 0).sh, ..state.clone() };
     let empty = Camera { width: 0, height: 0, ..camera.clone() };
@@ -108,11 +107,11 @@ fn print_parts(renderer: &mut Renderer, state: &Gaussians, camera: &Camera, even
             let start = Instant::now();
             match lacking {
                 0 => drop(black_box(renderer.render(state, camera, [0.0; 3]))),
-                // No harmonics to read.
+                // Without SH to read.
                 1 => drop(black_box(renderer.render(&gray, camera, [0.0; 3]))),
-                // No pixel that is looked at.
+                // Without a pixel to evaluate.
                 2 => renderer.contribution(state, camera, NonZeroU32::MAX, &mut seen),
-                // No tile.
+                // Without a tile.
                 _ => drop(black_box(renderer.render(state, &empty, [0.0; 3]))),
             }
             times.push(start.elapsed().as_secs_f64());
@@ -140,7 +139,8 @@ fn print_parts(renderer: &mut Renderer, state: &Gaussians, camera: &Camera, even
     );
 }
 
-/// Cycles a second: of a chain of exclusive ors and products of integers, which take one and three.
+/// Returns cycles per second, measured with a chain of exclusive ors and integer products, which take one and three
+/// cycles.
 fn clock() -> f64 {
     const LINKS: u32 = 10_000_000;
     fastest(|| {
@@ -150,7 +150,7 @@ fn clock() -> f64 {
     })
 }
 
-/// Bytes a second that are read of what no cache holds.
+/// Returns the bytes per second read from memory that no cache holds.
 fn bandwidth() -> f64 {
     let words = vec![1u64; 1 << 25];
     fastest(|| {
@@ -159,7 +159,7 @@ fn bandwidth() -> f64 {
     })
 }
 
-/// The highest rate of what `amount` does.
+/// Returns the highest rate of several calls of `amount`, which returns the work it did.
 fn fastest(amount: impl Fn() -> f64) -> f64 {
     let rate = |_| {
         let start = Instant::now();
@@ -168,7 +168,7 @@ fn fastest(amount: impl Fn() -> f64) -> f64 {
     (0..7).map(rate).fold(0.0, f64::max)
 }
 
-/// The middle one of an odd number of values.
+/// Returns the middle of an odd number of values.
 fn median(mut values: Vec<f64>) -> f64 {
     values.sort_by(f64::total_cmp);
     values[values.len() / 2]
@@ -192,9 +192,10 @@ fn pictures(criterion: &mut Criterion) {
     }
 }
 
-/// Every Gaussian in nine, in a grid along its first two axes and about as opaque together.
+/// Splits every Gaussian into nine in a grid along its first two axes, which together are about as opaque.
 fn split(state: &Gaussians) -> Gaussians {
-    /// Distance of the children, standard deviations; √⅓ of one is left to each, so that their variances add up.
+    /// Distance of the children in standard deviations of the parent; each child has √⅓ of one, so that the variances
+    /// add up.
     const APART: f32 = 1.0;
     let parents: Vec<u32> = (0..9 * state.len() as u32).map(|child| child / 9).collect();
     let mut children = state.pick(&parents);
@@ -209,7 +210,7 @@ fn split(state: &Gaussians) -> Gaussians {
         let narrower = 3f32.ln() / 2.0;
         children.log_scale.set_row(child, [scale[0] - narrower, scale[1] - narrower, scale[2]]);
         let [logit] = children.opacity_logit.row(child);
-        // What nine add up to in the middle, of what one has at its center.
+        // Sum of the nine alphas in the middle, divided by the alpha at the center of one.
         let overlap = (1.0 + 2.0 * (-1.5f32).exp()).powi(2);
         let alpha = 1.0 - (1.0 / (1.0 + logit.exp())).powf(1.0 / overlap);
         children.opacity_logit.set_row(child, [(alpha / (1.0 - alpha)).ln()]);
@@ -217,20 +218,20 @@ fn split(state: &Gaussians) -> Gaussians {
     children
 }
 
-/// The same view in a picture of `size`, as wide a field.
+/// Returns the same view in an image of `size` with the same field of view.
 fn enlarged(camera: &Camera, size: [u32; 2]) -> Camera {
     let times = f64::from(size[0]) / f64::from(camera.width);
     let [cx, cy] = size.map(|pixels| f64::from(pixels) / 2.0);
     Camera { width: size[0], height: size[1], fx: camera.fx * times, fy: camera.fy * times, cx, cy, ..camera.clone() }
 }
 
-/// `count` Gaussians that fill a box before the camera, smaller the more there are, so that the picture
-/// stays about as opaque.
+/// Returns `count` Gaussians that fill a box in front of the camera. Their size falls with `count`, so that the opacity
+/// of the image stays about the same.
 fn cloud(count: usize) -> Gaussians {
     let mut cloud = Gaussians::zeros(count, 3);
     let size = -1.2 - (count as f32).ln() / 3.0;
     for i in 0..count {
-        // Additive recurrence of irrational steps: even, and the same everywhere.
+        // Additive recurrence with irrational steps: evenly distributed, and the same on every machine.
         let step = |k: f64| (i as f64 * k).fract() as f32;
         let position = [4.0 * step(0.819_172_51) - 2.0, 3.2 * step(0.671_043_61) - 1.6, 2.0 + 3.0 * step(0.549_700_48)];
         cloud.position.set_row(i, position);

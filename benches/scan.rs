@@ -1,23 +1,23 @@
-//! How much does the scan of a container cost beyond reading it, per Gaussian and frame, on one thread?
+//! Measures the cost of the scan of a container per Gaussian and frame.
 //!
-//! Without views, so that life span, motion and the search for NaN are all there is. `packed/*`: the rival `decode`
-//! decodes the same tiles and drops them; the scan should run at 80% of its speed. How good a rival that is, show
-//! `zstd`, which decompresses the same values, compressed without a filter at the same level, and `copy`, which
-//! copies them. `raw/*`: the tiles lie in the
-//! page cache, and the rivals are plain sums over the same bytes: of f32 one after the other, and of u32, which
-//! is as fast as memory; the scan should run at half the speed of the first. `position` varies alone, or with
-//! rotation, scale and opacity; the constant columns are read once.
+//! First, the cost beyond reading, on one thread. There are no views, so the scan consists of life span, motion and the
+//! search for NaN. `packed/*` is compared with `decode`, which decodes the same tiles and drops them; the goal is 80%
+//! of its speed. Two more figures put `decode` in relation: `zstd` decompresses the same values, compressed without a
+//! filter at the same level, and `copy` copies them. In `raw/*` the tiles lie in the page cache, and are compared with
+//! plain sums over the same bytes: of f32 one after the other, and of u32, which is as fast as memory; the goal is half
+//! the speed of the first. `position` varies alone, or with rotation, scale and opacity; the constant attributes are
+//! read once.
 //!
-//! How is the scan of a container best fed, on all threads? `blocks` has every thread read a block of Gaussians, with
-//! advice for its next frame block; `stages` fetches, decodes and accumulates on threads of their own. `warm_*`: from the
-//! page cache; `cold_*`: the page cache is told to drop the file first (Linux); `slow_*`: as if from a disk of
-//! [`SLOW`] bytes per second, which every way waits for as it would for a real one.
+//! Second, ways to read ahead, on all threads: in `blocks` every thread reads a block of Gaussians and announces its
+//! next frame block; `stages` fetches, decodes and accumulates on separate threads. `warm_*` reads from the page cache;
+//! `cold_*` drops the file from the page cache first (Linux); `slow_*` simulates a disk of [`SLOW`] bytes per second,
+//! for which both ways wait as for a real one.
 //!
-//! What does it cost to use raw tiles in place, on all threads? `raw_frames/*` gives every frame to the state of a
-//! caller: `ordinary` by positioned reads, the others from the map, whose pages are released once per frame block of a
-//! block, frame by frame, or never, which lets the whole file become resident.
+//! Third, the cost of using raw tiles in place, on all threads: `raw_frames/*` copies every frame to a state of the
+//! caller. `ordinary` uses positioned reads; the others use the memory map and release its pages once per frame block
+//! of a Gaussian block, frame by frame, or never, in which case the whole file becomes resident.
 //!
-//! `cargo bench --bench scan`
+//! Usage: `cargo bench --bench scan`
 
 use std::collections::BTreeMap;
 use std::hint::black_box;
@@ -42,14 +42,14 @@ use splatsieve::statistics::pass::scan;
 
 const GAUSSIANS: usize = 16_384;
 const FRAMES: usize = 64;
-/// Bytes per second of a slow disk.
+/// Bytes per second of the simulated slow disk.
 const SLOW: f64 = 300e6;
 
 fn random(k: usize) -> f32 {
     (hash_id(k as u64) >> 40) as f32 / (1 << 24) as f32
 }
 
-/// Smooth curves with 1e-4 of noise: about as compressible as what training leaves behind.
+/// Smooth curves with 1e-4 of noise, about as compressible as trained models.
 struct Curves(SequenceInfo);
 
 impl FrameSource for Curves {
@@ -85,7 +85,7 @@ impl BlockReader for CurveReader {
     }
 }
 
-/// Decodes every tile that a scan reads: all of a varying column, of others the first frames.
+/// Decodes every tile that a scan reads: all tiles of a varying attribute, the first frame block of the others.
 fn each_tile(reader: &Reader, varying: Attributes, mut take: impl FnMut(&[f32])) {
     let mut buffer = TileBuffer::default();
     for gaussian_block in 0..reader.layout().gaussian_blocks() {
@@ -164,11 +164,11 @@ fn benches(criterion: &mut Criterion) {
     }
 }
 
-/// A disk that brings what is ordered, one order after the other.
+/// Simulated disk that handles one request after the other.
 struct Disk(Mutex<Instant>);
 
 impl Disk {
-    /// Orders `bytes`; they are there at the time it gives.
+    /// Requests `bytes`. Returns the time at which they are available.
     fn order(&self, bytes: u64) -> Instant {
         let mut busy = self.0.lock().unwrap();
         *busy = (*busy).max(Instant::now()) + Duration::from_secs_f64(bytes as f64 / SLOW);
@@ -180,14 +180,14 @@ fn wait_for(ready: Instant) {
     thread::sleep(ready.saturating_duration_since(Instant::now()));
 }
 
-/// A container fed in one way or the other, from where it lies or as if from a slow disk.
-struct Fed<'a> {
+/// Container that is read in one of the two ways, directly or through the simulated disk.
+struct BenchSource<'a> {
     container: &'a Container,
     in_stages: bool,
     disk: Option<Disk>,
 }
 
-impl Fed<'_> {
+impl BenchSource<'_> {
     fn bytes(&self, gaussians: Range<usize>, frames: Range<usize>, want: Attributes) -> u64 {
         let reader = self.container.reader();
         let layout = reader.layout();
@@ -206,7 +206,7 @@ impl Fed<'_> {
     }
 }
 
-impl FrameSource for Fed<'_> {
+impl FrameSource for BenchSource<'_> {
     fn info(&self) -> &SequenceInfo {
         self.container.info()
     }
@@ -215,7 +215,7 @@ impl FrameSource for Fed<'_> {
         let reader = self.container.open(ids.clone())?;
         match ids {
             Ids::Range(gaussians) if self.disk.is_some() && !self.in_stages => {
-                Ok(Box::new(Waiting { fed: self, gaussians, reader, coming: None }))
+                Ok(Box::new(WaitingReader { fed: self, gaussians, reader, coming: None }))
             }
             _ => Ok(reader),
         }
@@ -226,7 +226,7 @@ impl FrameSource for Fed<'_> {
     }
 }
 
-impl Prefetch for Fed<'_> {
+impl Prefetch for BenchSource<'_> {
     fn frame_block(&self) -> usize {
         self.container.frame_block()
     }
@@ -239,19 +239,20 @@ impl Prefetch for Fed<'_> {
     }
 }
 
-/// Waits for a slow disk: for the first frame block, and for what is left of the next, which was ordered by advice.
-struct Waiting<'a> {
-    fed: &'a Fed<'a>,
+/// Reader that waits for the simulated disk: for the first frame block, and for the rest of the next one, which it
+/// requested in advance.
+struct WaitingReader<'a> {
+    fed: &'a BenchSource<'a>,
     gaussians: Range<usize>,
     reader: Box<dyn BlockReader + 'a>,
-    /// The next frame block, and when it is there.
+    /// Next frame block, and the time at which it is available.
     coming: Option<(usize, Instant)>,
 }
 
-impl BlockReader for Waiting<'_> {
+impl BlockReader for WaitingReader<'_> {
     fn read(&mut self, frame: usize, want: Attributes, out: &mut Gaussians) -> Result<()> {
-        let (of_block, info) = (self.fed.frame_block(), self.fed.info());
-        if frame.is_multiple_of(of_block)
+        let (block_frames, info) = (self.fed.frame_block(), self.fed.info());
+        if frame.is_multiple_of(block_frames)
             && let Some(disk) = &self.fed.disk
         {
             let order = |start: usize, want| disk.order(self.fed.bytes(self.gaussians.clone(), start..start + 1, want));
@@ -259,7 +260,7 @@ impl BlockReader for Waiting<'_> {
                 Some((start, ready)) if start == frame => ready,
                 _ => order(frame, want),
             };
-            let next = frame + of_block;
+            let next = frame + block_frames;
             self.coming = (next < info.times.len()).then(|| (next, order(next, info.varying)));
             wait_for(now);
         }
@@ -267,7 +268,7 @@ impl BlockReader for Waiting<'_> {
     }
 }
 
-/// Has the page cache drop a file.
+/// Drops a file from the page cache.
 #[cfg(target_os = "linux")]
 fn drop_cached(path: &Path) {
     let file = std::fs::File::open(path).unwrap();
@@ -275,13 +276,13 @@ fn drop_cached(path: &Path) {
     rustix::fs::fadvise(&file, 0, None, rustix::fs::Advice::DontNeed).unwrap();
 }
 
-fn ways(criterion: &mut Criterion) {
+fn read_ahead(criterion: &mut Criterion) {
     let recipe = Recipe::preset("default").unwrap().scan;
     let times: Vec<f64> = (0..FRAMES).map(|t| t as f64).collect();
     let mut schedule = ViewSchedule::default();
     schedule.push(FRAMES, &[]);
     let plan = ScanPlan::new(&recipe, &times, &schedule).unwrap();
-    // Not where temporary files may lie in memory.
+    // A folder for temporary files may be in memory, so this one is in the target folder.
     let folder = tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).unwrap();
     let varying = Attributes::all().difference(Attributes::SH);
     let source = Curves(SequenceInfo { count: GAUSSIANS, times, sh_degree: 0, varying });
@@ -294,7 +295,7 @@ fn ways(criterion: &mut Criterion) {
             group.sample_size(20).throughput(Throughput::Elements((GAUSSIANS * FRAMES) as u64));
             for (way, in_stages) in [("blocks", false), ("stages", true)] {
                 let disk = slow.then(|| Disk(Mutex::new(Instant::now())));
-                let fed = Fed { container: &container, in_stages, disk };
+                let fed = BenchSource { container: &container, in_stages, disk };
                 group.bench_function(way, |bencher| {
                     let before = || {
                         #[cfg(target_os = "linux")]
@@ -312,7 +313,7 @@ fn ways(criterion: &mut Criterion) {
     }
 }
 
-/// Every frame of raw tiles to the state of a caller.
+/// Copies every frame of raw tiles to a state of the caller.
 fn raw_frames(criterion: &mut Criterion, reader: &Reader, varying: Attributes) {
     let columns: Vec<(u32, usize)> = Attributes::all()
         .iter()
@@ -360,5 +361,5 @@ fn pack(source: &Curves, path: &Path, compression: Compression) {
     write_container(source, path, compression, BTreeMap::new(), |_| ()).unwrap();
 }
 
-criterion_group!(all, benches, ways);
+criterion_group!(all, benches, read_ahead);
 criterion_main!(all);

@@ -1,10 +1,10 @@
-//! What does a value cost on its way into the percentiles that normalize a score, on one thread?
+//! Measures the cost of a value in the percentiles that normalize scores, on one thread.
 //!
-//! `sketch` counts N values and looks twice more at those in the buckets of P1 and of P99, as the program does; `count`
-//! is the first of the three looks alone. The rivals sort a copy of the values, and select both ranks in it without
-//! sorting. Values are log-normal, as scores are, with a tenth of zeros.
+//! `sketch` counts N values and reads them twice more for the buckets of P1 and P99, as the program does; `count` is
+//! the first of the three passes alone. They are compared with sorting a copy of the values, and with selecting both
+//! ranks in it without sorting. Values are log-normal, like scores, with 10% zeros.
 //!
-//! `cargo bench --bench score`; invert the throughput for the time per value.
+//! Usage: `cargo bench --bench score`. The time per value is the inverse of the throughput.
 
 use std::hint::black_box;
 
@@ -21,8 +21,8 @@ fn value(k: usize) -> f64 {
     (2.0 * normal - 5.0).exp()
 }
 
-/// Place of the `p`-th percentile of `len` values in order.
-fn place(p: usize, len: usize) -> usize {
+/// Returns the index of the `p`-th percentile of `len` sorted values.
+fn percentile_index(p: usize, len: usize) -> usize {
     (p * len).div_ceil(100).max(1) - 1
 }
 
@@ -46,14 +46,14 @@ fn benches(criterion: &mut Criterion) {
             bencher.iter(|| {
                 let mut sorted = values.clone();
                 sorted.sort_unstable_by(f64::total_cmp);
-                (sorted[place(1, len)], sorted[place(99, len)])
+                (sorted[percentile_index(1, len)], sorted[percentile_index(99, len)])
             });
         });
         group.bench_function(BenchmarkId::new("select", len), |bencher| {
             bencher.iter(|| {
                 let mut part = values.clone();
-                let p99 = *part.select_nth_unstable_by(place(99, len), f64::total_cmp).1;
-                (*part.select_nth_unstable_by(place(1, len), f64::total_cmp).1, p99)
+                let p99 = *part.select_nth_unstable_by(percentile_index(99, len), f64::total_cmp).1;
+                (*part.select_nth_unstable_by(percentile_index(1, len), f64::total_cmp).1, p99)
             });
         });
     }

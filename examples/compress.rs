@@ -1,7 +1,7 @@
-//! Compresses a scene and shows its progress in its own way: one line per task, with the percentage done.
+//! Compresses a scene and shows its progress with its own event handler: one line per task, with the percentage done.
 //!
 //! ```sh
-//! cargo run --release --example compress -- output/my_model small    # a tenth of the Gaussians
+//! cargo run --release --example compress -- output/my_model small    # keeps 10% of the Gaussians
 //! ```
 
 use std::error::Error;
@@ -14,7 +14,7 @@ use splatsieve::progress::{EventSink, Events, ExpectedStage, Message, Task, Task
 use splatsieve::recipe::Recipe;
 use splatsieve::scene::InputOptions;
 
-/// Prints events on standard output.
+/// Event handler that prints on standard output.
 struct Printer;
 
 impl EventSink for Printer {
@@ -36,7 +36,7 @@ impl EventSink for Printer {
     }
 }
 
-/// A task, whose progress is printed in steps of a tenth.
+/// Task whose progress is printed in steps of 10%.
 #[derive(Debug)]
 struct Percentage {
     name: &'static str,

@@ -1,15 +1,18 @@
 #!/usr/bin/env python3
-"""Containers within bounds: bytes and pictures of whole sequences, beside a peer's.
+"""Prints a table of containers with error bounds: bytes and render quality of complete sequences, compared with other
+formats.
 
     cargo build --release
     python3 scripts/bounded_table.py target/release/splatsieve DATA [MODEL ...] [--peer "splat4d"] [--fourdgs COMMAND]
 
-DATA/<name>/ is a 4DGaussians model folder with its cameras inside; every one of its frames is packed, exactly and within two
-sets of bounds (zstd level 15, as by default). Prints bytes of the container, how many times fewer those are than f32 of every frame, and the mean PSNR of
-pictures against the exact one. Then the same of what a peer can hold: frames without the harmonics above the constant one
-(8-bit colours, opacities and quaternions for .splat4d, whose program --peer names, at its default bounds; ours within the same
-ones; zstd level 19 both). COMMAND, for .4dgs, gets the folder of those frames as PLY and the file to write, and prints the
-folder of PLY files that it decodes to. Standard library only.
+DATA/<name>/ is a 4DGaussians model folder with its cameras in it. The script packs every frame exactly and within two
+sets of bounds (zstd level 15, the default). It prints the bytes of each container, the size of float32 for every frame
+divided by them, and the mean PSNR of renders against the exact container.
+
+Then it compares what the other formats can hold: frames with SH degree 0, and 8-bit colors, opacities and quaternions
+for .splat4d. --peer names the program that writes .splat4d, used at its default bounds; ours uses the same bounds, and
+both use zstd level 19. COMMAND writes .4dgs: it gets a folder with the frames as PLY and the file to write, and prints
+the folder of PLY files to which it decodes that file. Needs only the standard library.
 """
 
 import plainly  # noqa: F401 (first: what fails after it ends with a sentence)
@@ -27,7 +30,7 @@ from pathlib import Path
 C0 = 0.28209479177387814
 FINE = "position=0.01%,rotation=2e-3,log_scale=5e-3,opacity_logit=1e-2,sh=5e-3"
 COARSE = "position=0.05%,rotation=1e-2,log_scale=2e-2,opacity_logit=5e-2,sh=2e-2"
-# .splat4d by default: 2 mm, 2 percent, 4 levels of 255, quaternions of 8 bits as they are.
+# Default bounds of .splat4d: 2 mm, 2 percent, 4 levels of 255; quaternions are 8 bits anyway.
 BOUNDS = {"position": 2e-3, "log_scale": 0.02, "sh": 4 / 255 / C0, "opacity_logit": 4 / 255 / 0.25, "rotation": 1 / 256}
 PLAIN = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
 
@@ -45,7 +48,7 @@ def psnr(binary, original, other, cameras):
 
 
 def read_ply(path):
-    """Columns of a binary PLY of floats by name."""
+    """Reads the columns of a binary PLY of floats by name."""
     data = path.read_bytes()
     head, _, body = data.partition(b"end_header\n")
     names = [line.split()[2].decode() for line in head.splitlines() if line.startswith(b"property")]
@@ -68,7 +71,7 @@ def byte(value):
 
 
 def write_splat(path, columns):
-    """32 bytes a row: position and scales as f32, colour and opacity, quaternion as bytes."""
+    """Writes 32 bytes per row: position and scales as f32; color, opacity and quaternion as bytes."""
     count = len(columns["x"])
     rows = array("f", bytes(32 * count))
     for i, name in enumerate(["x", "y", "z"]):
@@ -111,7 +114,7 @@ def timed(*command):
 
 
 def whole(binary, model, scratch):
-    """Every column of a model's frames; gives the exact container."""
+    """Packs all columns of the frames of a model and prints their rows. Returns the exact container."""
     exact = scratch / "exact.gseq"
     seconds, _ = timed(binary, "convert", model, exact, "--cameras", model)
     columns = json.loads(run(binary, "info", exact, "--json"))["columns"]
@@ -125,7 +128,7 @@ def whole(binary, model, scratch):
 
 
 def plain(binary, model, exact, peer, fourdgs, scratch):
-    """Frames without harmonics above the constant one, here and by the peers."""
+    """Packs frames with SH degree 0 with this program and with the others, and prints their rows."""
     frames, ply, splat = scratch / "frames", scratch / "ply", scratch / "splat"
     run(binary, "convert", exact, frames, "--as", "ply-sequence")
     ply.mkdir()

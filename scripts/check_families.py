@@ -1,33 +1,38 @@
 #!/usr/bin/env python3
-"""Checks that a compressed model opens the way the renderers of its family open it.
+"""Checks that a compressed model opens like a model of its trainer in the trainer's own renderer.
 
     python3 scripts/check_families.py FAMILY MODEL [ORIGINAL]
 
-FAMILY is one of those below; MODEL what was written; ORIGINAL what it was made of, with which it is compared then. Standard
-library only. Where PyTorch is installed, the loader's own calls are tried as well; where not, that is said.
+Example: python3 scripts/check_families.py stg small output/my_model
 
-stg: a SpacetimeGaussians folder, lite or full, its PLY, or a .splatv, in the terms of `load_ply` and of splaTV's viewer
-  - the PLY is binary little-endian, all float32; as many properties begin with each prefix as the loader counts, none with
-    f_rest; every value is finite
+FAMILY is one of the names below, MODEL the written result, and ORIGINAL the model it was made from; if ORIGINAL is
+given, the two are compared. Needs only the standard library. If PyTorch is installed, the calls of the loader are tried
+as well; otherwise the script says that they are not.
+
+stg: a SpacetimeGaussians folder (lite or full), its PLY, or a .splatv, checked as `load_ply` and splaTV's viewer read
+it
+  - the PLY is binary little-endian and all float32; the number of properties with each prefix is what the loader
+    expects, with no f_rest; every value is finite
   - point_cloud.pt of the full model has mlp1.weight [6, 12, 1, 1] and mlp2.weight [3, 6, 1, 1]
-  - compared: the same properties in the same order, no more Gaussians; cfg_args, cameras.json and point_cloud.pt byte for byte
-  - a .splatv: magic, lengths, a camera, zeros behind the last Gaussian, no half that is no number
+  - compared: the same properties in the same order, no more Gaussians; cfg_args, cameras.json and point_cloud.pt byte
+    for byte
+  - a .splatv: magic number, lengths, a camera, zeros after the last Gaussian, no NaN or infinite half
 
-yang4d: a native 4D Gaussian Splatting checkpoint, or its folder, in the terms of `GaussianModel.restore`
-ftgs: a gsplat checkpoint of FreeTimeGS, or its folder, in the terms of `splats.load_state_dict`
-  - a zip archive of stored files with their checksums; a tree that an unpickler reads which makes nothing but tensors
-  - shapes that agree on the number of Gaussians, optimiser state and statistics too; every value is finite
-  - compared: the same tree, types, devices and gradients; everything without rows is the original's, value by value
+yang4d: a native 4D Gaussian Splatting checkpoint, or its folder, checked as `GaussianModel.restore` reads it
+ftgs: a gsplat checkpoint of FreeTimeGS, or its folder, checked as `splats.load_state_dict` reads it
+  - a zip archive of uncompressed files with their checksums; its pickle creates only tensors and containers
+  - all shapes have the same number of Gaussians, also in optimizer state and statistics; every value is finite
+  - compared: the same tree, types, devices and gradients; everything without rows equals the original, value by value
 
 d3g, scgs: a Deformable-3D-Gaussians or SC-GS folder
   - point_cloud/iteration_K/point_cloud.ply and deform/iteration_K/deform.pth have the same largest K
-  - as many f_rest as the SH degree of cfg_args asks; every value is finite
-  - the state dict fits a network strictly: names and shapes of every layer and head, as its variant has them
-  - scgs: nodes, radii and weights are of one number; fea_* are as many as nodes have, and one more with a motion mask
-  - compared: the network's bytes, cfg_args (but for a lower sh_degree), properties in order, and rows that nothing was
-    changed of
+  - the number of f_rest follows from the SH degree in cfg_args; every value is finite
+  - the state dict fits a network strictly: names and shapes of every layer and head of its variant
+  - scgs: nodes, radii and weights have the same number; so many fea_* as nodes have, and one more with a motion mask
+  - compared: the bytes of the network, cfg_args (except for a lower sh_degree), properties in order, and rows that did
+    not change
 
-Exits 1 at the first thing that does not hold.
+Exits 1 at the first violation.
 """
 
 import plainly  # noqa: F401 (first: what fails after it ends with a sentence)
@@ -55,14 +60,15 @@ def fail(message):
     sys.exit(1)
 
 
-def hold(condition, message):
+def require(condition, message):
+    """Ends the script with `message` if `condition` is false."""
     if not condition:
         fail(message)
     print(f"ok: {message}")
 
 
 def iteration_folder(model):
-    """The folder that loaders take: that of the largest iteration."""
+    """Returns the folder that loaders open: the one with the largest iteration."""
     folders = [f for f in (model / "point_cloud").iterdir() if re.fullmatch(r"iteration_\d+", f.name)]
     if not folders:
         fail(f"{model}/point_cloud has no iteration_K folder")
@@ -70,13 +76,13 @@ def iteration_folder(model):
 
 
 def read_ply(path):
-    """Names of the properties, and the rows as bytes, of a PLY of little-endian floats."""
+    """Returns the property names and the rows, as bytes, of a PLY of little-endian floats."""
     data = path.read_bytes()
     end = data.find(b"end_header\n")
     if not data.startswith(b"ply\n") or end < 0:
         fail(f"{path} is no PLY")
     header, names, count = data[:end].decode("ascii"), [], 0
-    hold("format binary_little_endian 1.0" in header, f"{path.name} is binary, little-endian")
+    require("format binary_little_endian 1.0" in header, f"{path.name} is binary, little-endian")
     for line in header.splitlines():
         words = line.split()
         if words[:2] == ["element", "vertex"]:
@@ -86,7 +92,7 @@ def read_ply(path):
                 fail(f"{path}: property {words[-1]} is {words[1]}, no float")
             names.append(words[-1])
     body, size = data[end + 11:], 4 * len(names)
-    hold(len(body) == count * size, f"{path.name} has {count} rows of {len(names)} floats")
+    require(len(body) == count * size, f"{path.name} has {count} rows of {len(names)} floats")
     return names, [body[i:i + size] for i in range(0, len(body), size)]
 
 
@@ -100,7 +106,8 @@ def finite(rows):
 
 def same_file(name, of, original):
     if (original / name).exists():
-        hold((of / name).exists() and (of / name).read_bytes() == (original / name).read_bytes(), f"{name} is the original's")
+        same = (of / name).exists() and (of / name).read_bytes() == (original / name).read_bytes()
+        require(same, f"{name} is the original's")
 
 
 # ---- SpacetimeGaussians
@@ -120,36 +127,37 @@ def stg(model, original):
               "scale_": 3}
     for prefix, count in counts.items():
         found = beginning(prefix)
-        hold(len(found) == count, f"{count} properties begin with {prefix}")
-        # The loader sorts them by the number behind the last underscore.
+        require(len(found) == count, f"{count} properties begin with {prefix}")
+        # The loader sorts them by the number after the last underscore.
         numbers = sorted(int(name.split("_")[-1]) for name in found)
         if numbers != list(range(count)):
             fail(f"properties that begin with {prefix} are numbered {numbers}")
-    hold({"x", "y", "z", "opacity", "trbf_center", "trbf_scale"} <= set(names), "x y z opacity trbf_center trbf_scale are there")
-    hold(finite(rows), "every value is finite")
+    needed = {"x", "y", "z", "opacity", "trbf_center", "trbf_scale"}
+    require(needed <= set(names), "x y z opacity trbf_center trbf_scale are there")
+    require(finite(rows), "every value is finite")
     if is_full and model.is_dir():
         stg_network(folder / "point_cloud.pt")
     if original is None:
         return
-    hold(model.is_dir() == original.is_dir(), "a folder of a folder, a PLY of a PLY")
+    require(model.is_dir() == original.is_dir(), "a folder of a folder, a PLY of a PLY")
     of = iteration_folder(original) if original.is_dir() else original.parent
     their_names, their_rows = read_ply(of / "point_cloud.ply" if original.is_dir() else original)
-    hold(names == their_names, "the properties are the original's, in their order")
-    hold(len(rows) <= len(their_rows), f"{len(rows)} Gaussians of {len(their_rows)}")
+    require(names == their_names, "the properties are the original's, in their order")
+    require(len(rows) <= len(their_rows), f"{len(rows)} Gaussians of {len(their_rows)}")
     theirs = set(their_rows)
     print(f"{sum(row in theirs for row in rows)} rows are the original's, byte for byte")
     if model.is_dir():
-        hold(folder.name == of.name, f"{folder.name} is the original's iteration")
+        require(folder.name == of.name, f"{folder.name} is the original's iteration")
         same_file("point_cloud.pt", folder, of)
         for name in ("cfg_args", "cameras.json"):
             same_file(name, model, original)
 
 
 def stg_network(path):
-    hold(path.exists() and zipfile.is_zipfile(path), "point_cloud.pt is there")
+    require(path.exists() and zipfile.is_zipfile(path), "point_cloud.pt is there")
     with zipfile.ZipFile(path) as archive:
         sizes = sorted(entry.file_size for entry in archive.infolist() if re.search(r"/data/\d+$", entry.filename))
-    hold(sizes == [4 * 18, 4 * 72], "point_cloud.pt has 72 and 18 weights")
+    require(sizes == [4 * 18, 4 * 72], "point_cloud.pt has 72 and 18 weights")
     try:
         import torch
     except ImportError:
@@ -164,29 +172,29 @@ def stg_network(path):
 
     state = torch.load(path, map_location="cpu", weights_only=True)
     Sandwich().load_state_dict(state, strict=True)
-    hold(all(bool(torch.isfinite(tensor).all()) for tensor in state.values()), "it loads into the decoder, with finite weights")
+    require(all(bool(torch.isfinite(tensor).all()) for tensor in state.values()), "it loads into the decoder, with finite weights")
 
 
 def stg_splatv(model, original):
     count = len(splatv_rows(model))
     if original is not None and original.suffix == ".splatv":
         theirs = splatv_rows(original)
-        hold(count <= len(theirs), f"{count} Gaussians of {len(theirs)}")
+        require(count <= len(theirs), f"{count} Gaussians of {len(theirs)}")
     elif original is not None:
         of = iteration_folder(original) / "point_cloud.ply" if original.is_dir() else original
-        hold(count <= len(read_ply(of)[1]), f"{count} Gaussians, no more than the original's")
+        require(count <= len(read_ply(of)[1]), f"{count} Gaussians, no more than the original's")
 
 
 def splatv_rows(path):
     data = path.read_bytes()
     magic, length = struct.unpack("<II", data[:8])
-    hold(magic == 0x674B, f"{path.name} begins with 0x674b")
+    require(magic == 0x674B, f"{path.name} begins with 0x674b")
     entry = json.loads(data[8:8 + length])[0]
     texture = data[8 + length:]
-    hold(entry["type"] == "splat" and entry["size"] == len(texture) == 16 * entry["texwidth"] * entry["texheight"],
+    require(entry["type"] == "splat" and entry["size"] == len(texture) == 16 * entry["texwidth"] * entry["texheight"],
          f"a texture of {entry['texwidth']} x {entry['texheight']} texels")
     camera = entry["cameras"][0]
-    hold({"position", "rotation", "fx", "fy"} <= set(camera), "a camera to start at")
+    require({"position", "rotation", "fx", "fy"} <= set(camera), "a camera to start at")
     rows = [texture[i:i + 64] for i in range(0, len(texture), 64)]
     while rows and not any(rows[-1]):
         rows.pop()
@@ -207,7 +215,7 @@ TYPES = {
 
 
 class Tensor:
-    """What a tensor of a checkpoint says of itself, and its values in order."""
+    """Description of a tensor in a checkpoint, with its values in order."""
 
     def __init__(self, storage, offset, shape, stride, wants_gradient=False):
         self.kind, self.device, self.values = storage
@@ -222,7 +230,7 @@ class Tensor:
 
 
 class Reader(pickle.Unpickler):
-    """Makes tensors, parameters and ordered dictionaries, and refuses everything else."""
+    """Unpickler that creates tensors, parameters and ordered dictionaries, and refuses everything else."""
 
     def __init__(self, file, archive, stem):
         super().__init__(file)
@@ -244,22 +252,22 @@ class Reader(pickle.Unpickler):
         _, name, key, device, count = what
         code, size, kind = TYPES[name]
         data = self.archive.read(f"{self.stem}/data/{key}")
-        hold_quietly(len(data) >= count * size, f"data/{key} has the {count} values that the pickle says")
+        require_quietly(len(data) >= count * size, f"data/{key} has the {count} values that the pickle says")
         return kind, device, struct.unpack(f"<{count}{code}", data[: count * size])
 
 
-def hold_quietly(condition, message):
+def require_quietly(condition, message):
     if not condition:
-        hold(False, message)
+        require(False, message)
 
 
 def load(path):
     archive = zipfile.ZipFile(path)
     names = archive.namelist()
-    hold(archive.testzip() is None, f"{path}: every file of the archive has its checksum")
-    hold(all(entry.compress_type == zipfile.ZIP_STORED for entry in archive.infolist()), "nothing is compressed")
+    require(archive.testzip() is None, f"{path}: every file of the archive has its checksum")
+    require(all(entry.compress_type == zipfile.ZIP_STORED for entry in archive.infolist()), "nothing is compressed")
     inner = next((name for name in names if name.endswith("/data.pkl")), None)
-    hold(inner is not None, "there is one data.pkl")
+    require(inner is not None, "there is one data.pkl")
     root = Reader(archive.open(inner), archive, inner.rsplit("/", 1)[0]).load()
     if torch:
         torch.load(path, map_location="cpu", weights_only=True)
@@ -270,7 +278,7 @@ def load(path):
 
 
 def leaves(node, place=""):
-    """Everything in a tree that is no container, with its place, in order."""
+    """Yields every leaf of a tree with its path, in order."""
     if isinstance(node, dict):
         for key, value in node.items():
             yield from leaves(value, f"{place}[{key!r}]")
@@ -282,37 +290,39 @@ def leaves(node, place=""):
 
 
 def compare(root, original, count, before):
-    """All but rows is the original's."""
+    """Checks that everything except rows equals the original."""
     new, old = list(leaves(root)), list(leaves(original))
-    hold([place for place, _ in new] == [place for place, _ in old], "the tree is the original's: names and order")
+    require([place for place, _ in new] == [place for place, _ in old], "the tree is the original's: names and order")
     fewer = 0
     for (place, a), (_, b) in zip(new, old):
         if not isinstance(b, Tensor):
             same = a == b or (a != a and b != b)
-            hold_quietly(same, f"{place} is the original's {b!r}, not {a!r}")
+            require_quietly(same, f"{place} is the original's {b!r}, not {a!r}")
             continue
         same = (a.kind, a.device, a.wants_gradient) == (b.kind, b.device, b.wants_gradient)
-        hold_quietly(same, f"{place} has the type, device and gradient of the original's")
+        require_quietly(same, f"{place} has the type, device and gradient of the original's")
         if b.shape[:1] == (before,) and a.shape != b.shape:
             fewer += 1
-            hold_quietly(a.shape == (count,) + b.shape[1:], f"{place} has shape {(count,) + b.shape[1:]}, not {a.shape}")
+            wanted = (count,) + b.shape[1:]
+            require_quietly(a.shape == wanted, f"{place} has shape {wanted}, not {a.shape}")
         else:
-            hold_quietly(a.shape == b.shape and a.flat() == b.flat(), f"{place} is the original's, value by value")
-    hold(True, f"{fewer} tensors have {count} rows of {before}; everything else is the original's")
+            require_quietly(a.shape == b.shape and a.flat() == b.flat(), f"{place} is the original's, value by value")
+    require(True, f"{fewer} tensors have {count} rows of {before}; everything else is the original's")
 
 
 def check_rows(tensors, count):
     for name, (tensor, row) in tensors.items():
-        hold_quietly(isinstance(tensor, Tensor), f"{name} is a tensor")
-        hold_quietly(tensor.shape == (count,) + row, f"{name} has shape {(count,) + row}, not {tensor.shape}")
-        hold_quietly(all(math.isfinite(x) for x in tensor.flat()), f"every value of {name} is finite")
-    hold(True, f"{', '.join(tensors)}: shapes of {count} Gaussians, finite values")
+        require_quietly(isinstance(tensor, Tensor), f"{name} is a tensor")
+        require_quietly(tensor.shape == (count,) + row, f"{name} has shape {(count,) + row}, not {tensor.shape}")
+        require_quietly(all(math.isfinite(x) for x in tensor.flat()), f"every value of {name} is finite")
+    require(True, f"{', '.join(tensors)}: shapes of {count} Gaussians, finite values")
 
 
 def check_adam(state, shapes, name):
     for key in ("exp_avg", "exp_avg_sq"):
         if key in state:
-            hold_quietly(state[key].shape in shapes, f"{name}: {key} has the shape of its parameter, not {state[key].shape}")
+            found = state[key].shape
+            require_quietly(found in shapes, f"{name}: {key} has the shape of its parameter, not {found}")
 
 
 def one_of(folder, *patterns):
@@ -320,25 +330,25 @@ def one_of(folder, *patterns):
     if folder.is_file():
         return folder
     found = [path for pattern in patterns for path in sorted(folder.glob(pattern))]
-    hold(bool(found), f"{folder} has a checkpoint")
+    require(bool(found), f"{folder} has a checkpoint")
     return found[-1]
 
 
 def yang4d(folder, original):
-    """GaussianModel.restore of the repository, of 19 parts."""
+    """Checks the 19 entries that GaussianModel.restore of the repository reads."""
     root = load(one_of(folder, "chkpnt*.pth"))
     capture, iteration = root
-    hold(len(capture) == 19 and isinstance(iteration, int), "the checkpoint is (capture of 19, iteration)")
+    require(len(capture) == 19 and isinstance(iteration, int), "the checkpoint is (capture of 19, iteration)")
     count, rest = capture[1].shape[0], capture[3].shape[1]
     names = {1: ("xyz", (3,)), 2: ("features_dc", (1, 3)), 3: ("features_rest", (rest, 3)), 4: ("scaling", (3,)),
              5: ("rotation", (4,)), 6: ("opacity", (1,)), 13: ("t", (1,)), 14: ("scaling_t", (1,))}
     if capture[16]:
         names[15] = ("rotation_r", (4,))
     check_rows({name: (capture[i], row) for i, (name, row) in names.items()}, count)
-    hold(all(capture[i].wants_gradient for i in names), "the parameters want gradients")
-    hold(all(capture[i].shape[0] == count for i in range(7, 11)), "statistics of densifying have as many rows")
+    require(all(capture[i].wants_gradient for i in names), "the parameters want gradients")
+    require(all(capture[i].shape[0] == count for i in range(7, 11)), "statistics of densifying have as many rows")
     groups = capture[11]["param_groups"]
-    hold(len(groups) == len(names), f"the optimiser has {len(names)} groups, as restore expects")
+    require(len(groups) == len(names), f"the optimiser has {len(names)} groups, as restore expects")
     shapes = {capture[i].shape for i in names}
     for key, state in capture[11]["state"].items():
         check_adam(state, shapes, f"optimiser state {key}")
@@ -348,7 +358,7 @@ def yang4d(folder, original):
 
 
 def ftgs(folder, original):
-    """A gsplat checkpoint with velocities: splats.load_state_dict and one optimiser per name."""
+    """Checks a gsplat checkpoint with velocities: splats.load_state_dict and one optimizer per name."""
     root = load(one_of(folder, "ckpts/ckpt_*.pt", "ckpt_*.pt"))
     splats = root["splats"]
     count = splats["means"].shape[0]

@@ -1,21 +1,24 @@
 #!/usr/bin/env python3
-"""Checks that a compressed 4DGaussians model folder opens the way the original renderer opens it.
+"""Checks that a compressed 4DGaussians model folder opens like the original in the original renderer.
 
     python3 scripts/check_model_folder.py ORIGINAL COMPRESSED
 
-Standard library only. Where PyTorch or plyfile is installed, the loader's own calls are tried as well; where not, that
-is said. Checked, in the terms of the original loader (`GaussianModel.load_ply`, `load_model`):
-  - cfg_args is the original's, byte for byte, or but for a lower sh_degree
-  - the point cloud has the original's properties: names, order, types; as many f_rest as that SH degree asks, and in rows
-    that nothing else was changed of the original's coefficients of every channel
-  - a lower SH degree is that of a model whose colours no head deforms
-  - every value is finite and the count is not larger than the original's
-  - deformation.pth holds the original's tensors: names and shapes, so that it loads strictly into a network made by
-    cfg_args, which copies half precision into its own parameters; values are finite and, but for rows of time planes
-    that no time from 0 on reads, the original's as half precision rounds them, or exactly
-  - with PyTorch: it opens with weights_only=True, and load_state_dict(strict=True) leaves just these values
+Example: python3 scripts/check_model_folder.py output/my_model small
+
+Needs only the standard library. If PyTorch or plyfile is installed, the calls of the loader are tried as well;
+otherwise the script says that they are not. The checks follow the original loader (`GaussianModel.load_ply`,
+`load_model`):
+  - cfg_args equals the original byte for byte, or except for a lower sh_degree
+  - the point cloud has the properties of the original: names, order, types; as many f_rest as its SH degree needs, and
+    in unchanged rows the original coefficients of every channel
+  - a lower SH degree occurs only in a model without a head that deforms colors
+  - every value is finite, and there are no more Gaussians than in the original
+  - deformation.pth holds the tensors of the original: names and shapes, so that it loads strictly into a network made
+    from cfg_args, which converts half precision to its own type; values are finite and equal those of the original,
+    exactly or rounded to half precision, except in rows of time planes that no time from 0 on reads
+  - with PyTorch: it opens with weights_only=True, and load_state_dict(strict=True) results in exactly these values
   - deformation_table.pth is absent or bool [N]; deformation_accum.pth is absent or float32 [N, 3]
-Exits 1 at the first thing that does not hold; prints the bytes of the folder by part at the end.
+Exits 1 at the first violation; otherwise prints the bytes of the folder by part.
 """
 
 import plainly  # noqa: F401 (first: what fails after it ends with a sentence)
@@ -41,7 +44,8 @@ def fail(message):
     sys.exit(1)
 
 
-def hold(condition, message):
+def require(condition, message):
+    """Ends the script with `message` if `condition` is false."""
     if not condition:
         fail(message)
     print(f"ok: {message}")
@@ -56,7 +60,7 @@ def iteration_folder(model):
 
 
 def read_config(path):
-    """Arguments of the Namespace that the loader evaluates, by name, and the SH degree among them."""
+    """Returns the arguments of the Namespace that the loader evaluates, by name, and the SH degree."""
     try:
         call = ast.parse(path.read_text().strip(), mode="eval").body
         keys = {key.arg: key.value for key in call.keywords}
@@ -67,31 +71,31 @@ def read_config(path):
 
 
 def check_config(before, after):
-    """The cfg_args at `after` against that at `before`; gives the SH degrees of both."""
+    """Checks the cfg_args at `after` against that at `before`. Returns the SH degrees of both."""
     (keys_before, degree_before), (keys, degree) = read_config(before), read_config(after)
     if degree == degree_before:
-        hold(after.read_bytes() == before.read_bytes(), "cfg_args is unchanged")
+        require(after.read_bytes() == before.read_bytes(), "cfg_args is unchanged")
         return degree_before, degree
-    hold(keys == keys_before, "cfg_args is unchanged but for sh_degree")
-    hold(degree in range(degree_before), f"SH degree {degree} of {degree_before}")
-    hold(keys.get("no_dshs") in (None, ast.dump(ast.parse("True").body[0].value)), "no SH head deforms colours")
+    require(keys == keys_before, "cfg_args is unchanged but for sh_degree")
+    require(degree in range(degree_before), f"SH degree {degree} of {degree_before}")
+    require(keys.get("no_dshs") in (None, ast.dump(ast.parse("True").body[0].value)), "no SH head deforms colours")
     return degree_before, degree
 
 
 def rest_of(degree):
-    """Number of f_rest that `load_ply` asserts."""
+    """Returns the number of f_rest properties that `load_ply` asserts."""
     return 3 * (degree + 1) ** 2 - 3
 
 
-def without_bands(names, degree_before, degree):
-    """What is left of the names of properties at a lower SH degree: pairs of the name then and the name before."""
+def at_lower_degree(names, degree_before, degree):
+    """Returns the properties that remain at a lower SH degree, as pairs of new name and old name."""
     had, left = rest_of(degree_before) // 3, rest_of(degree) // 3
     pairs = []
     for name in names:
         if not name.startswith("f_rest_"):
             pairs.append((name, name))
             continue
-        # Of one channel after the other.
+        # Coefficients are ordered channel by channel.
         channel, coefficient = divmod(int(name[len("f_rest_"):]), max(had, 1))
         if coefficient < left:
             pairs.append((f"f_rest_{channel * left + coefficient}", name))
@@ -99,18 +103,18 @@ def without_bands(names, degree_before, degree):
 
 
 def check_cloud(before, after, degree_before, degree):
-    """The point cloud at `after` against that at `before`; gives its properties and rows."""
+    """Checks the point cloud at `after` against that at `before`. Returns its properties and rows."""
     properties_before, rows_before = read_ply(before)
     properties, rows = read_ply(after)
     names_before, names = ([name for _, name in of] for of in (properties_before, properties))
-    pairs = without_bands(names_before, degree_before, degree)
+    pairs = at_lower_degree(names_before, degree_before, degree)
     kinds = dict((name, kind) for kind, name in properties_before)
     expected = [(kinds[was], name) for name, was in pairs]
     rest = [name for name in names if name.startswith("f_rest_")]
-    hold(len(rest) == rest_of(degree), f"{len(rest)} f_rest for SH degree {degree}")
-    hold(properties == expected, f"{len(properties)} properties with the original's names, order and types")
-    hold(0 < len(rows) <= len(rows_before), f"{len(rows)} of {len(rows_before)} Gaussians")
-    hold(all(math.isfinite(x) for row in rows for x in row), "every value is finite")
+    require(len(rest) == rest_of(degree), f"{len(rest)} f_rest for SH degree {degree}")
+    require(properties == expected, f"{len(properties)} properties with the original's names, order and types")
+    require(0 < len(rows) <= len(rows_before), f"{len(rows)} of {len(rows_before)} Gaussians")
+    require(all(math.isfinite(x) for row in rows for x in row), "every value is finite")
     own = [place for place, name in enumerate(names) if name not in rest]
     own_before = [names_before.index(names[place]) for place in own]
     kept = [names_before.index(was) for _, was in pairs]
@@ -118,12 +122,13 @@ def check_cloud(before, after, degree_before, degree):
     for row in rows_before:
         found[tuple(row[place] for place in own_before)].append(tuple(row[place] for place in kept))
     same = [(row, found[key]) for row in rows for key in [tuple(row[place] for place in own)] if key in found]
-    hold(all(row in of for row, of in same), f"{len(same)} rows that nothing was changed of have the original's f_rest")
+    are_equal = all(row in of for row, of in same)
+    require(are_equal, f"{len(same)} rows that nothing was changed of have the original's f_rest")
     return properties, rows
 
 
 def read_ply(path):
-    """Properties and rows."""
+    """Returns properties and rows."""
     data = path.read_bytes()
     end = data.index(b"end_header\n") + len(b"end_header\n")
     lines = data[:end].decode("ascii").splitlines()
@@ -139,20 +144,20 @@ def read_ply(path):
 
 
 class Tensor:
-    """A tensor as its file has it: where its elements lie in its storage."""
+    """Tensor as stored in its file: the places of its elements in its storage."""
 
     def __init__(self, storage, offset, shape, stride):
         self.kind, self.key, self.stored = storage
         self.offset, self.shape, self.stride = offset, tuple(shape), tuple(stride)
 
     def places(self):
-        """Of every element, the last index fastest."""
+        """Returns the places of all elements in the storage, the last index fastest."""
         steps = [range(0, extent * step, step) if step else [0] * extent for extent, step in zip(self.shape, self.stride)]
         return (self.offset + sum(at) for at in itertools.product(*steps))
 
 
 class Reader(pickle.Unpickler):
-    """Reads what torch.save writes of tensors and calls nothing else."""
+    """Unpickler that reads what torch.save writes for tensors and calls nothing else."""
 
     def find_class(self, module, name):
         if (module, name) == ("collections", "OrderedDict"):
@@ -169,7 +174,7 @@ class Reader(pickle.Unpickler):
 
 
 def read_pth(path):
-    """Tensors by name, and of each its values in the order of its elements."""
+    """Returns tensors by name, and the values of each in the order of its elements."""
     with zipfile.ZipFile(path) as archive:
         names = archive.namelist()
         pickled = next(name for name in names if name.endswith("/data.pkl"))
@@ -194,24 +199,24 @@ def half(value):
 
 
 def rows_read(name, shape):
-    """Whether an element of a tensor is read at some time from 0 on, by its index."""
+    """Returns whether any time from 0 on reads an element of a tensor, by its index."""
     if not TIME_PLANE.fullmatch(name) or len(shape) != 4:
         return lambda at: True
     rows, columns = shape[2:]
-    # Time is not mapped to [-1, 1]: 0 falls in the middle of the rows.
+    # Time is not mapped to [-1, 1]: 0 is in the middle of the rows.
     first = (rows - 1) // 2
     return lambda at: at // columns % rows >= first
 
 
 def check_field(before, after):
-    """The state dict of the folder `after`, against that of `before`."""
+    """Checks the state dict of the folder `after` against that of `before`."""
     tensors_before, values_before = read_pth(before)
     tensors, values = read_pth(after)
-    hold(set(tensors) == set(tensors_before), f"deformation.pth has the original's {len(tensors)} tensors")
+    require(set(tensors) == set(tensors_before), f"deformation.pth has the original's {len(tensors)} tensors")
     shapes = [(name, tensor.shape) for name, tensor in tensors.items() if tensor.shape != tensors_before[name].shape]
-    hold(not shapes, f"all of the original's shapes {shapes or ''}".rstrip())
-    hold(all(tensor.kind in ("FloatStorage", "HalfStorage") for tensor in tensors.values()), "all floating-point")
-    hold(all(math.isfinite(x) for of in values.values() for x in of), "every value is finite")
+    require(not shapes, f"all of the original's shapes {shapes or ''}".rstrip())
+    require(all(tensor.kind in ("FloatStorage", "HalfStorage") for tensor in tensors.values()), "all floating-point")
+    require(all(math.isfinite(x) for of in values.values() for x in of), "every value is finite")
     for name, tensor in tensors.items():
         is_read, narrow = rows_read(name, tensor.shape), tensor.kind == "HalfStorage"
         for at, (old, new) in enumerate(zip(values_before[name], values[name])):
@@ -223,7 +228,7 @@ def check_field(before, after):
 
 
 def check_with_torch(torch, folder, tensors, values, count):
-    """What the original loader does with the `.pth` files."""
+    """Runs what the original loader does with the `.pth` files."""
     network = torch.nn.Module()
     for name, tensor in tensors.items():
         *path, leaf = name.split(".")
@@ -249,13 +254,13 @@ def check_with_torch(torch, folder, tensors, values, count):
     ]:
         if (folder / name).exists():
             table = torch.load(folder / name, map_location="cpu")
-            hold(tuple(table.shape) == shape and table.dtype == dtype, f"{name} is {dtype} {list(shape)}")
+            require(tuple(table.shape) == shape and table.dtype == dtype, f"{name} is {dtype} {list(shape)}")
         else:
             print(f"ok: {name} is absent, as the loader accepts")
 
 
 def check_features_with_torch(torch, properties, rows, degree):
-    """What `load_ply` makes of colours."""
+    """Runs what `load_ply` does with colors."""
     names = [name for _, name in properties]
 
     def values(prefix):
@@ -265,11 +270,11 @@ def check_features_with_torch(torch, properties, rows, degree):
     rest = values("f_rest_").reshape((len(rows), 3, (degree + 1) ** 2 - 1)).transpose(1, 2)
     features = torch.cat((values("f_dc_").reshape((len(rows), 1, 3)), rest), dim=1)
     shape = (len(rows), (degree + 1) ** 2, 3)
-    hold(tuple(features.shape) == shape, f"colours of PyTorch are {list(shape)}")
+    require(tuple(features.shape) == shape, f"colours of PyTorch are {list(shape)}")
 
 
 def parts(model, folder):
-    """Bytes of what the renderer opens, by part."""
+    """Returns the bytes of the files that the renderer opens, by part."""
     return [path.stat().st_size for path in (folder / "point_cloud.ply", folder / "deformation.pth", model / "cfg_args")]
 
 
@@ -280,7 +285,7 @@ def main():
     original, compressed = Path(sys.argv[1]), Path(sys.argv[2])
     degree_before, degree = check_config(original / "cfg_args", compressed / "cfg_args")
     before, after = iteration_folder(original), iteration_folder(compressed)
-    hold(before.name == after.name, f"{after.name} is the iteration the loader picks")
+    require(before.name == after.name, f"{after.name} is the iteration the loader picks")
     properties, rows = check_cloud(before / "point_cloud.ply", after / "point_cloud.ply", degree_before, degree)
     tensors, values = check_field(before / "deformation.pth", after / "deformation.pth")
     try:
@@ -288,7 +293,7 @@ def main():
     except ImportError:
         print("skipped: PyTorch is not installed, so its own loader was not tried")
         tables = ["deformation_table.pth", "deformation_accum.pth"]
-        hold(not any((after / name).exists() for name in tables), "no per-Gaussian tables to disagree with")
+        require(not any((after / name).exists() for name in tables), "no per-Gaussian tables to disagree with")
     else:
         check_with_torch(torch, after, tensors, values, len(rows))
         check_features_with_torch(torch, properties, rows, degree)
@@ -299,7 +304,7 @@ def main():
     else:
         vertex = PlyData.read(str(after / "point_cloud.ply")).elements[0]
         names = [p.name for p in vertex.properties]
-        hold(names == [name for _, name in properties], "plyfile reads the same properties")
+        require(names == [name for _, name in properties], "plyfile reads the same properties")
     was, now = parts(original, before), parts(compressed, after)
     for name, old, new in zip(["point cloud", "field", "cfg_args", "whole"], [*was, sum(was)], [*now, sum(now)]):
         print(f"{name}: {new} of {old} bytes ({100 * new / old:.1f}%)")

@@ -1,10 +1,12 @@
 #!/usr/bin/env python3
-"""What converting to the formats of players costs.
+"""Prints what conversion to the formats of players costs.
 
     python3 scripts/convert_table.py target/release/splatsieve DATA [MODEL ...]
 
-DATA holds model folders with cameras, of which the MODELs named are taken (all of them if none is). Prints what was fitted,
-bytes, seconds, and for .splatv, which is read again, PSNR against the model on its held-out pictures.
+Example: python3 scripts/convert_table.py target/release/splatsieve ../shared/data deform2
+
+DATA holds model folders with cameras; without MODEL all of them are converted. Prints what was fitted, bytes, seconds,
+and for .splatv, which can be read back, the PSNR against the model on its test views.
 """
 
 import plainly  # noqa: F401 (first: what fails after it ends with a sentence)

@@ -1,23 +1,23 @@
 #!/usr/bin/env python3
-"""Makes frames that do not know one another of a PLY sequence whose Gaussians are known, and keeps the truth.
+"""Makes a sequence without Gaussian ids from a PLY sequence with ids, and keeps the true ids for scoring.
 
     python3 scripts/cut_lives.py FRAMES OUT [--lives 4-12] [--overlap 2] [--noise 0.02] [--jitter 0.02] [--away 0] [--seed 0]
     python3 scripts/cut_lives.py --score OUT LINKED.gseq
 
-FRAMES is a folder of PLY files with the same Gaussians in the same order, little-endian floats (`splatsieve convert`). Of
-every frame the script writes a file of the same name into OUT in which
-- a Gaussian's time is cut into lives of --lives frames [default: one life]; for --overlap frames [0] the old life fades out
-  while the new one fades in, both together as opaque as the Gaussian;
-- every life has a base colour and an opacity of its own, off by --jitter [0] (of the range of colours; of its opacity);
-- every position is off by --noise [0] of the size, the root mean square of the three scales, along each axis;
-- each Gaussian is away with probability --away [0], and the rows stand in another order in each.
-OUT/truth.npz says of the rows of all frames, one after the other, `gaussian` and `life`, both counted from 0, and with
-`starts`, [T + 1], where those of each frame begin.
+FRAMES is a folder of PLY files with the same Gaussians in the same order, little-endian floats (`splatsieve convert`).
+For every frame the script writes a file of the same name into OUT in which
+- the time of a Gaussian is cut into lives of --lives frames [default: one life]; during --overlap frames [0] the old
+  life fades out while the new one fades in, and both together are as opaque as the Gaussian;
+- every life has its own base color and opacity, which differ by --jitter [0] (of the range of colors; of its opacity);
+- every position differs by --noise [0] times the size, the root mean square of the three scales, along each axis;
+- each Gaussian is absent with probability --away [0], and the rows of each frame have a different order.
+OUT/truth.npz has `gaussian` and `life` for the rows of all frames, one frame after the other, both counted from 0, and
+`starts`, [T + 1], the first row of each frame.
 
-With --score: LINKED.gseq is what `splatsieve convert OUT LINKED.gseq --link apart` gives, which holds every row. A link is
-two rows of neighbouring frames in one track. Prints how many of the true ones, two rows of one life, were found, and how
-many that are there are wrong, both by life and by Gaussian, as parts of the true links, and how many tracks, lives and
-Gaussians there are.
+--score compares LINKED.gseq, made with `splatsieve convert OUT LINKED.gseq --link apart`, which keeps every row. A link
+is a pair of rows of adjacent frames in the same track. Prints how many of the true links (two rows of the same life)
+were found and how many links are wrong, both by life and by Gaussian, as fractions of the true links, and the numbers
+of tracks, lives and Gaussians.
 """
 
 import plainly  # noqa: F401 (first: what fails after it ends with a sentence)
@@ -31,7 +31,7 @@ SH_C0 = 0.28209479177387814
 
 
 def read(path):
-    """Header, names of the properties, [N, properties] float32."""
+    """Returns the header, the property names, and the values [N, properties] float32."""
     data = path.read_bytes()
     end = data.index(b"end_header\n") + len(b"end_header\n")
     lines = data[:end].decode().splitlines()
@@ -52,21 +52,21 @@ def write(path, header, rows):
 
 
 class Lives:
-    """Which life every Gaussian is in, frame after frame."""
+    """Current life of every Gaussian, updated frame by frame."""
 
-    def __init__(self, count, lengths, overlap, jitter, dice):
-        self.lengths, self.overlap, self.jitter, self.dice = lengths, overlap, jitter, dice
+    def __init__(self, count, lengths, overlap, jitter, random):
+        self.lengths, self.overlap, self.jitter, self.random = lengths, overlap, jitter, random
         self.count = count
         self.life = np.arange(count)
         self.before = np.full(count, -1)
         self.begun = np.full(count, -(1 << 30))
         self.off, self.off_before = self.offsets(count), np.zeros((count, 4))
-        # The first one has begun at any time before.
-        self.end = dice.integers(1, lengths[1] + 1, count) if lengths else np.full(count, 1 << 30)
+        # The first life may have begun at any time before frame 0.
+        self.end = random.integers(1, lengths[1] + 1, count) if lengths else np.full(count, 1 << 30)
 
     def offsets(self, count):
-        """Of red, green, blue, and of the opacity as a part of it."""
-        return self.dice.normal(0, self.jitter, (count, 4)) if self.jitter else np.zeros((count, 4))
+        """Returns random offsets of red, green and blue, and of the opacity as a fraction of it."""
+        return self.random.normal(0, self.jitter, (count, 4)) if self.jitter else np.zeros((count, 4))
 
     def enter(self, frame):
         new = np.flatnonzero(self.end == frame)
@@ -75,10 +75,10 @@ class Lives:
         self.count += len(new)
         self.off[new] = self.offsets(len(new))
         self.begun[new] = frame
-        self.end[new] = frame + self.dice.integers(self.lengths[0], self.lengths[1] + 1, len(new)) if len(new) else 0
+        self.end[new] = frame + self.random.integers(self.lengths[0], self.lengths[1] + 1, len(new)) if len(new) else 0
 
     def rows(self, frame):
-        """Gaussian, life, part of its density and offsets of every row of a frame."""
+        """Returns Gaussian, life, fraction of its density and offsets of every row of a frame."""
         age = frame - self.begun
         fades = (age < self.overlap) & (self.before >= 0)
         part = np.where(fades, (age + 1) / (self.overlap + 1), 1.0)
@@ -94,21 +94,21 @@ def cut(args):
         raise ValueError(f"{args.folders[0]}: no PLY files")
     out = args.folders[1]
     out.mkdir()
-    dice = np.random.default_rng(args.seed)
+    random = np.random.default_rng(args.seed)
     lives, truth, starts = None, [], [0]
     for number, path in enumerate(frames):
         header, names, rows = read(path)
         at = {name: place for place, name in enumerate(names)}
-        lives = lives or Lives(len(rows), args.lives, args.overlap, args.jitter, dice)
+        lives = lives or Lives(len(rows), args.lives, args.overlap, args.jitter, random)
         lives.enter(number)
         gaussian, life, part, off = lives.rows(number)
-        there = np.flatnonzero(dice.random(len(gaussian)) >= args.away)
-        there = dice.permutation(there)
+        there = np.flatnonzero(random.random(len(gaussian)) >= args.away)
+        there = random.permutation(there)
         gaussian, life, part, off = gaussian[there], life[there], part[there], off[there]
         new = rows[gaussian].astype(np.float64)
         scales = np.exp(new[:, [at[f"scale_{c}"] for c in range(3)]])
         size = np.sqrt((scales**2).mean(1))
-        new[:, [at[c] for c in "xyz"]] += args.noise * size[:, None] * dice.normal(0, 1, (len(new), 3))
+        new[:, [at[c] for c in "xyz"]] += args.noise * size[:, None] * random.normal(0, 1, (len(new), 3))
         new[:, [at[f"f_dc_{c}"] for c in range(3)]] += off[:, :3] / SH_C0
         if args.jitter or args.overlap:
             opacity = 1 / (1 + np.exp(-new[:, at["opacity"]]))
@@ -143,7 +143,7 @@ def score(folder, container):
     for name in ("life", "gaussian"):
         true = found = wrong = 0
         for frame in range(len(paths) - 1):
-            # Of several rows of a Gaussian any may go on.
+            # If a Gaussian has several rows, any of them may continue.
             who = [truth[name][starts[f] : starts[f + 1]] for f in (frame, frame + 1)]
             true += len(np.intersect1d(*who))
             _, before, after = np.intersect1d(tracks[frame], tracks[frame + 1], return_indices=True)

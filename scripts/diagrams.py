@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
-"""Takes diagrams out of a page of `splatsieve precision`, as pictures of their own.
+"""Extracts diagrams from a page of `splatsieve precision` as SVG files.
 
     target/release/splatsieve precision MODEL --cameras MODEL -o FOLDER
     python3 scripts/diagrams.py FOLDER/precision.html "CAPTION" PICTURE.svg ["CAPTION" PICTURE.svg ...]
 
-Each is the first whose caption begins so. README's two are made from deform2:
-"look: relative L2 error of C" scripts/precision_look.svg, "rounds: error added" scripts/precision_rounds.svg.
-Needs nothing but Python.
+Each CAPTION selects the first diagram whose caption begins with it. The two diagrams of the README are made from
+deform2: "look: relative L2 error of C" scripts/precision_look.svg, "rounds: error added" scripts/precision_rounds.svg.
+Needs only the standard library.
 """
 
 import plainly  # noqa: F401 (first: what fails after it ends with a sentence)
@@ -15,7 +15,7 @@ import re
 import sys
 from pathlib import Path
 
-# As on paper: what depends on the screen goes.
+# Style for print, without the parts that depend on the screen.
 STYLE = re.sub(
     r"@media[^{]*\{(?:[^{}]*\{[^{}]*\})*[^{}]*\}\n?",
     "",

@@ -1,15 +1,17 @@
 #!/usr/bin/env python3
-"""Digests of what the program writes: the table by which a refactoring proves that it changed no byte.
+"""Computes digests of the program's outputs: a table that proves that a refactoring changed no byte.
 
     cargo build --release
     python3 scripts/digests.py target/release/splatsieve DATA TABLE            writes TABLE
     python3 scripts/digests.py target/release/splatsieve DATA --against TABLE  compares, exit 1 if a digest differs
 
-DATA/<name>/ is a 4DGaussians model folder with its cameras inside; DATA/static/*.ply are static models. Containers,
-streams, PLY sequences and single PLYs are made of the built-in demo and of the smallest model. Every preset,
---prune-only, --merge-only, targets, ids, every output kind and the other verbs run once. summary.json, which holds
-times, and recipe.toml are left out. Bytes of models depend on the processor's instructions (FMA or not): compare
-tables of one machine. --only WORD runs the cases whose names hold it. Standard library only.
+Example: python3 scripts/digests.py target/release/splatsieve ../shared/data before.txt
+
+DATA/<name>/ is a 4DGaussians model folder with its cameras in it; DATA/static/*.ply are stills. Containers, streams,
+PLY sequences and single PLYs are made from the built-in demo and from the smallest model. Every preset, --prune-only,
+--merge-only, targets, ids, every output kind and the other commands run once. summary.json, which holds times, and
+recipe.toml are left out. The bytes of models depend on the instructions of the processor (FMA or not), so tables are
+comparable only on one machine. --only WORD runs the cases whose names contain WORD. Needs only the standard library.
 """
 
 import plainly  # noqa: F401 (first: what fails after it ends with a sentence)
@@ -25,7 +27,7 @@ SKIPPED = ("summary.json", "recipe.toml")
 
 
 def digest(path):
-    """sha256 over names and bytes of a file and what lies beside it under its name, or of all files of a folder."""
+    """Returns the SHA-256 of names and bytes of a file and the files beside it that share its name, or of a folder."""
     if path.is_dir():
         files = sorted(p for p in path.rglob("*") if p.is_file())
         named = [(str(p.relative_to(path)), p) for p in files]
@@ -45,7 +47,7 @@ def run(command, stdin=None):
 
 
 def cases(binary, data, scratch):
-    """(name, function that writes to a path it is given, name of the output)."""
+    """Yields (name, function that writes to a given path, name of the output) of every case."""
     models = sorted(path.parent for path in data.glob("*/cfg_args"))
     small = models[0]
     box = "-1,-1,-1,0,0,0"

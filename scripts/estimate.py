@@ -1,11 +1,14 @@
 #!/usr/bin/env python3
-"""Compares what a run says that it will take with what it takes.
+"""Compares the time and memory that a run predicts with what it uses.
 
     cargo build --release
     python3 scripts/estimate.py target/release/splatsieve INPUT[=CAMERAS] ...
 
-An INPUT is whatever `compress` reads. Prints a table: core-seconds and seconds, as said (least, likely, most) and as taken,
-memory as said and as taken, and how long a dry run takes; ends with 1 if anything lies outside of what was said. Standard library only.
+Example: python3 scripts/estimate.py target/release/splatsieve ../shared/data/deform2
+
+INPUT is anything that `compress` reads. Prints a table with the predicted (minimum, likely, maximum) and used
+core-seconds and seconds, the predicted and used memory, and the time of a dry run. Exits 1 if anything is outside the
+prediction. Needs only the standard library.
 """
 
 import plainly  # noqa: F401 (first: what fails after it ends with a sentence)

@@ -1,14 +1,14 @@
 #!/usr/bin/env python3
-"""Streams a trained 4DGaussians model to standard output, evaluated by its own code on its own GPU.
+"""Streams a trained 4DGaussians model to standard output, evaluated by the code of its repository on its own GPU.
 
-Run it with the Python of the repository (https://github.com/hustvl/4DGaussians), from its folder:
+Run it with the Python of the repository (https://github.com/hustvl/4DGaussians), in its folder:
 
     python path/to/export_4dgaussians.py -m output/my_model --cameras data/transforms_train.json \\
         | splatsieve compress - --cameras data -o small.gseq
 
-splatsieve reads these models by itself; this is for forks whose deformation it does not know: the frames are
-whatever `gaussians._deformation` gives. Frames are the distinct times of the camera files, or `--frames N` evenly
-spaced ones (i/N). `--device cpu` works where the fork's classes do.
+splatsieve reads these models itself; this script is for forks with a deformation that splatsieve does not know: the
+frames are the results of `gaussians._deformation`. Frames are at the distinct times of the camera files, or with
+`--frames N` at evenly spaced times (i/N). `--device cpu` works if the classes of the fork support it.
 """
 
 import plainly  # noqa: F401 (first: what fails after it ends with a sentence)
@@ -18,7 +18,7 @@ import sys
 from argparse import ArgumentParser
 from pathlib import Path
 
-# The repository's classes print. What is standard output now becomes the stream; prints go to standard error.
+# The classes of the repository print. The stream goes to the present standard output; prints go to standard error.
 STREAM = os.fdopen(os.dup(1), "wb")
 os.dup2(2, 1)
 sys.path.insert(0, os.getcwd())
@@ -52,7 +52,7 @@ def main():
     parser.add_argument("--cameras", nargs="*", default=[], help="transforms*.json with the times")
     parser.add_argument("--frames", type=int, help="evenly spaced frames instead")
     parser.add_argument("--device", default="cuda")
-    # Reads cfg_args of the model folder and puts the command line over it.
+    # Reads cfg_args of the model folder; options of the command line take precedence.
     args = get_combined_args(parser)
     times = frame_times(getattr(args, "cameras", []), getattr(args, "frames", None))
     if not times:
@@ -66,7 +66,7 @@ def main():
     gaussians.load_model(str(folder))
 
     with torch.no_grad(), StreamWriter(STREAM, len(gaussians.get_xyz), gaussians.max_sh_degree) as stream:
-        # Raw parameters: the deltas are added to these, activations come after.
+        # Raw parameters: the deltas are added to these before the activations.
         raw = (gaussians.get_xyz, gaussians._scaling, gaussians._rotation, gaussians._opacity, gaussians.get_features)
         raw = [parameter.to(args.device) for parameter in raw]
         for time in times:

@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
-"""Streams any model given as arrays to standard output.
+"""Streams a model given as arrays to standard output.
 
     python3 scripts/export_arrays.py model.npz | splatsieve compress - --cameras data -o small.gseq
     python3 scripts/export_arrays.py folder_of_npy/ | splatsieve convert - scene.gseq
 
-An .npz, or a folder of .npy files (mapped, not loaded), with these arrays; T frames, N Gaussians:
+The input is an .npz, or a folder of .npy files (memory-mapped), with these arrays for T frames and N Gaussians:
 
     times          [T], increasing
     position       [T, N, 3] or [N, 3]
@@ -13,8 +13,8 @@ An .npz, or a folder of .npy files (mapped, not loaded), with these arrays; T fr
     opacity_logit  [T, N, 1] or [T, N] or [N, 1] or [N]: logits; or opacity in [0, 1]
     sh             [T, N, (d+1)^2, 3] or [N, (d+1)^2, 3], the last two as one or not; or rgb [T, N, 3] or [N, 3] in [0, 1]
 
-An array without T holds for every frame. Where T = N and shapes are ambiguous, an array of opacity needs its last axis
-of 1. Needs numpy.
+An array without T holds for every frame. If T = N and shapes are ambiguous, an opacity array needs a last axis of size
+1. Needs numpy.
 """
 
 import plainly  # noqa: F401 (first: what fails after it ends with a sentence)
@@ -29,12 +29,12 @@ SH_C0 = 0.28209479177387814
 
 
 def logit(opacity):
-    # Logits of 0 and 1 are infinite; those of the nearest float32 are not.
+    # The logits of 0 and 1 are infinite, but those of the nearest float32 are finite.
     opacity = np.clip(np.asarray(opacity, np.float64), np.finfo(np.float32).tiny, 1 - 2**-24)
     return np.log(opacity) - np.log1p(-opacity)
 
 
-# What an array may be given as instead, and how the one follows from the other.
+# Alternative names of arrays, and the conversion of each.
 INSTEAD = {
     "log_scale": ("scale", np.log),
     "opacity_logit": ("opacity", logit),
@@ -60,11 +60,11 @@ def main():
         columns[name] = arrays[name if name in arrays else other]
         convert[name] = (lambda array: array) if name in arrays else function
     if "sh" in arrays and columns["sh"].shape[-1] != 3:
-        # One row of 3(d+1)^2 for a Gaussian, as containers and read_gseq.py have them.
+        # One row of 3(d+1)^2 values per Gaussian, as in containers and read_gseq.py.
         columns["sh"] = columns["sh"].reshape(*columns["sh"].shape[:-1], -1, 3)
     times = np.asarray(arrays.get("times", np.arange(1)), np.float64)
     count = columns["position"].shape[-2]
-    # One axis more than a single state has, counting from the values of one Gaussian.
+    # Number of axes of an array with time, including the axis of the values of one Gaussian.
     axes = {"position": 2, "rotation": 2, "log_scale": 2, "opacity_logit": 2, "sh": 3 if "sh" in arrays else 2}
 
     def varies(name):

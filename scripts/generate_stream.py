@@ -1,14 +1,14 @@
 #!/usr/bin/env python3
-"""Streams a made-up sequence of any size to standard output.
+"""Streams a generated sequence of any size to standard output.
 
     python3 scripts/generate_stream.py 200000 600 | splatsieve convert - big.gseq      # 200,000 Gaussians, 600 frames
 
-The scene is a room of 4 x 4 x 2.5 units: floor, walls, eight bodies that move, faint dust, near-duplicates that merge.
-Every value of position, rotation, log_scale and opacity differs from frame to frame for every Gaussian, along a smooth
-curve with noise on it, unless `--varying` names fewer columns; spherical harmonics are constant. The same arguments
-give the same bytes.
+The scene is a room of 4 x 4 x 2.5 units: floor, walls, eight bodies that move, faint dust, and near-duplicates that
+merge. Every value of position, rotation, log_scale and opacity of every Gaussian differs between frames, along a smooth
+curve with noise, unless `--varying` names fewer columns; spherical harmonics are constant. The same arguments give the
+same bytes.
 
-Memory: 0.8 kB per Gaussian, whatever the number of frames. Needs numpy.
+Memory: 0.8 kB per Gaussian, for any number of frames. Needs numpy.
 """
 
 import plainly  # noqa: F401 (first: what fails after it ends with a sentence)
@@ -21,13 +21,13 @@ from stream_writer import StreamWriter
 
 # Rows of each column among the eleven that may vary.
 ROWS = {"position": slice(0, 3), "rotation": slice(3, 7), "log_scale": slice(7, 10), "opacity_logit": slice(10, 11)}
-# Frames after which the curves come round again. Motion per frame does not depend on T, so that ten times the
-# frames are ten times the work.
+# Number of frames after which the curves repeat. The motion per frame does not depend on T, so ten times the frames are
+# ten times the work.
 PERIOD = 60
 
 
 def scene(count, degree):
-    """Rest values [11, N], two amplitudes [11, N] of the motion, and spherical harmonics [N, (d+1)^2, 3]."""
+    """Returns mean values [11, N], two amplitudes [11, N] of the motion, and spherical harmonics [N, (d+1)^2, 3]."""
     random = np.random.default_rng(count)
 
     def uniform(low, high, shape=count):
@@ -35,7 +35,7 @@ def scene(count, degree):
 
     kind, u, v = uniform(0, 1), uniform(0, 1), uniform(0, 1)
     rest, sway, turn = (np.zeros((11, count), np.float32) for _ in range(3))
-    # 60% surfaces, the four as large as the room makes them; 25% bodies; the rest dust.
+    # 60% are on surfaces, the four that the size of the room gives; 25% on bodies; the rest is dust.
     surface = np.minimum(kind / 0.6 * 4.125, 4.125)
     floor, back = surface < 1.6, (surface >= 1.6) & (surface < 2.6)
     left = (surface >= 2.6) & (surface < 3.4)
@@ -50,14 +50,14 @@ def scene(count, degree):
     ball = np.stack([ring * np.cos(angle), ring * np.sin(angle), 0.3 * height]) + middle[:, which]
     rest[:3] = np.where(body, ball, np.where(dust, np.stack([4 * u - 2, 4 * v - 2, uniform(0, 2.5)]), np.stack([x, y, z])))
     rest[3:7] = np.array([[1], [0], [0], [0]], np.float32) + uniform(-0.5, 0.5, (4, count))
-    # Surfaces are covered once or twice whatever N is.
+    # Surfaces are covered once or twice for any N.
     rest[7:10] = np.log(np.where(dust, 0.003, 4 / np.sqrt(count))) + uniform(-0.5, 0.3, (3, count))
     rest[10] = np.where(dust, uniform(-4, -2), uniform(1, 4))
     for amplitude in (sway, turn):
         wobble = np.repeat(np.float32([3e-4, 0.01, 0.01, 0.2]), [3, 4, 3, 1])[:, None]
         amplitude[:] = wobble * uniform(-1, 1, (11, count))
         amplitude[:3] += body * uniform(-0.4, 0.4, (3, 8))[:, which]
-    # A tenth are copies of others, a little aside: the first to merge.
+    # 10% are copies of others with a small offset; they merge first.
     copy = np.where(uniform(0, 1) < 0.1, random.integers(0, count, count), np.arange(count))
     rest, sway, turn = rest[:, copy], sway[:, copy], turn[:, copy]
     rest[:3] += (copy != np.arange(count)) * 0.1 * np.exp(rest[7:10]) * uniform(-1, 1, (3, count))
@@ -67,9 +67,9 @@ def scene(count, degree):
 
 
 def curves(rest, sway, turn, frames):
-    """Values [rows, N] of one frame after the other, in the same array."""
+    """Yields the values [rows, N] of one frame after the other, always in the same array."""
     shape, (rest, sway, turn) = rest.shape, (array.ravel() for array in (rest, sway, turn))
-    # One pool of noise, begun at another place in every frame, takes a tenth of the time of fresh numbers.
+    # One pool of noise, read from another offset in every frame, takes a tenth of the time of new random numbers.
     shifts, chunk = 1 << 20, 1 << 14
     noise = np.random.default_rng(1).standard_normal(len(rest) + shifts, np.float32) * np.float32(2e-5)
     now, scratch = np.empty_like(rest), np.empty(chunk, np.float32)
@@ -77,7 +77,7 @@ def curves(rest, sway, turn, frames):
         at = 2 * np.pi * frame / PERIOD
         swaying, turning = np.float32([np.cos(at) + 0.3 * np.sin(3 * at), np.sin(at) + 0.3 * np.cos(2 * at)])
         shift = frame * 514229 % shifts
-        # In pieces that stay in the cache from one operation to the next.
+        # In chunks that stay in the cache from one operation to the next.
         for start in range(0, len(rest), chunk):
             here = slice(start, min(start + chunk, len(rest)))
             value, product = now[here], scratch[: here.stop - start]

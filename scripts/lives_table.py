@@ -1,15 +1,16 @@
 #!/usr/bin/env python3
-"""What linking saves where Gaussians live short lives: the same lives compressed one by one, and linked to tracks.
+"""Prints what linking saves if Gaussians have short lives: the same lives compressed separately, and linked to tracks.
 
     cargo build --release
     python3 scripts/lives_table.py target/release/splatsieve DATA [MODEL ...] [--overlap 2] [--ratios .4,.2,.1,.05] [--with="--no-refine"]
 
-DATA/<name>/ is a 4DGaussians model folder with its cameras inside. Its frames are cut by cut_lives.py into lives of 4 to 12
-frames, shuffled, with positions off by 2% of the size and colours and opacities by 2%. `alone` is a container in which
-every life is a track of its own, as the truth says; `linked` is the folder as it is. Both are compressed by `default` to the
-same parts of their tracks. Prints what is left, tracks and Gaussian-frames (those that are there in a frame, of all
-frames), and the PSNR of held-out pictures against the uncut model; then, by interpolation between these, how many times
-fewer tracks give the PSNR that lives alone have, and how many dB more as many Gaussian-frames give. Needs numpy and zstandard.
+DATA/<name>/ is a 4DGaussians model folder with its cameras in it. cut_lives.py cuts its frames into lives of 4 to 12
+frames, shuffles them, and adds noise of 2% of the size to positions and of 2% to colors and opacities. `alone` is a
+container in which every life is a separate track, from the truth; `linked` is the folder as it is. Both are compressed
+by `default` to the same fractions of their tracks. Prints the remaining tracks and Gaussian-frames (frames in which a
+Gaussian is alive, over all Gaussians), and the PSNR of test views against the uncut model; then, by interpolation, how
+many times fewer tracks give the PSNR of separate lives, and how many dB more the same number of Gaussian-frames gives.
+Needs numpy and zstandard.
 """
 
 import plainly  # noqa: F401 (first: what fails after it ends with a sentence)
@@ -27,7 +28,7 @@ from cut_lives import read
 from read_gseq import Gseq
 from stream_writer import StreamWriter
 
-# An opacity logit below this is of a Gaussian that is not there.
+# Opacity logit below which a Gaussian is absent.
 THERE = -30
 NOT_THERE = -40
 
@@ -40,29 +41,29 @@ def run(*command):
 
 
 def states(path):
-    """Columns of a PLY file, [N, width] each."""
+    """Returns the columns of a PLY file, [N, width] each."""
     _, names, rows = read(path)
     rest = sum(name.startswith("f_rest_") for name in names) // 3
 
-    def of(*wanted):
+    def columns_of(*wanted):
         return rows[:, [names.index(name) for name in wanted]]
 
     # The file has red of all coefficients, then green, then blue.
-    higher = [of(*(f"f_rest_{channel * rest + k}" for channel in range(3))) for k in range(rest)]
+    higher = [columns_of(*(f"f_rest_{channel * rest + k}" for channel in range(3))) for k in range(rest)]
     return {
-        "position": of("x", "y", "z"),
-        "rotation": of(*(f"rot_{c}" for c in range(4))),
-        "log_scale": of(*(f"scale_{c}" for c in range(3))),
-        "opacity_logit": of("opacity"),
-        "sh": np.concatenate([of(*(f"f_dc_{c}" for c in range(3))), *higher], 1),
+        "position": columns_of("x", "y", "z"),
+        "rotation": columns_of(*(f"rot_{c}" for c in range(4))),
+        "log_scale": columns_of(*(f"scale_{c}" for c in range(3))),
+        "opacity_logit": columns_of("opacity"),
+        "sh": np.concatenate([columns_of(*(f"f_dc_{c}" for c in range(3))), *higher], 1),
     }
 
 
 def pack_lives(binary, cut, times, out):
-    """The container in which every life is a track, held as it is where it is not there."""
+    """Writes a container in which every life is a track, with constant values outside its life."""
     truth = np.load(cut / "truth.npz")
     paths, starts = sorted(cut.glob("*.ply")), truth["starts"]
-    # By their births, so that those that are there together are neighbours.
+    # Sorted by first frame, so that lives of the same time are neighbors.
     names, first, number = np.unique(truth["life"], return_index=True, return_inverse=True)
     order = np.argsort(first, kind="stable")
     place = np.empty(len(names), int)
@@ -98,7 +99,7 @@ def gaussian_frames(container):
 
 
 def curve(binary, model, source, name, ratios, extra, scratch):
-    """Tracks, Gaussian-frames and PSNR of each part that is kept."""
+    """Returns tracks, Gaussian-frames and PSNR at each ratio."""
     points = []
     for ratio in ratios:
         out = scratch / "small.gseq"
@@ -112,7 +113,7 @@ def curve(binary, model, source, name, ratios, extra, scratch):
 
 
 def within(values, by, at):
-    """Where a curve that rises with `by` reaches `at`, if it does, in logs of `values`."""
+    """Interpolates log `values` where the curve, which rises with `by`, reaches `at`; None if it does not."""
     if not by.min() <= at <= by.max():
         return None
     order = np.argsort(by)

@@ -1,17 +1,17 @@
 #!/usr/bin/env python3
-"""LPIPS between two folders of pictures of the same names, as JSON: per picture, and the mean.
+"""Computes LPIPS between two folders of images with the same names, as JSON: per image, and the mean.
 
     splatsieve render model --cameras data --all -o before/
     splatsieve render small --cameras data --all -o after/
     python3 scripts/lpips.py before after [--net alex|vgg|squeeze]
 
-Needs the packages lpips, torchvision and pillow (pip install lpips torchvision pillow) and, once, the network's
-weights, which torchvision downloads; without the internet put them where the message says. Pictures are taken as
-they are, 8 bits per channel, scaled to [-1, 1]. Lower is closer; 0 is equal. Zhang et al., "The Unreasonable
+Needs the packages lpips, torchvision and pillow (pip install lpips torchvision pillow) and once the weights of the
+network, which torchvision downloads; without internet access put them where the message says. Images are used
+unchanged, 8 bits per channel, scaled to [-1, 1]. Lower is closer; 0 is equal. Zhang et al., "The Unreasonable
 Effectiveness of Deep Features as a Perceptual Metric", 2018.
 """
 
-# This folder is on the path of its own scripts, and this script bears the name of the package it needs.
+# The folder of this script is on the module path, and this script has the name of the package it needs.
 import plainly  # noqa: F401 (first: what fails after it ends with a sentence)
 import sys
 
@@ -30,14 +30,14 @@ def stop(message):
 
 
 def metric(net):
-    """The LPIPS network `net`, or an end that says what it lacks."""
+    """Returns the LPIPS network `net`, or ends with a message that names what is missing."""
     try:
         import torch
         import torchvision  # noqa: F401, the package lpips takes its networks from it
         import lpips
     except ImportError as error:
         stop(f"cannot import {error.name}\n  pip install lpips torchvision pillow")
-    # The package speaks to torchvision in an older way, which that remarks on.
+    # The package uses an older interface of torchvision, which prints warnings.
     warnings.filterwarnings("ignore", module="torchvision")
     try:
         return lpips.LPIPS(net=net, verbose=False).eval()
@@ -50,7 +50,7 @@ def metric(net):
 
 
 def pairs(before, after):
-    """Names of the pictures in both folders, which must be the same."""
+    """Returns the names of the images, which must be the same in both folders."""
     names = []
     for folder in (before, after):
         if not folder.is_dir():
@@ -65,7 +65,7 @@ def pairs(before, after):
 
 
 def read(path):
-    """The picture as a tensor [1, 3, height, width] in [-1, 1]."""
+    """Returns the image as a tensor [1, 3, height, width] in [-1, 1]."""
     import numpy
     import torch
     from PIL import Image

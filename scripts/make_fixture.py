@@ -1,14 +1,14 @@
 #!/usr/bin/env python3
-"""Makes tests/data/tiny_model: a 4DGaussians model folder small enough to live with the code.
+"""Makes tests/data/tiny_model: a 4DGaussians model folder small enough for the repository.
 
     python3 scripts/make_fixture.py [FOLDER]          (default: tests/data/tiny_model)
 
-Needs numpy and PyTorch; the folder's README.md says which versions made what is there. Nothing is
-trained: a seeded field with all five heads on moves a seeded cloud that has what compression looks at:
-tight groups that move together, loners, needles, dead and fading Gaussians.
+Needs numpy and PyTorch; README.md in the folder names the versions that made the present files. Nothing is trained: a
+seeded field with all five heads moves a seeded point cloud with the features that compression examines: tight groups
+that move together, isolated Gaussians, needles, dead and fading Gaussians.
 
-Written, beside the files of a model folder and its cameras:
-  states.npz          states at FRAMES_KEPT as float64 PyTorch evaluates them, SH at the last of those
+Besides the files of a model folder and its cameras, the script writes:
+  states.npz          states at FRAMES_KEPT as PyTorch evaluates them in float64, SH at the last of these frames
   statistics_f64.npz  life, V, D and kappa over all frames, by the definitions of tests/compression/trained_models.rs
 """
 
@@ -28,14 +28,14 @@ FRAMES = 10
 FRAMES_KEPT = [0, 4, 9]
 WIDTH, CHANNELS, RESOLUTION, MULTIRES = 16, 4, [8, 8, 8, 6], [1, 2]
 HEADS = {"pos_deform": 3, "scales_deform": 3, "rotations_deform": 4, "opacity_deform": 1, "shs_deform": 48}
-# Typical size of each head's delta: a scene about 2 wide, opacities that fade, colours that shift.
+# Typical size of the delta of each head: a scene about 2 units wide, opacities that fade, colors that shift.
 REACH = {"pos_deform": 0.15, "scales_deform": 0.1, "rotations_deform": 0.1, "opacity_deform": 1.5, "shs_deform": 0.05}
 AXES = [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
 ALPHA_MIN = 0.01
 
 
 def make_cloud(rng):
-    """Raw parameters [N, ...]: 60 groups of four near-copies, 50 loners, 6 dead, 4 needles."""
+    """Returns raw parameters [N, ...]: 60 groups of four near-copies, 50 isolated Gaussians, 6 dead, 4 needles."""
 
     def draw(n):
         return {
@@ -61,7 +61,7 @@ def make_cloud(rng):
 
 
 def make_field(generator):
-    """A state dict with the original's names, shapes and types."""
+    """Returns a state dict with the names, shapes and types of the original."""
 
     def normal(*shape, std):
         return torch.randn(*shape, generator=generator) * std
@@ -80,19 +80,19 @@ def make_field(generator):
         reach = REACH[name[:-2]] if name.endswith(".3") else 1.4
         state[f"deformation_net.{name}.weight"] = normal(fan_out, fan_in, std=reach / math.sqrt(fan_in))
         state[f"deformation_net.{name}.bias"] = normal(fan_out, std=0.1 * reach)
-    # Stored by the original, read by nothing.
+    # Stored by the original, but never read.
     state["deformation_net.timenet.0.weight"] = normal(4, 9, std=1.0)
     state["time_poc"] = torch.tensor([1.0, 2.0, 4.0, 8.0])
     return state
 
 
 def evaluate(cloud, state, time):
-    """Activated state at `time`, float64: FORMATS of 4DGaussians, written from its description."""
+    """Returns the activated state at `time` in float64, by the description of the 4DGaussians format."""
     w = {key: value.double() for key, value in state.items()}
     raw = {key: torch.from_numpy(value).double() for key, value in cloud.items()}
     high, low = w["deformation_net.grid.aabb"]
     u = (raw["position"] - high) * 2 / (low - high) - 1
-    # The time is a coordinate as it is, not mapped to [-1, 1]; the field receives it as float32.
+    # The time is used as a coordinate directly, not mapped to [-1, 1]; the field receives it as float32.
     t = float(np.float32(time))
     u = torch.cat([u, torch.full_like(u[:, :1], t)], dim=1)
     levels = []
@@ -120,7 +120,7 @@ def evaluate(cloud, state, time):
 
 
 def statistics(xyz, opacity):
-    """Per Gaussian, from positions [T, N, 3] and opacities [T, N]; all steps are of one frame."""
+    """Returns statistics per Gaussian from positions [T, N, 3] and opacities [T, N]; all steps have one frame."""
     frames, count = opacity.shape
     life = opacity >= ALPHA_MIN
     step = ((xyz[1:] - xyz[:-1]) ** 2).sum(axis=2)
@@ -155,7 +155,7 @@ def write_ply(cloud, path):
 
 
 def write_cameras(folder):
-    """A ring of cameras at radius 4; every third is held out."""
+    """Writes a ring of cameras at radius 4; every third is a test camera."""
     shots = {"train": [], "test": []}
     for frame in range(FRAMES):
         for view in range(6):
@@ -195,7 +195,7 @@ def main():
         "output_coordinate_dim": CHANNELS,
         "resolution": RESOLUTION,
     }
-    # `source_path` is the folder itself, as seen from beside it: cameras are found without being named.
+    # `source_path` is the folder itself, relative to its parent: cameras are found without being named.
     (folder / "cfg_args").write_text(
         f"Namespace(sh_degree=3, source_path={folder.name!r}, model_path='output/tiny', white_background=False, "
         f"eval=True, net_width={WIDTH}, defor_depth=1, bounds=1.6, kplanes_config={planes}, multires={MULTIRES}, "

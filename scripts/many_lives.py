@@ -1,13 +1,13 @@
 #!/usr/bin/env python3
-"""What a long sequence of short lives takes: frames of any order, linked and compressed within a budget of memory.
+"""Measures a long sequence of short lives: frames in any order, linked and compressed within a memory limit.
 
     cargo build --release
     python3 scripts/many_lives.py target/release/splatsieve [--frames 300] [--living 60000] [--life 9] [--memory 2GiB] [--folder DIR] [--with="--no-refine"]
 
-Makes PLY frames of so many Gaussians each, that live for so many frames in the mean, move, end, and begin elsewhere, in another
-order in every frame; the same for every run. Prints how many lives there are, how many tracks were found, the time and the
-largest resident set of the run, and whether that is within the budget. The frames are left in DIR if it is given, and taken
-from there if they are there. Needs numpy.
+Makes PLY frames with --living Gaussians each, which live --life frames on average, move, end, and begin elsewhere, in
+another order in every frame; the same in every run. Prints the number of lives, the number of tracks found, the time
+and the largest resident memory of the run, and whether that is within the limit. If DIR is given, the frames are kept
+there and reused. Needs numpy.
 """
 
 import plainly  # noqa: F401 (first: what fails after it ends with a sentence)
@@ -27,7 +27,7 @@ PROPERTIES += [f"scale_{c}" for c in range(3)] + [f"rot_{c}" for c in range(4)]
 
 
 def born(count, rng):
-    """Rows of new Gaussians, on and near a sphere, and how they move in a frame."""
+    """Returns rows of new Gaussians on and near a sphere, and their motion per frame."""
     rows = np.zeros((count, len(PROPERTIES)), np.float32)
     towards = rng.standard_normal((count, 3))
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
@@ -40,7 +40,7 @@ def born(count, rng):
 
 
 def make(folder, frames, living, life):
-    """Writes the frames; gives the number of lives."""
+    """Writes the frames. Returns the number of lives."""
     rng = np.random.default_rng(2)
     header = f"ply\nformat binary_little_endian 1.0\nelement vertex {living}\n"
     header += "".join(f"property float {name}\n" for name in PROPERTIES) + "end_header\n"

@@ -4,9 +4,11 @@
     cargo build --release
     python3 scripts/models_table.py target/release/splatsieve DATA [PRESET ...]
 
-DATA/<name>/ is a model folder with its cameras inside and, if there are any, held-out photographs in test/.
-Every figure comes from what the program prints; quality is that of 15 frames of every held-out view, times and
-memory are those of this machine. Standard library only.
+Example: python3 scripts/models_table.py target/release/splatsieve ../shared/data default strong
+
+DATA/<name>/ is a model folder with its cameras in it and, if available, photographs of the test views in test/. All
+figures are those that the program prints; quality is measured on 15 frames of every test view, times and memory are
+those of this machine. Needs only the standard library.
 """
 
 import plainly  # noqa: F401 (first: what fails after it ends with a sentence)
@@ -25,24 +27,24 @@ def run(*command):
 
 
 def evaluated(binary, model, output, cameras):
-    """What `evaluate` says of `output`, with photographs where the model has some."""
+    """Returns what `evaluate` prints for `output`, with photographs if the model has some."""
     truth = ["--ground-truth", model / "test"] if (model / "test").is_dir() else []
     return run(binary, "evaluate", model, output, "--cameras", cameras, *truth, "--max-frames", 15, "--json")
 
 
 def photographs(quality):
-    """PSNR against photographs, of the unpruned model and of the result; none without them."""
+    """Returns the PSNR against photographs of the unpruned model and of the result; None without photographs."""
     truth = quality.get("ground_truth")
     return (truth["original"]["psnr"], truth["psnr"]) if truth else None
 
 
 def peak(summary):
-    """MiB."""
+    """Returns the peak memory in MiB."""
     return max(stage["peak_memory_bytes"] or 0 for stage in summary["stages"]) / 2**20
 
 
 def sizes(before, after):
-    """Megabytes, and the part that is left."""
+    """Returns megabytes, and the remaining fraction."""
     return f"{before / 1e6:.1f} → {after / 1e6:.1f} ({100 * after / before:.0f}%)" if before else f"{after / 1e6:.1f}"
 
 

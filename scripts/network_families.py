@@ -1,18 +1,19 @@
-"""Models that a network moves, in the terms of `Scene`, `GaussianModel.load_ply` and `DeformModel.load_weights`: part of
-check_families.py."""
+"""Checks of models that a network moves, as `Scene`, `GaussianModel.load_ply` and `DeformModel.load_weights` open them;
+part of check_families.py.
+"""
 
 import ast
 import math
 import re
 from pathlib import Path
 
-from check_model_folder import fail, hold, read_ply, read_pth, rest_of, without_bands
+from check_model_folder import fail, require, read_ply, read_pth, rest_of, at_lower_degree
 
 WIDTH, DEPTH, PLACE = 256, 8, 63
 
 
 def last_iteration(folder):
-    """`searchForMaxIteration` of the original."""
+    """Returns the largest iteration, as `searchForMaxIteration` of the original does."""
     found = [int(f.name.split("_")[1]) for f in folder.iterdir() if re.fullmatch(r"iteration_\d+", f.name)]
     if not found:
         fail(f"{folder} has no iteration_K folder")
@@ -20,13 +21,13 @@ def last_iteration(folder):
 
 
 def read_arguments(path):
-    """Arguments of the Namespace, by name."""
+    """Returns the arguments of the Namespace by name."""
     call = ast.parse(path.read_text().strip(), mode="eval").body
     return {key.arg: ast.literal_eval(key.value) for key in call.keywords}
 
 
 def network_shapes(names, prefix, heads):
-    """Names and shapes of a network, of which `names` tell whether it has a time network."""
+    """Returns names and shapes of a network; `names` tells whether it has a time network."""
     has_time_network = f"{prefix}timenet.0.weight" in names
     of_time = 30 if has_time_network else 21
     layers = {"timenet.0": (WIDTH, 13), "timenet.2": (30, WIDTH)} if has_time_network else {}
@@ -41,53 +42,54 @@ def network_shapes(names, prefix, heads):
 
 
 def check_network(model, prefix, heads, others):
-    """The state dict at `model` against what a network has; gives its tensors' shapes."""
+    """Checks the state dict at `model` against its expected network. Returns the shapes of its tensors."""
     tensors, values = read_pth(model)
     shapes = {name: tensor.shape for name, tensor in tensors.items()}
     expected = network_shapes(shapes, prefix, heads(shapes))
     found = {name: shape for name, shape in shapes.items() if name not in others}
-    hold(found == expected, f"{len(found)} tensors of the network load strictly")
-    hold(all(math.isfinite(x) for of in values.values() for x in of), "every weight is finite")
+    require(found == expected, f"{len(found)} tensors of the network load strictly")
+    require(all(math.isfinite(x) for of in values.values() for x in of), "every weight is finite")
     return shapes
 
 
 def check_cloud(path, degree):
-    """The cloud at `path`; gives its properties and rows."""
+    """Checks the point cloud at `path`. Returns its properties and rows."""
     properties, rows = read_ply(path)
     names = [name for _, name in properties]
     rest = [name for name in names if name.startswith("f_rest_")]
-    hold(len(rest) == rest_of(degree), f"{len(rest)} f_rest for SH degree {degree}")
+    require(len(rest) == rest_of(degree), f"{len(rest)} f_rest for SH degree {degree}")
     needed = ["x", "y", "z", "opacity"] + [f"f_dc_{k}" for k in range(3)]
     needed += [f"scale_{k}" for k in range(3)] + [f"rot_{k}" for k in range(4)]
-    hold(all(name in names for name in needed), "every property that the loader reads")
-    hold(all(math.isfinite(x) for row in rows for x in row), f"{len(rows)} Gaussians, every value finite")
+    require(all(name in names for name in needed), "every property that the loader reads")
+    require(all(math.isfinite(x) for row in rows for x in row), f"{len(rows)} Gaussians, every value finite")
     return properties, rows
 
 
 def check_against(original, arguments, network, properties, rows, k):
-    """What has to be as it was in the model at `original`."""
+    """Checks everything that must equal the model at `original`."""
     before = read_arguments(original / "cfg_args")
     degree_before, degree = before.pop("sh_degree", 3), arguments.get("sh_degree", 3)
     same = {key: value for key, value in arguments.items() if key != "sh_degree"}
-    hold(same == before and degree <= degree_before, "cfg_args is unchanged but for a lower sh_degree")
+    require(same == before and degree <= degree_before, "cfg_args is unchanged but for a lower sh_degree")
     own = original / "deform" / f"iteration_{k}" / "deform.pth"
-    hold(own.read_bytes() == network.read_bytes(), "the network has the original's bytes")
+    require(own.read_bytes() == network.read_bytes(), "the network has the original's bytes")
     properties_before, rows_before = read_ply(original / "point_cloud" / f"iteration_{k}" / "point_cloud.ply")
     names_before = [name for _, name in properties_before]
-    pairs = without_bands(names_before, degree_before, degree)
+    pairs = at_lower_degree(names_before, degree_before, degree)
     kinds = {name: kind for kind, name in properties_before}
-    hold(properties == [(kinds[was], name) for name, was in pairs], "properties with the original's names, order and types")
-    hold(len(rows) <= len(rows_before), f"{len(rows)} of {len(rows_before)} Gaussians")
+    expected = [(kinds[was], name) for name, was in pairs]
+    require(properties == expected, "properties with the original's names, order and types")
+    require(len(rows) <= len(rows_before), f"{len(rows)} of {len(rows_before)} Gaussians")
     places = [names_before.index(was) for _, was in pairs]
     kept = {tuple(row[place] for place in places) for row in rows_before}
     print(f"{sum(row in kept for row in rows)} of {len(rows)} rows are the original's")
 
 
 def open_folder(model):
-    """K, the arguments, and where cloud and network are."""
+    """Returns K, the arguments, and the paths of point cloud and network."""
     arguments = read_arguments(model / "cfg_args")
     k = last_iteration(model / "point_cloud")
-    hold(k == last_iteration(model / "deform"), f"cloud and network are of iteration {k}")
+    require(k == last_iteration(model / "deform"), f"cloud and network are of iteration {k}")
     cloud = model / "point_cloud" / f"iteration_{k}" / "point_cloud.ply"
     return k, arguments, cloud, model / "deform" / f"iteration_{k}" / "deform.pth"
 
@@ -101,7 +103,7 @@ def deformable_3d_gaussians(model, original):
 
     shapes = check_network(network, "", heads, ())
     for key, name in (("is_blender", "timenet.0.weight"), ("is_6dof", "branch_w.weight")):
-        hold(arguments.get(key, False) == (name in shapes), f"{key} of cfg_args is that of the weights")
+        require(arguments.get(key, False) == (name in shapes), f"{key} of cfg_args is that of the weights")
     properties, rows = check_cloud(cloud, arguments.get("sh_degree", 3))
     if original:
         check_against(original, arguments, network, properties, rows, k)
@@ -121,9 +123,10 @@ def sc_gs(model, original):
     properties, rows = check_cloud(cloud, arguments.get("sh_degree", 3))
     if has_nodes:
         count, width = shapes["nodes"]
-        hold(shapes["_node_radius"] == (count,) and shapes["_node_weight"] == (count, 1), f"{count} nodes")
+        require(shapes["_node_radius"] == (count,) and shapes["_node_weight"] == (count, 1), f"{count} nodes")
         features = [name for _, name in properties if name.startswith("fea")]
         mask = 1 if arguments.get("gs_with_motion_mask") else 0
-        hold(len(features) == width - 3 + mask, f"{len(features)} fea_* for {width - 3} hyper dimensions, mask {mask}")
+        told = f"{len(features)} fea_* for {width - 3} hyper dimensions, mask {mask}"
+        require(len(features) == width - 3 + mask, told)
     if original:
         check_against(original, arguments, network, properties, rows, k)

@@ -1,7 +1,8 @@
-"""Lets a script end with a sentence where Python would print a traceback: import it first.
+"""Makes scripts end with a one-line message in place of a traceback. Import it first.
 
-Wrong arguments give the usage of the script's own text and 2, whatever else fails a line with the file it was about and 1,
-Ctrl-C 130; whoever reads the output may stop at any line. `python3 -X dev SCRIPT` shows the traceback all the same.
+Wrong arguments print the usage lines of the script's docstring and exit with 2; other errors print one line that names
+the file concerned and exit with 1; Ctrl-C exits with 130; a reader may close the output at any line. `python3 -X dev
+SCRIPT` shows the traceback all the same.
 """
 
 import linecache
@@ -14,12 +15,12 @@ from pathlib import Path
 
 
 def usage(text):
-    """The indented lines that a script's text begins with."""
+    """Returns the indented lines of a script's docstring."""
     return "\n".join(line for line in (text or "").splitlines() if line.startswith("    "))
 
 
-def sentence(error):
-    """What went wrong, in one line."""
+def one_line(error):
+    """Returns a description of the error in one line."""
     if isinstance(error, OSError) and error.filename is not None:
         return f"{error.filename}: {error.strerror}"
     if isinstance(error, ModuleNotFoundError):
@@ -34,12 +35,12 @@ def sentence(error):
     return " ".join(str(error).split()) or type(error).__name__
 
 
-def tell(kind, error, trace):
-    """Python's `sys.excepthook`."""
+def report(kind, error, trace):
+    """Reports an uncaught exception; replaces `sys.excepthook`."""
     main = sys.modules["__main__"]
     script = Path(getattr(main, "__file__", "script"))
     if isinstance(error, BrokenPipeError):
-        # Whoever read our output has seen enough; what is left would be flushed at the end.
+        # The reader has stopped reading; the rest of the output would be flushed at exit and fail again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         os._exit(0)
     if isinstance(error, KeyboardInterrupt):
@@ -54,12 +55,12 @@ def tell(kind, error, trace):
         print(f"{script.name}: wrong arguments; expected\n{usage(main.__doc__)}", file=sys.stderr)
         sys.stderr.flush()
         os._exit(2)
-    print(f"{script.name}: {sentence(error)}", file=sys.stderr)
+    print(f"{script.name}: {one_line(error)}", file=sys.stderr)
 
 
-# Only of the scripts here: a program that imports one of them keeps its own.
+# Only for the scripts of these folders: a program that imports one of them keeps its own hook.
 if Path(getattr(sys.modules["__main__"], "__file__", "")).resolve().parent in {
     Path(__file__).resolve().parent,
     Path(__file__).resolve().parent / "slurm",
 }:
-    sys.excepthook = tell
+    sys.excepthook = report

@@ -9,15 +9,15 @@
     python3 scripts/read_gseq.py scene.gseq                    # says what it holds
     python3 scripts/read_gseq.py scene.gseq arrays.npz         # every frame of every column: times, and [T, N, width]
 
-Every tile is found through the footer's index; one frame block of one column is in memory at a time. Checksums are not
-verified (that is `splatsieve verify`). Needs numpy and zstandard.
+Tiles are found through the index in the footer; one frame block of one column is in memory at a time. Checksums are not
+verified (`splatsieve verify` does that). Needs numpy and zstandard.
 """
 
 import plainly  # noqa: F401 (first: what fails after it ends with a sentence)
 import sys
 from pathlib import Path
 
-# Of the checkout, else of an installed package.
+# The module of the checkout, or else of an installed package.
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "python"))
 
 from splatsieve._gseq import Gseq, main  # noqa: E402

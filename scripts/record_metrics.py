@@ -1,10 +1,10 @@
-"""Records PSNR, SSIM and FLIP of small pictures, for tests/rendering/metrics_recorded.rs.
+"""Records PSNR, SSIM and FLIP of small images for tests/rendering/metrics_recorded.rs.
 
     python scripts/record_metrics.py tests/fixtures/metrics
 
-Writes a.npy and b.npy (float32 [pictures, 37, 53, 3], values partly outside [0, 1]) and expected.json with
-per picture one PSNR and SSIM, computed in float64 by 2-D convolution with PyTorch, and one FLIP of 8-bit pictures,
-computed by its authors' package (flip-evaluator), and the versions that made them.
+Writes a.npy and b.npy (float32 [images, 37, 53, 3], values partly outside [0, 1]) and expected.json with one PSNR and
+SSIM per image, computed in float64 by 2-D convolution with PyTorch, one FLIP of the 8-bit images, computed by its
+authors' package (flip-evaluator), and the versions of the packages. Needs numpy, PyTorch and flip-evaluator.
 """
 
 import plainly  # noqa: F401 (first: what fails after it ends with a sentence)
@@ -20,7 +20,7 @@ import torch.nn.functional as functional
 
 
 def ssim(a, b):
-    """Of two [3, H, W] tensors: the whole 11x11 window at once, zeros beyond the border."""
+    """Returns the SSIM of two [3, H, W] tensors: the 11x11 window in one convolution, with zeros beyond the border."""
     at = torch.arange(11, dtype=torch.float64) - 5
     line = torch.exp(-(at**2) / (2 * 1.5**2))
     window = torch.outer(line, line)
@@ -44,7 +44,7 @@ def psnr(a, b):
 
 
 def flip(a, b):
-    """Mean of the error map, `b` the reference, at the default distance of 67 pixels per degree."""
+    """Returns the mean of the error map with `b` as reference, at the default distance of 67 pixels per degree."""
     a, b = (np.float32(np.round(p.clip(0, 1) * 255) / 255) for p in (a, b))
     return float(flip_evaluator.evaluate(b, a, "LDR", inputsRGB=True, applyMagma=False)[1])
 

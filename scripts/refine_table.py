@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""What refining survivors gains: reduces every model below a folder to some sizes, with and without it.
+"""Prints what refinement gains: every model below a folder at several sizes, with and without refinement.
 
     cargo build --release
     python3 scripts/refine_table.py target/release/splatsieve DATA [RATIO ...]
@@ -7,15 +7,19 @@
     python3 scripts/refine_table.py target/release/splatsieve DATA --degrees [RATIO ...]
     python3 scripts/refine_table.py target/release/splatsieve DATA --efforts [RATIO ...]
 
-DATA/<name>/ is a 4DGaussians model folder with its cameras inside and, if there are any, held-out photographs in test/;
-DATA/static/<name>.ply is a model without cameras, for which an orbit of 12 to score by and 4 to compare by is made.
-Prints a Markdown table: pruned alone (--no-refine --prune-only) → `default`, by mean PSNR of 15 frames of every held-out
-view against the unpruned model's own pictures, SSIM, and PSNR against the photographs; wall seconds of the whole run and
-those before refinement; the largest peak of both. With --steps error against run time instead: a tenth of every model
-by as many steps (cuts take 8% of them each), against pruning alone. With --degrees as many Gaussians of every SH degree as
-take the bytes of that part of the cloud, refined (models without an SH head). With --efforts what `--effort` fast, default
-and best come to: 30% kept unrefined, then refined at every ratio; wall and processor seconds are those of all stages.
-Standard library only.
+Example: python3 scripts/refine_table.py target/release/splatsieve ../shared/data 0.2 0.1
+
+DATA/<name>/ is a 4DGaussians model folder with its cameras in it and, if available, photographs of the test views in
+test/; DATA/static/<name>.ply is a model without cameras, for which the script makes an orbit of 12 training and 4 test
+cameras. Prints a Markdown table of pruning only (--no-refine --prune-only) → `default`: mean PSNR of 15 frames of every
+test view against renders of the unpruned model, SSIM, and PSNR against the photographs; wall seconds of the whole run
+and of the part before refinement; the largest peak memory of both.
+
+--steps prints error against run time: 10% of every model with different numbers of steps (each prune step takes 8% of
+them), against pruning only. --degrees prints results of every SH degree, refined, with as many Gaussians as fit the
+bytes of that ratio of the point cloud (models without an SH head). --efforts prints results of `--effort` fast, default
+and best: 30% kept without refinement, then refined at every ratio; wall and processor seconds are those of all stages.
+Needs only the standard library.
 """
 
 import plainly  # noqa: F401 (first: what fails after it ends with a sentence)
@@ -31,7 +35,9 @@ from sweep_table import positions
 
 
 def orbit(ply, path, pixels=300, focal=330):
-    """Cameras around the median position, 2.2 times as far as nine tenths of all lie; up is y."""
+    """Writes cameras around the median position, at 2.2 times the distance within which 90% of the Gaussians lie; up is
+    y.
+    """
     axes = positions(ply)
     middle = [sorted(axis)[len(axis) // 2] for axis in axes]
     distances = sorted(math.dist(middle, place) for place in zip(*axes))
@@ -75,7 +81,7 @@ def point(binary, model, cameras, ratio, output, *options):
 
 
 def work_precision(binary, models, steps):
-    """Error against run time, by steps."""
+    """Prints error against run time, by number of steps."""
     print("| model | steps | s | PSNR dB to the original | SSIM | PSNR dB to photographs |")
     print("|---|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as folder:
@@ -93,7 +99,7 @@ def work_precision(binary, models, steps):
 
 
 def degrees(binary, models, ratios):
-    """Every SH degree, at equal bytes of cloud."""
+    """Prints every SH degree at equal bytes of the point cloud."""
     print("| model | bytes of the cloud | Gaussians kept: PSNR dB to the original, of degree 3 | 2 | 1 | 0 |")
     print("|---|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as folder:
@@ -113,7 +119,7 @@ def degrees(binary, models, ratios):
 
 
 def efforts(binary, models, ratios):
-    """Every effort: quality, and seconds."""
+    """Prints quality and seconds of every effort."""
     names = ["fast", "default", "best"]
     print(f"| model | kept | {' | '.join(f'{name}: PSNR dB | s (processor s)' for name in names)} |")
     print(f"|{'---|' * (2 + 2 * len(names))}")
@@ -131,7 +137,7 @@ def efforts(binary, models, ratios):
 
 
 def rigs(binary, models, ratios):
-    """Static models by the cameras of the orbit, and by those that the program finds where none are given."""
+    """Prints stills with the cameras of the orbit, and with the virtual rig of the program."""
     print("| model | kept | PSNR dB, scored by the orbit | scored without cameras |")
     print("|---|---|---|---|")
     with tempfile.TemporaryDirectory() as folder:

@@ -1,10 +1,10 @@
 #!/bin/sh
-# Makes scripts/report_picture.png, the README's picture: the slider of a report on a strongly compressed model.
+# Makes scripts/report_picture.png, an image of the README: the slider of a report on a strongly compressed model.
 #
 #     cargo build --release
 #     scripts/report_picture.sh target/release/splatsieve DATA/room2_dynerf scripts/report_picture.png
 #
-# DATA/<name> is a model folder with its cameras inside. Needs Chromium (apt-get install chromium-headless-shell),
+# DATA/<name> is a model folder with its cameras in it. Needs Chromium (apt-get install chromium-headless-shell),
 # or another one named in SPLATSIEVE_BROWSER.
 set -eu
 if [ $# -ne 3 ]; then
@@ -18,7 +18,7 @@ trap 'rm -rf "$folder"' EXIT
 
 "$splatsieve" compress "$model" --cameras "$model" --preset strong -o "$folder/small"
 "$splatsieve" report "$model" "$folder/small" --cameras "$model" --max-frames 3 -o "$folder/report"
-# The slider alone.
+# Only the slider.
 only='header, section:not(#compare), h2 { display: none } main { padding: 14px 20px }'
 sed "s|</head>|<style>$only</style></head>|" "$folder/report/report.html" >"$folder/slider.html"
 "$browser" --headless --no-sandbox --disable-gpu --hide-scrollbars --window-size=620,665 \

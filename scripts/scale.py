@@ -1,17 +1,18 @@
 #!/usr/bin/env python3
-"""Compresses made-up sequences of several sizes in given memory and prints a Markdown table of time and peak.
+"""Compresses generated sequences of several sizes within memory limits and prints a Markdown table of time and peak
+memory.
 
     cargo build --release
     python3 scripts/scale.py target/release/splatsieve FOLDER                   # README's table, and FOLDER/scale.json
     python3 scripts/scale.py target/release/splatsieve FOLDER --sizes 200000x600 --budgets 256MiB 1GiB none
 
-Without `--sizes` the series varies one thing at a time: the frames, the Gaussians, the budget (`--memory`). Below its
-table stands what must hold, and it exits 1 if something does not: the same bytes under every budget; no peak above its
-budget; ten times the frames with at most 5% more peak, in at most 10.5 times the time.
+Without `--sizes` the series varies one quantity at a time: frames, Gaussians, memory limit (`--memory`). Requirements
+are printed below its table, and the script exits 1 if one fails: the same bytes under every limit; no peak above its
+limit; ten times the frames with at most 5% more peak memory, in at most 10.5 times the time.
 
-generate_stream.py makes the sequences, `pack` stores each in FOLDER, and it is removed after its last run
-(`--keep`: stays, and is not made again). Peaks of a run are the system's (`ru_maxrss` of the process, which is VmHWM:
-mapped pages count), those of its stages the program's own. Needs numpy.
+generate_stream.py makes the sequences and `pack` stores each in FOLDER; it is removed after its last run (`--keep`
+keeps and reuses it). Peaks of a run are those of the system (`ru_maxrss` of the process, which is VmHWM: mapped pages
+count); peaks of its stages are those that the program prints. Needs numpy.
 """
 
 import plainly  # noqa: F401 (first: what fails after it ends with a sentence)
@@ -30,7 +31,7 @@ MIB = 1 << 20
 
 
 def cameras_json(views):
-    """3DGS's cameras.json: `views` of 320 x 240 in the open side of the room, each at every frame."""
+    """Returns a cameras.json of 3DGS: `views` of 320 x 240 pixels in the open side of the room, each in every frame."""
     cameras = []
     for view in range(views):
         x = -1.5 + 3 * (view + 0.5) / views
@@ -45,8 +46,8 @@ def cameras_json(views):
 
 
 def measured(command, **options):
-    """Runs a command; gives what it prints, and its seconds and peak."""
-    # This process must stay small: the ru_maxrss of a child begins at what its parent had when it forked.
+    """Runs a command. Returns its output, seconds and peak memory."""
+    # This process must stay small: the ru_maxrss of a child starts with the memory of its parent at the fork.
     start = time.monotonic()
     child = subprocess.Popen([str(part) for part in command], stdout=subprocess.PIPE, **options)
     output = child.stdout.read()
@@ -78,7 +79,7 @@ def memory(budget):
 
 
 def runs(args, gaussians, frames):
-    """Compresses one sequence under every budget; an entry of the table each."""
+    """Compresses one sequence under every memory limit. Yields one table entry for each."""
     packed = args.folder / f"{gaussians}x{frames}{'_raw' * args.raw}.gseq"
     cameras, output = args.folder / "cameras.json", args.folder / "compressed.gseq"
     cameras.write_text(cameras_json(args.views))
@@ -116,7 +117,7 @@ def row(run):
 
 
 def claims(runs):
-    """What must hold, each with whether it does."""
+    """Yields the requirements, each with whether it holds."""
     for run in runs:
         if run["budget"] != "none":
             name = f"{run['gaussians']} x {run['frames']} in {run['budget']}: peak {run['peak_bytes'] / MIB:.1f} MiB"
@@ -128,7 +129,8 @@ def claims(runs):
         under = f"({few['gaussians']} x {few['frames']}, --memory {few['budget']})"
         more = {key: many[key] / few[key] for key in ("gaussians", "frames", "peak_bytes", "seconds")}
         if (more["gaussians"], more["frames"]) == (1, 10):
-            # Less where the frames looked at of the short sequence lie so near each other that some are held.
+            # The factor is smaller if the used frames of the short sequence are so close that some of them are kept in
+            # memory.
             yield f"10 times the frames: peak x {more['peak_bytes']:.3f} {under}", more["peak_bytes"] <= 1.05
             yield f"10 times the frames: time x {more['seconds']:.2f} {under}", more["seconds"] <= 10.5
         if (more["gaussians"], more["frames"]) == (10, 1):
@@ -164,7 +166,7 @@ def main():
     parser.add_argument("--every", type=int, default=10, help="frames from one that is rendered to the next")
     parser.add_argument("--sh-degree", type=int, choices=range(4), default=3)
     parser.add_argument("--raw", action="store_true", help="store tiles raw")
-    parser.add_argument("--keep", action="store_true", help="leave the sequences in FOLDER, use those that are there")
+    parser.add_argument("--keep", action="store_true", help="keep the sequences in FOLDER, and reuse existing ones")
     parser.add_argument("--extra", nargs=argparse.REMAINDER, default=[], help="all that follows goes to compress")
     args = parser.parse_args()
 

@@ -1,14 +1,15 @@
 #!/usr/bin/env python3
-"""Measures what the parts of a run cost, one after the other, and says from it how long many nodes would take.
+"""Measures the cost of every shard of a run, one after the other, and estimates the time on many nodes.
 
     python3 scripts/scaling.py target/release/splatsieve MODEL --parts 1 2 7 --json room.json -- --no-refine
     python3 scripts/scaling.py --of large.json --gaussians 1000000 --frames 10000      # the same tables of what was measured
 
-MODEL is a folder with its cameras; behind -- stands what else `compress` takes. Every part is a process of its own on one
-thread. Of each: processor and wall seconds, bytes that it read and wrote by calls (mapped pages are none), peak memory.
-What a part costs that has nothing to do is measured by starting one again that is done. Prints three tables: stage by
-stage, the longest chain, and the estimate; `--check` makes it exit 1 where the parts of a stage take more than 1.15 of the
-same stage in one part though each works 5 s or more (`--parts` has to begin with 1). Needs nothing but Python.
+MODEL is a folder with its cameras; arguments after -- are further options of `compress`. Every shard runs as a separate
+process on one thread. Measured for each: processor and wall seconds, bytes read and written by system calls (mapped
+pages do not count), peak memory. The cost of a shard without work is measured by starting a finished one again. Prints
+three tables: the stages, the longest chain, and the estimate. `--check` exits 1 if the shards of a stage take more than
+1.15 times the same stage in one shard although each works 5 s or more (`--parts` must begin with 1). Needs only the
+standard library; Linux.
 """
 
 import plainly  # noqa: F401 (first: what fails after it ends with a sentence)
@@ -29,13 +30,13 @@ MB = 1e6
 
 
 def measured(command):
-    """What a run prints and what it cost."""
+    """Runs a command. Returns its output and its cost."""
     begun = time.monotonic()
     child = subprocess.Popen([str(word) for word in command], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    # Both are short: neither fills its pipe.
+    # Both outputs are short and do not fill a pipe.
     printed, complaints = child.stdout.read(), child.stderr.read()
     os.waitid(os.P_PID, child.pid, os.WEXITED | os.WNOWAIT)
-    # It has ended and nobody has asked after it: the system still has its accounts.
+    # The process has ended but is not yet reaped, so the system still has its I/O counters.
     io = dict(line.split(": ") for line in Path(f"/proc/{child.pid}/io").read_text().splitlines())
     _, status, usage = os.wait4(child.pid, 0)
     child.returncode = os.waitstatus_to_exitcode(status)
@@ -46,7 +47,9 @@ def measured(command):
 
 
 def units(command):
-    """Units of the stages that are divided: blocks of Gaussians, pictures; none where nobody knows before."""
+    """Returns the units of the divided stages (blocks of Gaussians, views); None if their number is not known in
+    advance.
+    """
     found = {}
     for line in measured([*command, "--list-stages"])[0].splitlines():
         name, what = line.split(": ", 1)
@@ -56,7 +59,9 @@ def units(command):
 
 
 def in_parts(command, of, work, program):
-    """Stage by stage the cost of every part of `of`, of one that has nothing to do, and bytes of pieces; and the rest."""
+    """Returns, by stage, the cost of all `of` shards and of one without work, the bytes of their cache entries; and the
+    rest of the run.
+    """
     command = [*command, "--cache", work]
     stages = []
     while True:
@@ -67,7 +72,7 @@ def in_parts(command, of, work, program):
                 break
             parts.append(cost)
             if index == 1 < of:
-                # Done already: it opens the input and what earlier stages found, and ends.
+                # The shard is done already: it opens the input and the results of earlier stages, and ends.
                 again = measured([*command, "--shard", f"1/{of}"])[1]
             name = said.split(":")[0]
         if not parts:
@@ -103,12 +108,12 @@ def machine():
 
 
 def family(name):
-    """rounds-03 is one of the rounds."""
+    """Returns the stage without its number: rounds-03 is one of the rounds."""
     return name.split("-")[0]
 
 
 def plain_seconds(found):
-    """Processor seconds of the stages of a run in one piece."""
+    """Returns the processor seconds of the stages of a run without shards."""
     seconds = {}
     for stage in found["plain"]["summary"]["stages"]:
         seconds[stage["name"]] = seconds.get(stage["name"], 0) + (stage["processor_seconds"] or 0)
@@ -116,15 +121,15 @@ def plain_seconds(found):
 
 
 def stage_table(found):
-    """A row for every stage and number of parts; and what is above its bound."""
+    """Yields a table row for every stage and number of shards."""
     yield (
-        "| stage | parts | processor s, all parts | of a plain run's | longest part, s | a part of nothing, s "
-        "| read, MB | written, MB | pieces, MB | peak, MiB |"
+        "| stage | shards | processor s, all shards | of one run | longest shard, s | shard without work, s "
+        "| read, MB | written, MB | cache entries, MB | peak, MiB |"
     )
     yield "|" + "---|" * 10
     plain = plain_seconds(found)
     for name in dict.fromkeys(family(stage["stage"]) for run in found["runs"] for stage in run["stages"]):
-        # Pairs are what merging looks at first.
+        # Merging begins with measuring pairs.
         whole = plain.get({"pairs": "merge", "targets": "refine"}.get(name, name), 0)
         for run in found["runs"]:
             stages = [stage for stage in run["stages"] if family(stage["stage"]) == name]
@@ -143,7 +148,7 @@ def stage_table(found):
 
 
 def over(found):
-    """Stages whose parts cost too much, each against the same stage in one part."""
+    """Yields the stages whose shards cost too much, each against the same stage in one shard."""
     whole = {stage["stage"]: stage["parts"][0]["processor"] for run in found["runs"] if run["of"] == 1 for stage in run["stages"]}
     for run in found["runs"]:
         for stage in run["stages"]:
@@ -153,7 +158,9 @@ def over(found):
 
 
 def split(found):
-    """Work and start of every stage, as sums of parts have them: the fewest parts, and what more of them add, each."""
+    """Yields work and start-up cost of every stage: work from the fewest shards, start-up cost from what each further
+    shard adds.
+    """
     few, many = found["runs"][0], found["runs"][-1]
     for one, cut in zip(few["stages"], many["stages"]):
         sums = [sum(part["processor"] for part in stage["parts"]) for stage in (one, cut)]
@@ -162,10 +169,10 @@ def split(found):
 
 
 def chain_table(found):
-    """Sum and longest chain of whole runs: what one node, and one node a part, would take."""
+    """Yields rows with sum and longest chain of whole runs: the time on one node, and on one node per shard."""
     yield (
-        "| parts | sum of all parts, s | the rest, s | together, of a plain run's | longest chain, s | of a plain run's "
-        "| chain by work / parts + start, s |"
+        "| shards | sum of all shards, s | rest, s | total, of one run | longest chain, s | of one run "
+        "| predicted chain: work / shards + start, s |"
     )
     yield "|" + "---|" * 7
     plain = found["plain"]["processor"]
@@ -178,16 +185,18 @@ def chain_table(found):
             f"| {run['of']} | {total:.1f} | {rest:.1f} | {(total + rest) / plain:.2f} | {longest + rest:.1f} "
             f"| {(longest + rest) / plain:.2f} | {told + rest:.1f} |"
         )
-    yield f"\nA plain run takes {plain:.1f} s of one processor."
+    yield f"\nA run without shards takes {plain:.1f} s of one processor."
 
 
 def estimate(found, args):
-    """Seconds on several nodes of a scene of another size, stage by stage: work + starts of parts + shared files.
+    """Yields rows with the seconds on several nodes for a scene of another size, by stage: work + start of shards +
+    shared files.
 
-    Work is that of the fewest parts, over nodes and their processors, of which no node has less than one unit. A start
-    is what the most parts cost above that, each, and a barrier. Every node reads the model, the whole of all stages
-    before, and the parts of the last one: at most, as nodes have caches. All of it grows with the Gaussians, and
-    the scan's work with the frames as well; looks and rounds see a number of pictures that grows with neither.
+    Work is that of the fewest shards, divided by nodes and their processors; no node has less than one unit. A start
+    costs what each further shard adds, and a barrier. Every node reads the model, all earlier stages, and the shards of
+    the last one; that is an upper bound, because nodes have caches. Everything grows with the number of Gaussians, and
+    the work of the scan also with frames; visible contribution and pruning rounds render a number of views that grows
+    with neither.
     """
     source = found["plain"]["summary"]["input"]
     more, longer = args.gaussians / source["gaussians"], args.frames / source["frames"]
@@ -205,7 +214,7 @@ def estimate(found, args):
         for nodes, sums in zip(args.nodes, costs[2]):
             sums[0] += work / min(nodes, units * (more if name == "scan" else 1))
             sums[1] += start * more + args.barrier * (nodes > 1)
-            # The parts that are joined are as large as the whole.
+            # The joined shards are as large as the result of one shard.
             sums[2] += nodes * (moved + more * cut["part_bytes"] / args.bandwidth)
     heads = [f"{nodes} node{'s' * (nodes > 1)}" for nodes in args.nodes]
     yield f"| stage | processor s | {' | '.join(heads)} |"
@@ -214,9 +223,9 @@ def estimate(found, args):
         cells = [f"{sum(cost):.0f} ({cost[0]:.0f} + {cost[1]:.0f} + {cost[2]:.0f})" for cost in costs]
         yield f"| {name}{f' ({count} times)' if count > 1 else ''} | {work:.0f} | {' | '.join(cells)} |"
     rest = many["rest"]["processor"] * more
-    yield f"| the rest, on one node | {rest:.0f} | {' | '.join([f'{rest / args.cores:.0f}'] * len(args.nodes))} |"
+    yield f"| rest, on one node | {rest:.0f} | {' | '.join([f'{rest / args.cores:.0f}'] * len(args.nodes))} |"
     together = [rest / args.cores + sum(sum(costs[2][k]) for costs in stages.values()) for k in range(len(args.nodes))]
-    yield f"| together, s | | {' | '.join(f'**{seconds:.0f}**' for seconds in together)} |"
+    yield f"| total, s | | {' | '.join(f'**{seconds:.0f}**' for seconds in together)} |"
 
 
 def main():
@@ -225,16 +234,16 @@ def main():
     parser.add_argument("model", nargs="?", type=os.path.abspath)
     parser.add_argument("--cameras", type=os.path.abspath)
     parser.add_argument("--parts", nargs="+", type=int, default=[1, 2, 7])
-    parser.add_argument("--json", type=Path, help="where to write all that was measured")
-    parser.add_argument("--of", type=Path, help="what was measured before, instead of a program and a model")
-    parser.add_argument("--scratch", help="folder for results and work folders while it lasts")
-    parser.add_argument("--check", action="store_true", help="exit 1 if parts cost more than they may")
+    parser.add_argument("--json", type=Path, help="file to which all measurements are written")
+    parser.add_argument("--of", type=Path, help="file with earlier measurements, in place of a program and a model")
+    parser.add_argument("--scratch", help="folder for temporary results and caches")
+    parser.add_argument("--check", action="store_true", help="exit 1 if shards cost more than 1.15 times one shard")
     parser.add_argument("--gaussians", type=float, default=1e6)
     parser.add_argument("--frames", type=float, default=1e4)
     parser.add_argument("--nodes", nargs="+", type=int, default=[1, 16, 256])
     parser.add_argument("--cores", type=int, default=16, help="processors of a node")
-    parser.add_argument("--barrier", type=float, default=10, help="seconds that a scheduler takes from one array to the next")
-    parser.add_argument("--bandwidth", type=float, default=2e9, help="bytes a second of the shared file system, for all nodes")
+    parser.add_argument("--barrier", type=float, default=10, help="seconds of the scheduler between two arrays")
+    parser.add_argument("--bandwidth", type=float, default=2e9, help="bytes per second of the shared file system, for all nodes together")
     words = sys.argv[1:]
     cut = words.index("--") if "--" in words else len(words)
     args = parser.parse_args(words[:cut])

@@ -1,10 +1,11 @@
 #!/usr/bin/env python3
-"""Makes README's picture: a model, a part of it pruned alone, and as many Gaussians refined, side by side.
+"""Makes the image of the README: a model, a fraction of it after pruning only, and as many Gaussians refined, side by
+side.
 
     python3 scripts/side_by_side.py target/release/splatsieve MODEL OUTPUT.png [--ratio 0.05] [--frame 30] [--view V]
 
-MODEL is a 4DGaussians model folder with its cameras inside; the picture is one that no step, ranking or cut looked at.
-Standard library only.
+MODEL is a 4DGaussians model folder with its cameras in it; the image shows a view that no optimization step, ranking or
+prune step used. Needs only the standard library.
 """
 
 import plainly  # noqa: F401 (first: what fails after it ends with a sentence)
@@ -21,7 +22,7 @@ from models_table import run
 
 
 def picture(binary, model, cameras, frame, view, path):
-    """Rows of RGB bytes of one picture."""
+    """Returns the RGB bytes of a render by row."""
     where = ["--cameras", cameras, "--frame", frame, "--view", view, "-o", path]
     subprocess.run([str(part) for part in [binary, "--quiet", "render", model, *where]], check=True)
     raw = path.read_bytes()
@@ -34,12 +35,12 @@ def picture(binary, model, cameras, frame, view, path):
 
 
 def png(rows):
-    """A PNG file of rows of RGB bytes."""
+    """Returns a PNG file with these rows of RGB bytes."""
 
     def chunk(kind, data):
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
-    # Each row as differences from the one above.
+    # Each row is stored as differences from the row above.
     above, lines = bytes(len(rows[0])), b""
     for row in rows:
         lines += b"\2" + bytes((a - b) & 255 for a, b in zip(row, above))

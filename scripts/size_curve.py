@@ -1,17 +1,18 @@
 #!/usr/bin/env python3
-"""Quality against bytes: archives at several ratios, beside what pruning alone leaves, packed, and beside peers.
+"""Prints quality against bytes: archives at several ratios, compared with packed results of pruning only and with other
+tools.
 
     cargo build --release
     python3 scripts/size_curve.py target/release/splatsieve DATA [MODEL ...] [--ratios 0.2,0.1,0.05] [--peer COMMAND] [--frames]
 
-DATA/<name>/ is a 4DGaussians model folder with its cameras inside; DATA/static/<name>.ply is a model without cameras, for
-which an orbit is made as refine_table.py does. Prints for each, by the part of the Gaussians that was kept, the mean PSNR
-of held-out pictures against the original's own, and bytes as a part of the original's files that a renderer opens: of the
-archive (.gsz, preset default); of what pruning alone leaves (--no-refine --prune-only --set field=exact), packed by
-`zstd -19` if that program is there, else by xz of Python's own library, which packs about as tightly; and of static models
-what COMMAND, a splat-transform of PlayCanvas, makes of as many (.sog and .spz, decimated by itself). With --frames instead
-the archive of the model's frames as PLY files, which say nothing of what they follow from, as a part of those. Standard
-library only.
+DATA/<name>/ is a 4DGaussians model folder with its cameras in it; DATA/static/<name>.ply is a model without cameras,
+for which an orbit is made as in refine_table.py. By ratio of kept Gaussians, the script prints the mean PSNR of test
+views against renders of the original, and bytes as a fraction of the files that a renderer opens: of the archive (.gsz,
+preset default); of the result of pruning only (--no-refine --prune-only --set field=exact), compressed by `zstd -19` if
+that program is installed, and otherwise by xz of the standard library, which compresses about as well; and of stills
+what COMMAND, a splat-transform of PlayCanvas, makes of as many Gaussians (.sog and .spz, decimated by that program).
+--frames measures the archive of the frames of the model as PLY files, without its deformation field, as a fraction of
+those files. Needs only the standard library.
 """
 
 import plainly  # noqa: F401 (first: what fails after it ends with a sentence)
@@ -28,7 +29,7 @@ from refine_table import orbit
 
 
 def files(model):
-    """What a renderer opens of a model."""
+    """Returns the files of a model that a renderer opens."""
     if model.is_file():
         return [model]
     clouds = sorted(model.glob("point_cloud/iteration_*"), key=lambda path: int(path.name.split("_")[1]))
@@ -40,14 +41,14 @@ def size(paths):
 
 
 def packed(path):
-    """Bytes of a file, packed."""
+    """Returns the bytes of a file after general compression."""
     if shutil.which("zstd"):
         return len(subprocess.run(["zstd", "-19", "-c", "-q", path], check=True, capture_output=True).stdout)
     return len(lzma.compress(path.read_bytes(), preset=6))
 
 
 def ours(binary, model, cameras, ratio, folder):
-    """Method, what to compare, bytes, and files of the original: of the archive, and of pruning alone."""
+    """Yields method, path to compare, bytes, and files of the original, for the archive and for pruning only."""
     archive, pruned = folder / "small.gsz", folder / f"pruned{model.suffix}"
     common = ["compress", model, "--cameras", cameras, "--ratio", ratio, "--json", "-o"]
     run(binary, *common, archive)
@@ -58,7 +59,7 @@ def ours(binary, model, cameras, ratio, folder):
 
 
 def of_frames(binary, model, cameras, ratio, folder):
-    """The same of the archive of a model's frames, whose files are the original."""
+    """Yields the same values for the archive of the frames of a model, whose files are the original."""
     packed, frames, archive = folder / "all.gseq", folder / "frames", folder / "frames.gsz"
     for words in [["convert", model, packed, "--cameras", cameras], ["convert", packed, frames, "--as", "ply-sequence"]]:
         subprocess.run([binary, *words], check=True, capture_output=True)
@@ -67,7 +68,7 @@ def of_frames(binary, model, cameras, ratio, folder):
 
 
 def peers(command, model, ratio, folder):
-    """The same of splat-transform."""
+    """Yields the same values for splat-transform."""
     for kind in ["sog", "spz"]:
         small, back = folder / f"peer.{kind}", folder / f"peer_{kind}.ply"
         decimated = [model, "--decimate", f"{100 * float(ratio):g}%", small]

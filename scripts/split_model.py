@@ -1,16 +1,17 @@
 #!/usr/bin/env python3
-"""Makes a large model of a small one: every Gaussian of a 4DGaussians model folder split in nine or more, seen at 1352x1014.
+"""Makes a large model from a small one: every Gaussian of a 4DGaussians model folder is split into nine or more, with
+views of 1352x1014.
 
     python3 scripts/split_model.py MODEL FOLDER [--side 3] [--frames 30] [--views 18] [--size 1352x1014]
     python3 scripts/split_model.py MODEL FOLDER --compare target/release/splatsieve   # README's figures of refining it
     python3 scripts/split_model.py MODEL FOLDER --row target/release/splatsieve [OPTION ...]   # a row of README's table
     python3 scripts/split_model.py MODEL FOLDER --row target/release/splatsieve --set look_pictures=0   # having looked at all
 
-They stand in a grid of SIDE x SIDE along a Gaussian's two longest axes (of nine a standard deviation apart, √⅓ as wide along
-these): mass and variance stay. FOLDER gets its views at every frame: the model's own, of which those of
-transforms_test.json are held out again, and some on the way between neighbours. `--compare` refines and prunes FOLDER down
-to a fifth in a gibibyte, and says how close the held-out pictures of both stay. `--row` prunes it down to 30% with the options
-behind it and prints what that took and how close 15 frames of the held-out views stay. Needs nothing but Python.
+The children of a Gaussian form a grid of SIDE x SIDE along its two longest axes (for nine: one standard deviation
+apart, √⅓ as wide along these axes), which preserves mass and variance. FOLDER gets the views of the model at every
+frame, with those of transforms_test.json as test views, and some views between neighboring ones. `--compare` refines
+and prunes FOLDER to 20% within one GiB and prints the quality of both on the test views. `--row` prunes it to 30% with
+the given options and prints the cost and the quality on 15 frames of the test views. Needs only the standard library.
 """
 
 import plainly  # noqa: F401 (first: what fails after it ends with a sentence)
@@ -24,12 +25,12 @@ from pathlib import Path
 
 from models_table import evaluated, peak, run
 
-# Distance of children and their width.
+# Distance of children in units of their width.
 APART = math.sqrt(3)
 
 
 def axes(w, x, y, z):
-    """Columns of the rotation of a quaternion of any length."""
+    """Returns the columns of the rotation of a quaternion of any length."""
     n = math.sqrt(w * w + x * x + y * y + z * z) or 1.0
     w, x, y, z = w / n, x / n, y / n, z / n
     return [
@@ -40,11 +41,11 @@ def axes(w, x, y, z):
 
 
 def split_cloud(source, target, side):
-    """Writes the PLY `target`: side x side rows for every one of `source`."""
+    """Writes the PLY `target` with side x side rows for every row of `source`."""
     grid = [k - (side - 1) / 2 for k in range(side)]
-    # Of a row of children: a variance of 1 is that of their places and their own.
+    # Width of a child: a variance of 1 is the sum of that of the positions and that of the child.
     width = 1 / math.sqrt(1 + APART**2 * (side**2 - 1) / 12)
-    # What all of them add up to in the middle, of what one has at its centre.
+    # Sum of all alphas in the middle, divided by the alpha at the center of one.
     overlap = sum(math.exp(-(APART**2) * (i * i + j * j) / 2) for i in grid for j in grid)
     header, body = source.read_bytes().split(b"end_header\n", 1)
     names = [line.split()[2] for line in header.decode().splitlines() if line.startswith("property")]

@@ -1,16 +1,17 @@
-"""Writes a frame stream (format/STREAM.md): what `splatsieve compress -` reads from standard input.
+"""Writes a frame stream (format/STREAM.md), the standard input of `splatsieve compress -`.
 
     with StreamWriter(sys.stdout.buffer, count, sh_degree, {"sh": features, ...}) as stream:
         for time, position, rotation in frames:
             stream.frame(time, {"position": position, "rotation": rotation})
 
-The writer is the Python package's (`python/splatsieve/_stream.py`), which says what columns are; needs numpy.
+The writer is that of the Python package (`python/splatsieve/_stream.py`), whose docstring describes the columns. Needs
+numpy.
 """
 
 import sys
 from pathlib import Path
 
-# Of the checkout, else of an installed package.
+# The module of the checkout, or else of an installed package.
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "python"))
 
 from splatsieve._stream import COLUMNS, StreamWriter  # noqa: E402

@@ -4,10 +4,13 @@
     cargo build --release
     python3 scripts/sweep_table.py target/release/splatsieve DATA CURVES
 
-DATA/<name>/ is a model folder with its cameras inside, DATA/static/<name>.ply a model without cameras, for which
-12 to score by and 4 to compare by are set around it, written to CURVES/<name>.json. Results go to CURVES/<name>/; a model whose CURVES/<name>/sweep.json is there already is not swept again. Below the
-tables stands where `default` is more than 0.05 dB below another method, and where `visible` is not above
-`projected`: it is expected to say "nowhere" twice. Standard library only.
+Example: python3 scripts/sweep_table.py target/release/splatsieve ../shared/data curves
+
+DATA/<name>/ is a model folder with its cameras in it; DATA/static/<name>.ply is a model without cameras, for which the
+script writes 12 training and 4 test cameras to CURVES/<name>.json. Results go to CURVES/<name>/; a model with a
+CURVES/<name>/sweep.json is not swept again. Below the tables the script names the points at which `default` is more
+than 0.05 dB below another method, and those at which `visible` is not above `projected`: both are expected to be
+"nowhere". Needs only the standard library.
 """
 
 import plainly  # noqa: F401 (first: what fails after it ends with a sentence)
@@ -22,7 +25,7 @@ FRACTIONS = ["0.8", "0.6", "0.4", "0.2", "0.1"]
 
 
 def positions(ply):
-    """Columns x, y, z of a binary PLY whose properties are all float and begin with these."""
+    """Returns the columns x, y, z of a binary PLY whose properties are all float and begin with these."""
     head, body = ply.read_bytes().split(b"end_header\n", 1)
     width = head.count(b"property float")
     values = array.array("f")
@@ -31,7 +34,7 @@ def positions(ply):
 
 
 def cameras_around(ply, path, count=16, pixels=300, field_of_view=60):
-    """Cameras on a Fibonacci sphere of two extents around the robust middle, every fourth held out."""
+    """Writes cameras on a Fibonacci sphere of two extents around the robust center; every fourth is a test camera."""
     axes = [sorted(axis) for axis in positions(ply)]
     ranges = [(axis[len(axis) // 100], axis[-1 - len(axis) // 100]) for axis in axes]
     middle = [(low + high) / 2 for low, high in ranges]

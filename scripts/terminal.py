@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
-"""Runs a command in a terminal of given sizes and says what is left on it, to look at bars as a person sees them.
+"""Runs a command in terminals of given sizes and reports what remains on the screen, to check progress bars.
 
     python3 scripts/terminal.py [--columns 80,100,120] [--show] COMMAND ...
 
-Every line that is drawn must fit, no line of a bar may stay behind, and no bar says that no time is left. --show prints the
-screen as it is half-way and at the end. Standard library only; Linux and macOS.
+Every drawn line must fit, no line of a bar may remain, and no bar may say that no time is left. --show prints the
+screen half-way and at the end. Needs only the standard library; Linux and macOS.
 """
 
 import argparse
@@ -18,12 +18,12 @@ import termios
 import unicodedata
 
 ROWS = 500
-# A bar's line, as opposed to what a run says.
+# Line of a progress bar, in contrast to other output of a run.
 BAR = re.compile(r"\d+%.* (pictures|states|steps|points|frames|settings|Gaussians)\b")
 
 
 class Screen:
-    """As much of a terminal as bars use: it wraps, goes up, and clears."""
+    """Model of the parts of a terminal that bars use: wrapping, moving up, clearing."""
 
     def __init__(self, columns):
         self.columns, self.row, self.column = columns, 0, 0
@@ -33,7 +33,7 @@ class Screen:
         if unicodedata.category(text) == "Cc":
             return
         if self.column >= self.columns:
-            # A line may be filled up with blanks to the last column.
+            # A line may be filled with blanks up to the last column.
             self.newline()
             self.column = 0
         line = self.lines[self.row].ljust(self.column)
@@ -77,7 +77,7 @@ class Screen:
 
 
 def run(command, columns):
-    """The screen at the end, the screens in between, and the exit code."""
+    """Runs a command. Returns the screen at the end, the screens before, and the exit code."""
     child, terminal = pty.fork()
     if child == 0:
         os.environ["TERM"] = "xterm"
@@ -95,7 +95,7 @@ def run(command, columns):
             break
         if not read:
             break
-        # What ends within a character or an escape waits for its rest.
+        # A piece of output that ends within a character or an escape sequence waits for the rest.
         rest += read
         text = rest.decode(errors="ignore")
         if re.search(r"\x1b(\[[0-9;?]*)?$", text):

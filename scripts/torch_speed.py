@@ -1,12 +1,13 @@
 #!/usr/bin/env python3
-"""Times how PyTorch evaluates the states of other families, as their own code does it: the rival of benches/families.rs.
+"""Measures how fast PyTorch evaluates the states of other model formats with their own code, for comparison with
+benches/families.rs.
 
     pip install torch
     python3 scripts/torch_speed.py [GAUSSIANS]           (100000 unless given)
 
-Prints microseconds of one processor per Gaussian and frame, the median of several runs; what else the machine does does not
-count. Weights and parameters are drawn at random: only
-their shapes matter. Networks are evaluated in blocks of 1024 as there, and of 16384, everything else all at once.
+Prints microseconds of one processor per Gaussian and frame, the median of several runs; other load on the machine does
+not count. Weights and parameters are random: only their shapes matter. Networks are evaluated in blocks of 1024
+Gaussians as in the benchmark, and of 16384; everything else at once.
 """
 
 import plainly  # noqa: F401 (first: what fails after it ends with a sentence)
@@ -23,7 +24,7 @@ SECONDS = 3.0
 
 
 def sines(x, octaves):
-    """`Embedder.embed`."""
+    """Encodes `x` like `Embedder.embed`."""
     parts = [x]
     for k in range(octaves):
         parts += [torch.sin(x * 2.0**k), torch.cos(x * 2.0**k)]
@@ -31,7 +32,7 @@ def sines(x, octaves):
 
 
 class Network(nn.Module):
-    """`DeformNetwork` of Deformable-3D-Gaussians with a time network, which SC-GS has of its nodes."""
+    """Network like `DeformNetwork` of Deformable-3D-Gaussians with a time network, which SC-GS uses for its nodes."""
 
     def __init__(self):
         super().__init__()
@@ -54,7 +55,7 @@ class Network(nn.Module):
 
 
 def microseconds(count, run):
-    """Median of `run`, which evaluates `count` Gaussians at a frame, by Gaussian."""
+    """Returns the median time per Gaussian of `run`, which evaluates `count` Gaussians at a frame."""
     run(0)
     taken, start = [], time.perf_counter()
     while time.perf_counter() - start < SECONDS or len(taken) < 3:
@@ -69,14 +70,16 @@ def networks():
     for block in (1024, 16384):
         x = torch.randn(block, 3)
         yield f"network, blocks of {block}", microseconds(block, lambda k: network(x, torch.full((block, 1), k / 60)))
-    # The same matrices alone.
+    # The same matrix products alone.
     inputs = [torch.randn(1024, layer.in_features) for layer in network.linear]
     weights = [layer.weight.T.contiguous() for layer in network.linear]
     yield "bare product, blocks of 1024", microseconds(1024, lambda _: [x @ w for x, w in zip(inputs, weights)])
 
 
 def nodes(count):
-    """`ControlNodeWarp.forward`: neighbours and their weights anew in every frame, as there, or once."""
+    """Measures `ControlNodeWarp.forward` with neighbors and weights computed in every frame, as in the original, or
+    once.
+    """
     network, x, rotation, scale = Network(), torch.randn(count, 3 + HYPER), torch.randn(count, 4), torch.randn(count, 3)
     mask, at, radius, weight = torch.rand(count, 1), torch.randn(NODES, 3 + HYPER), torch.rand(NODES), torch.randn(NODES)
 
@@ -98,7 +101,7 @@ def nodes(count):
 
 
 def polynomials(count):
-    """`train_ours_lite` up to the rasteriser."""
+    """Measures `train_ours_lite` up to the rasterizer."""
     x, motion, rotation, omega = (torch.randn(count, width) for width in (3, 9, 4, 4))
     scale, opacity, centre, width = torch.randn(count, 3), torch.randn(count, 1), torch.rand(count, 1), torch.randn(count, 1)
 
@@ -112,7 +115,9 @@ def polynomials(count):
 
 
 def slices(count):
-    """`get_current_covariance_and_mean_offset` and `get_marginal_t`, anew in every frame as there."""
+    """Measures `get_current_covariance_and_mean_offset` and `get_marginal_t`, computed in every frame as in the
+    original.
+    """
     x, scale, opacity, centre = torch.randn(count, 3), torch.randn(count, 4), torch.randn(count, 1), torch.rand(count, 1)
     left, right = torch.randn(count, 4), torch.randn(count, 4)
 

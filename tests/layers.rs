@@ -54,7 +54,7 @@ struct Module {
     passes_on: BTreeMap<String, Names>,
 }
 
-/// All modules of the library by path, without tests.
+/// Map of all modules of the library by path, without tests.
 struct Library(BTreeMap<Names, Module>);
 
 impl Library {

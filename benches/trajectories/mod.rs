@@ -1,4 +1,4 @@
-//! What the container's benches store: states of Gaussians over some frames, of the trained models and made up.
+//! Inputs of the container benchmarks: states of Gaussians over some frames, from trained models and generated.
 
 use std::path::Path;
 
@@ -12,23 +12,24 @@ use splatsieve::source::{FrameSource, Ids};
 mod models;
 
 const GAUSSIANS: usize = 4096;
-/// Those of one tile, at the sampling the models were trained with.
+/// Number of frames of one tile, at the sampling of the training.
 const FRAMES: usize = 32;
 const TIMES: usize = 60;
 
-/// Every scene by name: made-up curves, and the trained models where they are.
+/// Returns every scene by name: generated curves, and the trained models if they are available.
 pub(crate) fn scenes() -> Vec<(&'static str, HeldFrames)> {
     let models =
         models::found().into_iter().flat_map(|folder| models::NAMES.map(|name| (name, trained(&folder, name))));
     std::iter::once(("curves", curves())).chain(models).collect()
 }
 
-/// What the field of a trained model gives to Gaussians evenly spread over the cloud, columns that do not vary left out.
+/// Returns the states of a trained model for Gaussians evenly spread over the point cloud, without attributes that do
+/// not vary.
 fn trained(folder: &Path, name: &str) -> HeldFrames {
     let times = (0..TIMES).map(|t| t as f64 / TIMES as f64).collect();
     let model = ModelFolder::open(&folder.join(name), None).unwrap().with_times(times).unwrap();
     let info = model.info();
-    // Runs of 64 keep what neighbors in the file have in common.
+    // Runs of 64 Gaussians keep the similarity of neighbors in the file.
     let runs = GAUSSIANS / 64;
     let ids = (0..GAUSSIANS).map(|i| ((i / 64) * (info.count - 64) / runs + i % 64) as u32).collect::<Vec<_>>();
     let mut reader = model.open(Ids::List(&ids)).unwrap();
@@ -42,7 +43,7 @@ fn trained(folder: &Path, name: &str) -> HeldFrames {
     held
 }
 
-/// Smooth curves with 1e-4 of noise in every column but the harmonics.
+/// Returns smooth curves with 1e-4 of noise in every attribute except SH.
 fn curves() -> HeldFrames {
     let random = |k: usize| (hash_id(k as u64) >> 40) as f32 / (1 << 24) as f32;
     let varying = Attributes::all().difference(Attributes::SH);
@@ -60,7 +61,7 @@ fn curves() -> HeldFrames {
     held
 }
 
-/// The values of a column in tiles as the container has them: for each block of Gaussians `[frames][width][len]`.
+/// Returns the values of an attribute in the tiles of a container: for each block of Gaussians `[frames][width][len]`.
 pub(crate) fn tiles(scene: &HeldFrames, column: Attributes) -> Vec<Vec<f32>> {
     const BLOCK: usize = splatsieve::outputs::container::GAUSSIAN_BLOCK;
     let mut state = Gaussians::zeros(0, scene.info().sh_degree);

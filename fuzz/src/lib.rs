@@ -1,5 +1,5 @@
-//! What every fuzz target does: it hands bytes to the entry of its name, and then the same bytes with their checksums put
-//! right. A panic, a message with Rust's own text in it or too much memory ends the run.
+//! Code of every fuzz target: passes bytes to the entry of its name, and then the same bytes with repaired checksums. A
+//! panic, a message with Rust debug text or too much memory ends the run.
 
 #[path = "../../tests/corpus/entries.rs"]
 #[allow(dead_code, reason = "libFuzzer is told where the corpus lies")]
@@ -10,7 +10,7 @@ mod memory;
 use std::cell::OnceCell;
 use std::sync::Once;
 
-use entries::{ENTRIES, Place};
+use entries::{ENTRIES, InputFolder};
 
 #[doc(hidden)]
 pub use libfuzzer_sys::fuzz_target;
@@ -18,24 +18,24 @@ pub use libfuzzer_sys::fuzz_target;
 #[global_allocator]
 static ALLOCATOR: memory::Counting = memory::Counting;
 
-static ALONE: Once = Once::new();
+static ONE_THREAD: Once = Once::new();
 
 thread_local! {
-    static PLACE: OnceCell<Place> = const { OnceCell::new() };
+    static FOLDER: OnceCell<InputFolder> = const { OnceCell::new() };
 }
 
 /// Runs the entry `name` on `bytes`.
 ///
 /// # Panics
-/// Where the entry breaks a promise.
+/// Panics if `Entry::check` does.
 pub fn run(name: &str, bytes: &[u8]) {
     let entry = ENTRIES.iter().find(|entry| entry.name == name).expect("an entry of that name");
-    // Work that goes to a pool of threads stays on this one, or most of the time goes into waiting for another.
-    ALONE.call_once(|| drop(rayon::ThreadPoolBuilder::new().num_threads(1).use_current_thread().build_global()));
-    PLACE.with(|place| entry.check(bytes, place.get_or_init(Place::new)));
+    // Work for a thread pool stays on this thread; otherwise most of the time is spent waiting for another one.
+    ONE_THREAD.call_once(|| drop(rayon::ThreadPoolBuilder::new().num_threads(1).use_current_thread().build_global()));
+    FOLDER.with(|folder| entry.check(bytes, folder.get_or_init(InputFolder::new)));
 }
 
-/// The target of an entry.
+/// Defines the fuzz target of an entry.
 #[macro_export]
 macro_rules! target {
     ($name:literal) => {

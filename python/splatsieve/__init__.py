@@ -1,4 +1,4 @@
-"""Shrinks trained dynamic (4D) Gaussian-splatting models after training: the program `splatsieve` from Python.
+"""Compresses trained dynamic (4D) Gaussian-splatting models after training: the program `splatsieve` from Python.
 
     import splatsieve
 
@@ -6,7 +6,7 @@
     with splatsieve.stream("small.gseq", count=1000, sh_degree=0) as out: ...
     scene = splatsieve.read_gseq("small.gseq")
 
-Numpy is needed by `stream` and `read_gseq` only, which is why they import it late.
+Only `stream` and `read_gseq` need numpy; they import it when they are called.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ __all__ = [
 
 
 def read_gseq(path: str) -> Gseq:
-    """Opens a container (`.gseq`). Its tiles are read when they are asked for; checksums are not verified.
+    """Opens a container (`.gseq`). Its tiles are read on access; checksums are not verified.
 
-    Raises ValueError where the file is no complete container.
+    Raises ValueError if the file is not a complete container.
     """
     from ._gseq import Gseq
 
@@ -59,16 +59,17 @@ def stream(
     log: Log | None = None,
     **options: Option,
 ) -> Stream:
-    """Starts the program on a frame stream: a context manager to whose `frame` each frame is given.
+    """Starts the program on a frame stream. Returns a context manager whose method `frame` sends one frame.
 
-    `count` Gaussians with spherical harmonics of `sh_degree`; none: any number in each frame, all columns with it, and
-    the program finds which is which. `constant` has the columns that hold for every frame, by
-    name, the others come with every frame: position [N, 3]; rotation [N, 4], wxyz; log_scale [N, 3], natural logs;
-    opacity_logit [N] or [N, 1]; sh [N, (d+1)^2, 3]. Where the block ends the program goes on to the end of its work, and
-    `summary` of `compress` is there; where the block raises, the program is told that the stream broke off, and writes
-    nothing. `command` may be "convert". Options are those of `compress`.
+    `count` is the number of Gaussians, `sh_degree` the degree of their spherical harmonics. If `count` is None, frames
+    may have any number of Gaussians, every frame has all columns, and the program links the Gaussians of consecutive
+    frames. `constant` gives, by name, the columns that hold for every frame; the other columns come with every frame:
+    position [N, 3]; rotation [N, 4], wxyz; log_scale [N, 3], natural logs; opacity_logit [N] or [N, 1]; sh [N, (d+1)^2,
+    3]. At the end of the block the program finishes its work, and `summary` holds the summary of `compress`. If the
+    block raises, the program learns that the stream is incomplete and writes nothing. `command` may be "convert". Options are
+    those of `compress`.
 
-    Raises Error with the program's message, also from `frame` once the program has ended.
+    Raises Error with the program's message, also from `frame` after the program has ended.
     """
     from ._stream import Stream
 

@@ -1,7 +1,7 @@
 """Reads gseq containers (format/SPEC.md) in numpy.
 
-Every tile is found through the footer's index; one frame block of one column is in memory at a time. Checksums are not
-verified (that is `splatsieve verify`). Needs numpy and zstandard.
+Tiles are found through the index in the footer; one frame block of one column is in memory at a time. Checksums are not
+verified (`splatsieve verify` does that). Needs numpy and zstandard.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ RECORD = 64
 
 
 class Gseq:
-    """An open container: `count` Gaussians, `times` [T], and `widths`, the components of each column by its name."""
+    """Open container: `count` Gaussians, `times` [T], and `widths`, the number of components of each column by name."""
 
     def __init__(self, path: str) -> None:
         with open(path, "rb") as file:
@@ -37,7 +37,7 @@ class Gseq:
         for _ in range(columns):
             width, length = struct.unpack_from("<IH", self.bytes, at)
             self.widths[self.bytes[at + 6 : at + 6 + length].decode()] = width
-            # Version 2 goes on with the column's bound, which decoding does not need.
+            # Version 2 continues with the bound of the column, which decoding does not need.
             at += 6 + length + (8 if version == 2 else 0)
         (footer,) = struct.unpack_from("<Q", self.bytes, len(self.bytes) - 32)
         frames, _ = struct.unpack_from("<QQ", self.bytes, footer + 8)
@@ -47,7 +47,7 @@ class Gseq:
         self.kept: dict[str, tuple[int, list[Array]]] = {}
 
     def column(self, name: str, frame: int) -> Array:
-        """The column at a frame, [N, width]."""
+        """Returns a column at a frame, shape [N, width]."""
         block = frame // self.frame_block
         if self.kept.get(name, (None,))[0] != block:
             self.kept[name] = (block, [self.tile(name, i, block) for i in range(self.blocks)])
@@ -55,7 +55,7 @@ class Gseq:
         return np.concatenate(parts, 1).T if parts else np.empty((0, self.widths[name]), "<f4")
 
     def tile(self, name: str, gaussian_block: int, frame_block: int) -> Array:
-        """Values [frames stored, width, Gaussians]; a constant tile stores one frame."""
+        """Returns the values of a tile, shape [stored frames, width, Gaussians]; a constant tile stores one frame."""
         place = (frame_block * self.blocks + gaussian_block) * len(self.widths) + list(self.widths).index(name)
         record = self.index + RECORD * place
         encoding, order, constant = struct.unpack_from("<BBB", self.bytes, record + 16)
@@ -74,7 +74,7 @@ class Gseq:
 
 
 def unpredict(residuals: Array, order: int) -> Array:
-    """Residuals of the filter back to floats; all arithmetic is modulo 2^32."""
+    """Converts filter residuals back to floats; all arithmetic is modulo 2^32."""
     ranks = np.empty_like(residuals)
     for t, residual in enumerate(residuals):
         k = min(order, t)
@@ -88,7 +88,7 @@ def unpredict(residuals: Array, order: int) -> Array:
 
 
 def within_bound(stored: bytes, shape: tuple[int, int, int], order: int) -> Array:
-    """A bounded tile: multiples of a step, of tracks that move with residuals over time."""
+    """Decodes a bounded tile: multiples of a step, with residuals over time for the tracks that move."""
     step, exceptions, halvings = struct.unpack_from("<dII", stored)
     frames, tracks = shape[0], shape[1] * shape[2]
     most = -(-tracks // 8) + 4 * frames * tracks
@@ -112,11 +112,12 @@ def within_bound(stored: bytes, shape: tuple[int, int, int], order: int) -> Arra
 
 
 def unshuffle(planes: Array) -> Array:
-    """Numbers whose bytes of equal weight are gathered, lowest first."""
+    """Returns the numbers whose bytes are stored grouped by weight, lowest first."""
     return np.ascontiguousarray(planes.reshape(4, -1).T).view("<u4").reshape(-1)
 
 
 def unzigzag(codes: Array) -> Array:
+    """Converts zigzag codes to signed numbers."""
     return ((codes >> 1) ^ (-(codes & 1).astype(np.int32)).view(np.uint32)).view("<i4")
 
 

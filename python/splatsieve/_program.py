@@ -1,4 +1,4 @@
-"""Finds the program, turns keyword arguments into its options, and runs it."""
+"""Finds the program, converts keyword arguments to its options, and runs it."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any, Union
 
-# What an option may be: None leaves it out, a list or tuple is joined by commas, one of tuples repeats the option.
+# Value of an option. None leaves it out, a list or tuple is joined by commas, one of tuples repeats the option.
 Option = Union[None, bool, int, float, str, "os.PathLike[str]", Sequence[Any], Mapping[str, Any]]
-# Called with every line that the program says about its progress.
+# Function that is called with every progress line of the program.
 Log = Callable[[str], object]
 
-# Options that take no value at all; the others that are True or False take `=true` and `=false`.
+# Options that take no value; the other boolean options take `=true` and `=false`.
 SWITCHES = frozenset(
     "all check clean dry_run explain flip json list_stages merge_only no_refine overwrite prune_only quiet raw".split()
 )
 
 
 class Error(Exception):
-    """The program refused, or failed: its message; `code` is its exit code, 1 failed, 2 misused."""
+    """Message of the program after a failure. `code` is its exit code: 1 for a failure, 2 for wrong usage."""
 
     def __init__(self, message: str, code: int) -> None:
         super().__init__(message)
@@ -33,10 +33,10 @@ class Error(Exception):
 
 
 def program() -> str:
-    """The program that is run: the one installed with this module, else the one on PATH."""
+    """Returns the path of the program: the one installed with this module, or else the one on PATH."""
     name = "splatsieve" + (sysconfig.get_config_var("EXE") or "")
     folders = [sysconfig.get_path("scripts"), os.path.dirname(sys.executable)]
-    # `pip install --user`, and `--target`, whose programs lie beside the modules.
+    # `pip install --user` and `--target` put programs beside the modules.
     folders += [sysconfig.get_path("scripts", f"{os.name}_user"), str(Path(__file__).resolve().parents[1] / "bin")]
     for folder in folders:
         path = os.path.join(folder, name)
@@ -49,8 +49,9 @@ def program() -> str:
 
 
 def flags(options: Mapping[str, Option]) -> list[str]:
-    """Returns options as words of a command line: `dry_run=True` is `--dry-run`, `keep_box=(0, 1)` is `--keep-box=0,1`,
-    `set={"mu": 2}` is `--set=mu=2`."""
+    """Returns options in command-line form: `dry_run=True` is `--dry-run`, `keep_box=(0, 1)` is `--keep-box=0,1`,
+    `set={"mu": 2}` is `--set=mu=2`.
+    """
     words = []
     for key, value in options.items():
         flag = "--" + key.rstrip("_").replace("_", "-")
@@ -68,6 +69,7 @@ def flags(options: Mapping[str, Option]) -> list[str]:
 
 
 def text(value: Option) -> str:
+    """Returns the command-line text of an option value."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, Mapping):
@@ -79,8 +81,8 @@ def text(value: Option) -> str:
     return str(value)
 
 
-class Running:
-    """The program at work: what it says is taken from it as it comes, so that it never waits for us."""
+class RunningProgram:
+    """Running program. Threads read its output as it comes, so that the program never waits for a reader."""
 
     def __init__(self, words: Sequence[str], log: Log | None, stdin: int = subprocess.DEVNULL) -> None:
         quiet = [] if log else ["--quiet"]
@@ -93,32 +95,33 @@ class Running:
         self.said: list[str] = []
         self.printed: list[str] = []
         self.log = log
-        ears = ((self.process.stderr, self.hear), (self.process.stdout, self.printed.append))
-        self.ears = [threading.Thread(target=self.listen, args=ear, daemon=True) for ear in ears]
-        for ear in self.ears:
-            ear.start()
+        readers = ((self.process.stderr, self.add_message), (self.process.stdout, self.printed.append))
+        self.readers = [threading.Thread(target=self.read_lines, args=reader, daemon=True) for reader in readers]
+        for reader in self.readers:
+            reader.start()
 
     @staticmethod
-    def listen(pipe: IO[bytes], take: Callable[[str], object]) -> None:
+    def read_lines(pipe: IO[bytes], take: Callable[[str], object]) -> None:
         for line in pipe:
             take(line.decode("utf-8", "replace"))
 
-    def hear(self, line: str) -> None:
+    def add_message(self, line: str) -> None:
         self.said.append(line)
         if self.log:
             self.log(line.rstrip("\n"))
 
     def finish(self) -> str:
-        """Waits for its end; gives what it printed. Raises Error with what it said where it failed."""
+        """Waits for the end of the program and returns its standard output. Raises Error with its message if it failed.
+        """
         try:
             code = self.process.wait()
         except BaseException:
-            # It takes away what it has begun.
+            # The program removes its unfinished files when it is terminated.
             self.process.terminate()
             self.process.wait()
             raise
-        for ear in self.ears:
-            ear.join()
+        for reader in self.readers:
+            reader.join()
         for pipe in (self.process.stdout, self.process.stderr):
             if pipe:
                 pipe.close()
@@ -128,7 +131,7 @@ class Running:
 
 
 def message(said: str) -> str:
-    """The program's own message, which is the last thing it says, behind its name; or the parser's, behind `error:`."""
+    """Returns the program's own message (the last one, after its name), or the argument parser's after `error:`."""
     for name in ("splatsieve: ", "error: "):
         at = said.rfind("\n" + name)
         if at >= 0 or said.startswith(name):
@@ -137,21 +140,22 @@ def message(said: str) -> str:
 
 
 def run(verb: str, *arguments: str | os.PathLike[str], log: Log | None = None, **options: Option) -> str:
-    """Runs any command of the program with any of its options; gives what it printed to standard output.
+    """Runs a command of the program with any of its options. Returns its standard output.
 
         splatsieve.run("convert", "frames/", "scene.gseq", max_error={"position": 1e-3})
 
-    `log` is called with every line about its progress. Raises Error.
+    `log` is called with every progress line. Raises Error.
     """
     words = [verb, *flags(options), "--", *(os.fspath(path) for path in arguments)]
-    return Running(words, log).finish()
+    return RunningProgram(words, log).finish()
 
 
 def parsed(printed: str) -> dict[str, Any]:
+    """Returns the JSON object in `printed`. Raises Error if it is something else."""
     try:
         found = json.loads(printed)
     except ValueError:
-        # `--shard` and the like print a line instead.
+        # Some options, such as `--shard`, print a line in place of JSON.
         raise Error(f"no table came back (use splatsieve.run): {printed.strip()}", 0) from None
     return dict(found)
 
@@ -159,8 +163,8 @@ def parsed(printed: str) -> dict[str, Any]:
 def compress(
     input: str | os.PathLike[str], output: str | os.PathLike[str], *, log: Log | None = None, **options: Option
 ) -> dict[str, Any]:
-    """Writes a smaller model of `input` to `output`; gives its summary (format/SUMMARY.md),
-    which lies beside it as JSON with the list of its files.
+    """Writes a smaller model of `input` to `output`. Returns its summary (format/SUMMARY.md),
+    which is also written beside the output as JSON, with the list of its files.
 
         splatsieve.compress("model", "small", cameras="data", ratio=0.3, preset="default")
 
@@ -172,12 +176,12 @@ def compress(
 def evaluate(
     original: str | os.PathLike[str], compressed: str | os.PathLike[str], *, log: Log | None = None, **options: Option
 ) -> dict[str, Any]:
-    """Compares the pictures of two models; gives what `splatsieve evaluate --json` prints. Raises Error."""
+    """Compares the renders of two models. Returns the JSON of `splatsieve evaluate --json`. Raises Error."""
     return parsed(run("evaluate", original, compressed, json=True, log=log, **options))
 
 
 def info(
     input: str | os.PathLike[str], *, log: Log | None = None, **options: Option
 ) -> dict[str, Any]:
-    """Says what an input holds, as `splatsieve info --json` does. Raises Error."""
+    """Returns the description of an input, the JSON of `splatsieve info --json`. Raises Error."""
     return parsed(run("info", input, json=True, log=log, **options))

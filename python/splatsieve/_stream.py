@@ -1,8 +1,9 @@
-"""Writes frame streams (format/STREAM.md), to anything or to the program itself.
+"""Writes frame streams (format/STREAM.md) to a file or to the program.
 
-Columns are arrays [N, ...], in stored encoding: position [N, 3]; rotation [N, 4], wxyz; log_scale [N, 3], natural
-logs; opacity_logit [N] or [N, 1]; sh [N, (d+1)^2, 3]. Those that hold for every frame are given once, the others with
-every frame. Frames of any number of Gaussians, which nothing numbers, have no `count` and all columns. Needs numpy.
+Columns are arrays [N, ...] in stored encoding: position [N, 3]; rotation [N, 4], wxyz; log_scale [N, 3], natural logs;
+opacity_logit [N] or [N, 1]; sh [N, (d+1)^2, 3]. Columns that hold for every frame are given once, the others with every
+frame. Frames without Gaussian ids, which may have any number of Gaussians, have no `count` and all columns. Needs
+numpy.
 """
 
 from __future__ import annotations
@@ -45,13 +46,13 @@ class StreamWriter:
         out.writelines(planes(constant[name]) for name in COLUMNS if name in constant)
 
     def frame(self, time: float, columns: Mapping[str, ArrayLike]) -> None:
-        """Writes the columns that vary as they are at `time`, which is later than the frame's before."""
+        """Writes the varying columns at `time`, which must be later than the time of the previous frame."""
         payload = b"".join(planes(columns[name]) for name in self.varying)
         self.out.write(struct.pack("<4sIdQ", b"FRAM", self.frames, time, len(payload)) + payload)
         self.frames += 1
 
     def end(self) -> None:
-        """Writes the end mark, without which the reader knows that an exporter has failed."""
+        """Writes the end mark. A stream without an end mark tells the reader that the exporter failed."""
         self.out.write(struct.pack("<4sI16x", b"DONE", self.frames))
 
     def __enter__(self) -> StreamWriter:
@@ -66,13 +67,14 @@ class StreamWriter:
 
 
 def planes(column: ArrayLike) -> bytes:
+    """Returns the column as planes, one per component."""
     return np.ascontiguousarray(np.moveaxis(np.asarray(column), 0, -1), "<f4").tobytes()
 
 
 class Stream:
-    """What `splatsieve.stream` gives: the program, with a frame stream going in."""
+    """Result of `splatsieve.stream`: the running program with a frame stream as its input."""
 
-    # What `compress` wrote into its summary; None before the block has ended, and of other commands.
+    # Summary of `compress`; None before the block has ended, and for other commands.
     summary: dict[str, Any] | None = None
 
     def __init__(
@@ -103,14 +105,14 @@ class Stream:
         return self
 
     def frame(self, time: float, columns: Mapping[str, ArrayLike]) -> None:
-        """Hands over the columns that vary as they are at `time`, which is later than the frame's before."""
+        """Sends the varying columns at `time`, which must be later than the time of the previous frame."""
         try:
             self.writer.frame(time, columns)
         except BrokenPipeError:
             self.refused()
 
     def refused(self) -> None:
-        """The program reads no more: says why."""
+        """Raises Error with the program's message after the program has stopped reading."""
         self.close()
         self.running.finish()
         raise Error("splatsieve ended before the stream did", 0)
@@ -125,7 +127,7 @@ class Stream:
         self, kind: type[BaseException] | None, failure: BaseException | None, traceback: TracebackType | None
     ) -> None:
         if kind is not None:
-            # Without the end mark: it ends with an error of its own, which says less than what was raised.
+            # No end mark is written: the program ends with an error that says less than the exception raised here.
             self.close()
             if not issubclass(kind, Exception):
                 self.running.process.terminate()

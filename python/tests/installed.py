@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
-"""Builds the wheel, installs it into an environment of its own, and tries what the README promises there.
+"""Builds the wheel, installs it into a new environment, and tests what the README of the package describes.
 
     python3 python/tests/installed.py [WHEEL]
 
-Needs maturin, numpy and zstandard; a WHEEL given is not built. Nothing is downloaded: numpy and zstandard are those of
-the Python that runs this.
+Needs maturin, numpy and zstandard. If WHEEL is given, that file is tested and nothing is built. Nothing is downloaded:
+numpy and zstandard come from the Python that runs this script.
 """
 
 import os
@@ -28,7 +28,7 @@ def wheel(folder):
 
 
 def main():
-    """Runs this file again with the Python of an environment that has the wheel."""
+    """Runs this file again with the Python of an environment that contains the wheel."""
     with tempfile.TemporaryDirectory() as folder:
         built = Path(sys.argv[1]) if len(sys.argv) > 1 else wheel(folder)
         environment = Path(folder) / "environment"
@@ -42,7 +42,7 @@ def main():
 
 
 class Installed(unittest.TestCase):
-    """The module and the program of the wheel, in an empty folder."""
+    """Tests of the module and the program of the wheel, in an empty folder."""
 
     @classmethod
     def setUpClass(cls):
@@ -60,7 +60,7 @@ class Installed(unittest.TestCase):
         self.assertTrue((own / "splatsieve" / "py.typed").is_file())
         self.assertEqual(Path(splatsieve.program()).parent, Path(sysconfig.get_path("scripts")))
 
-    def test_compress_gives_the_summary_that_lies_beside_the_result(self):
+    def test_compress_returns_the_summary_beside_the_result(self):
         lines = []
         summary = splatsieve.compress(
             self.at / "demo" / "scene.gseq", self.at / "half.gseq", ratio=0.5, set={"refine_steps": 2}, log=lines.append
@@ -76,7 +76,7 @@ class Installed(unittest.TestCase):
         splatsieve.run("compress", self.at / "demo" / "scene.gseq", output=self.at / "no.gseq", dry_run=True)
         self.assertFalse((self.at / "no.gseq").exists())
 
-    def test_a_refusal_raises_with_the_message_of_the_program(self):
+    def test_a_refusal_raises_the_message_of_the_program(self):
         with self.assertRaisesRegex(splatsieve.Error, "no_such_model") as refused:
             splatsieve.compress(self.at / "no_such_model", self.at / "x.gseq")
         self.assertEqual(refused.exception.code, 1)
@@ -95,7 +95,7 @@ class Installed(unittest.TestCase):
             "sh": dice.normal(size=(count, 1, 3)).astype("<f4"),
         }
 
-    def test_frames_streamed_into_a_container_are_read_back_to_the_bit(self):
+    def test_streamed_frames_are_read_back_to_the_bit(self):
         columns = self.columns(300)
         position = columns.pop("position")
         with splatsieve.stream(self.at / "s.gseq", 300, 0, columns, command="convert") as out:
@@ -107,7 +107,7 @@ class Installed(unittest.TestCase):
             self.assertTrue(np.array_equal(scene.column("position", frame), position + np.float32(frame)))
         self.assertTrue(np.array_equal(scene.column("sh", 3), columns["sh"].reshape(300, 3)))
 
-    def test_a_stream_is_compressed_and_its_summary_given(self):
+    def test_a_compressed_stream_has_a_summary(self):
         columns = self.columns(200)
         with splatsieve.stream(self.at / "c.gseq", 200, 0, columns, target_count=50, no_refine=True) as out:
             out.frame(0.0, {})
@@ -115,32 +115,32 @@ class Installed(unittest.TestCase):
         self.assertEqual(splatsieve.info(self.at / "c.gseq")["gaussians"], 50)
         self.assertEqual(out.summary["gaussians"], 50)
 
-    def test_an_exporter_that_fails_leaves_no_file_and_its_own_error(self):
+    def test_a_failing_exporter_leaves_no_file(self):
         with self.assertRaisesRegex(ZeroDivisionError, "exporter"):
             with splatsieve.stream(self.at / "f.gseq", 200, 0, self.columns(200), command="convert") as out:
                 out.frame(0.0, {})
                 raise ZeroDivisionError("exporter")
         self.assertFalse((self.at / "f.gseq").exists())
 
-    def test_what_the_program_refuses_of_a_stream_is_raised(self):
+    def test_a_refused_stream_raises_the_message(self):
         with self.assertRaisesRegex(splatsieve.Error, "frame 1.*above 1"):
             with splatsieve.stream(self.at / "t.gseq", 200, 0, self.columns(200), command="convert") as out:
                 out.frame(1.0, {})
                 for _ in range(1000):
                     out.frame(0.5, {})
 
-    def test_options_without_values_are_those_of_the_program(self):
+    def test_switches_match_the_help_of_the_program(self):
         def help(*words):
             return subprocess.run([splatsieve.program(), *words, "--help"], check=True, capture_output=True, text=True).stdout
 
         verbs = re.findall(r"^  (\w+) ", help().partition("Commands:")[2].partition("Options:")[0], re.M)
         self.assertIn("compress", verbs)
         options = "".join(help(verb) for verb in verbs if verb != "help")
-        # What follows a name is its value, or after two blanks what it is for.
+        # A name is followed by its value, or after two blanks by its description.
         found = set(re.findall(r"^ {2,6}(?:-\w, )?--([\w-]+)(?:$| {2,}\S)", options, re.M))
         self.assertEqual({name.replace("-", "_") for name in found} - {"help", "version"}, set(_program.SWITCHES))
 
-    def test_options_become_words_of_the_command_line(self):
+    def test_options_become_command_line_words(self):
         words = _program.flags({"as_": "ply", "overwrite": False, "dry_run": True, "choose_by_views": False, "cameras": None})
         self.assertEqual(words, ["--as=ply", "--dry-run", "--set choose_by_views=false"])
         words = _program.flags({"keep_box": (-1, 0, 1.5), "max_error": {"position": 1e-3}, "merge_pass": [(1, 2), (3, 4)]})

@@ -1,17 +1,17 @@
 #!/usr/bin/env python3
-"""Prints, or submits, the Slurm jobs that compress one long scene: an array for every stage that can be divided, each
-when the one before is done, and a job for the rest.
+"""Prints or submits the Slurm jobs that compress one long scene: a job array for every stage that can be divided, each
+after the previous one, and a job for the rest.
 
     scripts/slurm/long_scene.py --parts 8 --cache CACHE -- MODEL --cameras DATA -o SMALL            # prints the commands
     scripts/slurm/long_scene.py --parts 8 --cache CACHE --submit --partition=short --time=1:00:00 --cpus-per-task=4 \\
         --mem=8G -- MODEL --cameras DATA -o SMALL --ratio 0.3
 
-Options that it does not know are handed to every sbatch; behind -- stands what `splatsieve compress` takes. Paths are as
-from the folder it is called in, which must be the same folder, with the same files, on all nodes. A task that is
-preempted, or loses its node, starts again and loses at most the part in work; the same command a second time takes up
-what is in WORK. How many stages there will be (rounds above all) is known only at most: an array for a stage that does
-not come to pass takes the next one that does, or finds nothing to do. `--arrays` submits fewer; the last job does what
-they have left.
+Options that the script does not know are passed to every sbatch; arguments after -- are those of `splatsieve compress`.
+Paths are relative to the current folder, which must be the same folder with the same files on all nodes. A task that is
+preempted or loses its node starts again and loses at most its current shard; the same command a second time resumes
+from WORK. Only an upper bound of the number of stages is known in advance (mainly of pruning rounds): an array for a
+stage that does not take place works on the next one, or finds nothing to do. `--arrays` submits fewer arrays; the last
+job does the rest.
 """
 
 import argparse
@@ -27,7 +27,7 @@ OPTIONS = ["--parsable", "--requeue", "--signal=B:TERM@60", "--open-mode=append"
 
 
 def found(program):
-    """The program by a path that holds in every folder."""
+    """Returns the absolute path of the program."""
     path = shutil.which(program)
     if path is None:
         sys.exit(f"no program {program} (--program names another)")
@@ -39,7 +39,7 @@ def quoted(words):
 
 
 def stages(compress):
-    """Stages that --shard divides."""
+    """Returns the stages that --shard divides."""
     listed = subprocess.run([*compress, "--list-stages"], stdout=subprocess.PIPE, text=True, check=False)
     if listed.returncode != 0:
         sys.exit(listed.returncode)
@@ -47,11 +47,11 @@ def stages(compress):
 
 
 def lines(args, sbatch, compress):
-    """A script that submits it all and prints the number of the last job."""
+    """Yields a script that submits all jobs and prints the number of the last one."""
     common = ["sbatch", *OPTIONS, f"--chdir={os.getcwd()}", *sbatch]
     names = stages(compress)[: args.arrays]
     compress = [*compress, "--cache", args.cache]
-    # What the job has, unless its user says otherwise.
+    # Resources of the job, unless the user gives other values.
     for option, value in (("--threads", "@THREADS@"), ("--memory", "@MEMORY@")):
         if not any(word.split("=")[0] == option for word in compress):
             compress.append(f"{option}={value}")
@@ -70,12 +70,12 @@ def lines(args, sbatch, compress):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False)
-    parser.add_argument("--parts", type=int, required=True, help="tasks of every array")
-    parser.add_argument("--cache", required=True, help="cache folder, on a file system that all nodes share")
+    parser.add_argument("--parts", type=int, required=True, help="number of tasks of every array")
+    parser.add_argument("--cache", required=True, help="cache folder on a file system that all nodes share")
     parser.add_argument("--submit", action="store_true", help="submit the jobs; print the number of the last one")
-    parser.add_argument("--arrays", type=int, help="at most so many arrays before the last job [default: one a stage]")
-    parser.add_argument("--name", default="splatsieve", help="first word of the jobs' names [default: splatsieve]")
-    parser.add_argument("--logs", help="folder of their logs [default: WORK.logs]")
+    parser.add_argument("--arrays", type=int, help="maximum number of arrays before the last job [default: one per stage]")
+    parser.add_argument("--name", default="splatsieve", help="prefix of the job names [default: splatsieve]")
+    parser.add_argument("--logs", help="folder of the logs [default: WORK.logs]")
     parser.add_argument("--program", default="splatsieve", help="splatsieve [default: the one on the PATH]")
     words = sys.argv[1:]
     cut = words.index("--") if "--" in words else len(words)

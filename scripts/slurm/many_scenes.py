@@ -1,17 +1,17 @@
 #!/usr/bin/env python3
-"""Prints, or submits, the Slurm jobs that compress many scenes: an array with a task for each, and a job that writes
-summary.csv and summary.html when all have ended, and fails if a scene has.
+"""Prints or submits the Slurm jobs that compress many scenes: a job array with one task per scene, and a job that
+writes summary.csv and summary.html when all have ended, and fails if a scene has failed.
 
     scripts/slurm/many_scenes.py LIST                                   # prints the commands
     scripts/slurm/many_scenes.py LIST --submit --at-once 20 --partition=short --time=4:00:00 --cpus-per-task=8 --mem=16G
 
-LIST has a line per scene: INPUT CAMERAS OUTPUT [OPTION ...], CAMERAS being - where there are none to name. Words are cut
-and quoted as in a shell ("my scene", my\\ scene), but nothing is expanded. Blank lines and those that begin with # are
-skipped. Relative paths are as from the list's folder, which all nodes must share.
+LIST has one line per scene: INPUT CAMERAS OUTPUT [OPTION ...]; CAMERAS is - if there are none to name. Words are split
+and quoted as in a shell ("my scene", my\\ scene), but nothing is expanded. Blank lines and lines that begin with # are
+skipped. Relative paths are relative to the folder of the list, which all nodes must share.
 
-All that is known of the scenes lies in a folder (LIST.run): scenes.json, a work folder of each while it is not done,
-logs, summary.csv, summary.html. The same command a second time does what is not done; a task that is preempted, or loses
-its node, goes on from what stages have kept. Options that it does not know are handed to every sbatch.
+The state of all scenes is in a folder (LIST.run): scenes.json, a cache folder of each unfinished scene, logs,
+summary.csv, summary.html. The same command a second time does what is not done; a task that is preempted or loses its
+node resumes from its cache. Options that the script does not know are passed to every sbatch.
 
     scripts/slurm/many_scenes.py LIST.run --task 3      # what the third task does: for another engine, or by hand
     scripts/slurm/many_scenes.py LIST.run --summary     # what the last job does
@@ -59,7 +59,7 @@ pre {{ background: #8882; padding: .7em; white-space: pre-wrap; overflow-wrap: a
 
 
 def scenes(path):
-    """Words of every scene of a list, checked."""
+    """Returns the checked words of every scene of a list."""
     outputs, listed = {}, []
     for number, line in enumerate(path.read_text().splitlines(), 1):
         if not line.strip() or line.lstrip().startswith("#"):
@@ -74,7 +74,7 @@ def scenes(path):
         if output in outputs:
             sys.exit(f"{path}, lines {outputs[output]} and {number}: both write {output}")
         outputs[output] = number
-        # By its words, so that a list that has grown knows what is done.
+        # Named by its words, so that a list that has grown still finds what is done.
         digest = hashlib.sha256("\0".join(words).encode()).hexdigest()[:8]
         listed.append({"name": f"{Path(output).name}-{digest}", "words": words})
     if not listed:
@@ -83,7 +83,7 @@ def scenes(path):
 
 
 def submission(args, sbatch):
-    """A script that submits it all and prints the number of the last job."""
+    """Yields a script that submits all jobs and prints the number of the last one."""
     path = Path(os.path.abspath(args.list))
     folder = Path(os.path.abspath(args.folder or f"{path}.run"))
     run = {"folder": str(path.parent), "program": found(args.program), "keep_work": args.keep_work, "scenes": scenes(path)}
@@ -98,12 +98,12 @@ def submission(args, sbatch):
     last = [*common, f"--job-name={args.name}-summary", f"--output={folder}/logs/%x.%j.log"]
     yield "set -euo pipefail"
     yield f"scenes=$({quoted(task)})"
-    # --parsable prints JOB or JOB;CLUSTER. Failed scenes are for the summary to tell.
+    # --parsable prints JOB or JOB;CLUSTER. The summary reports failed scenes.
     yield f'{quoted(last)} "--dependency=afterany:${{scenes%%;*}}" {quoted([TASK, script, folder, "--summary"])}'
 
 
 def write(path, value):
-    """JSON that is there whole or not at all."""
+    """Writes JSON so that the file appears whole or not at all."""
     begun = path.with_name(f"{path.name}.{os.uname().nodename}.{os.getpid()}")
     begun.write_text(json.dumps(value, indent=1) + "\n")
     begun.replace(path)
@@ -114,14 +114,14 @@ def read(path):
 
 
 def compress(folder, run, scene):
-    """The command of a scene."""
+    """Returns the command of a scene."""
     source, cameras, output, *options = scene["words"]
     cameras = [] if cameras == "-" else ["--cameras", cameras]
     return [run["program"], "compress", source, *cameras, "-o", output, *options, "--cache", str(folder / "work" / scene["name"])]
 
 
 def task(folder, number, threads, memory):
-    """Compresses a scene; gives the status to end with."""
+    """Compresses a scene. Returns the exit status."""
     run = read(folder / "scenes.json")
     if not 1 <= number <= len(run["scenes"]):
         sys.exit(f"{folder} has scenes 1 to {len(run['scenes'])}, and no {number}")
@@ -132,7 +132,7 @@ def task(folder, number, threads, memory):
     if record.get("state") == "done" and output.exists():
         print(f"{scene['name']} is done already", file=sys.stderr)
         return 0
-    # A result that was there before the first start is somebody's; one that appeared later is this task's.
+    # A result from before the first start belongs to someone else; one that appeared later belongs to this task.
     ours = record.get("ours", not output.exists())
     record = {"state": "running", "ours": ours, "starts": record.get("starts", 0) + 1, "seconds": record.get("seconds", 0)}
     write(record_path, record)
@@ -175,7 +175,7 @@ def task(folder, number, threads, memory):
 
 
 def quality(summary):
-    """How close the pictures are to the original's, where the run has looked at that; in words."""
+    """Returns in words how close the renders are to those of the original, if the run measured that."""
     goal, archive, bands, field = (summary.get(key) or {} for key in ("goal", "archive", "bands", "field"))
     if goal:
         what = {"max_loss": "lost against the photographs"}.get(goal["name"], "to the original")
@@ -186,8 +186,8 @@ def quality(summary):
     return ""
 
 
-def summarise(folder):
-    """Writes the summary of all scenes; gives whether all are done."""
+def write_summary(folder):
+    """Writes the summary of all scenes. Returns whether all are done."""
     run = read(folder / "scenes.json")
     rows = []
     for scene in run["scenes"]:
@@ -225,13 +225,14 @@ def summarise(folder):
 
 
 def without_formula(value):
-    """`value` so that no spreadsheet runs it: texts that begin as formulas do get an apostrophe in front."""
+    """Returns `value` so that no spreadsheet evaluates it: texts that begin like formulas get an apostrophe in front.
+    """
     is_formula = isinstance(value, str) and value.lstrip(" ").startswith(tuple("=+-@\t\r\n＝＋－＠"))
     return f"'{value}" if is_formula else value
 
 
 def page(title, rows, failed):
-    """The summary to look at."""
+    """Returns the summary as an HTML page."""
     def escaped(value, form="{}"):
         return "–" if value in (None, "") else html.escape(form.format(value))
 
@@ -253,23 +254,23 @@ def page(title, rows, failed):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False)
-    parser.add_argument("list", help="list of scenes; with --task and --summary the folder that was made of it")
+    parser.add_argument("list", help="list of scenes; with --task and --summary the folder made from it")
     parser.add_argument("--submit", action="store_true", help="submit the jobs; print the number of the last one")
-    parser.add_argument("--at-once", type=int, help="at most so many scenes at a time")
-    parser.add_argument("--folder", help="folder of work, logs and summary [default: LIST.run]")
-    parser.add_argument("--keep-work", action="store_true", help="keep the work folder of a scene that is done")
+    parser.add_argument("--at-once", type=int, help="maximum number of scenes at a time")
+    parser.add_argument("--folder", help="folder of caches, logs and summary [default: LIST.run]")
+    parser.add_argument("--keep-work", action="store_true", help="keep the cache of a finished scene")
     parser.add_argument("--name", default="splatsieve", help="name of the array [default: splatsieve]")
     parser.add_argument("--program", default="splatsieve", help="splatsieve [default: the one on the PATH]")
-    parser.add_argument("--task", type=int, metavar="N", help="compress the Nth scene of a folder, here and now")
+    parser.add_argument("--task", type=int, metavar="N", help="compress scene N of a folder now, in this process")
     parser.add_argument("--threads", help="of --task")
     parser.add_argument("--memory", help="of --task")
-    parser.add_argument("--summary", action="store_true", help="write the summary of a folder; ends with 1 if a scene failed")
+    parser.add_argument("--summary", action="store_true", help="write the summary of a folder; exits with 1 if a scene failed")
     args, sbatch = parser.parse_known_args()
     if args.task is not None or args.summary:
         if sbatch:
             parser.error(f"unknown: {' '.join(sbatch)}")
         folder = Path(os.path.abspath(args.list))
-        sys.exit(not summarise(folder) if args.summary else task(folder, args.task, args.threads, args.memory))
+        sys.exit(not write_summary(folder) if args.summary else task(folder, args.task, args.threads, args.memory))
     script = "\n".join(submission(args, sbatch)) + "\n"
     if not args.submit:
         print(script, end="")

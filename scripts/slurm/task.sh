@@ -1,19 +1,19 @@
 #!/usr/bin/env bash
-# A job or a task of an array: runs a command, hands SIGTERM on to it, and puts itself back into the queue when the
-# command ends with 143, as splatsieve does when it is told to end.
+# Job, or task of a job array: runs a command, passes SIGTERM on to it, and requeues itself if the command exits with 143,
+# as splatsieve does after SIGTERM.
 #
 #     sbatch --requeue --signal=B:TERM@60 --array=1-8 task.sh splatsieve compress ... --shard @TASK@/8 --threads=@THREADS@
 #
-# Of the command's words these are replaced; a word of which nobody knows the value is left out:
+# These placeholders in words of the command are replaced; a word whose value is unknown is left out:
 #     @TASK@     number of the task
 #     @THREADS@  processors of the job
-#     @MEMORY@   nine tenths of its memory; the rest is for what the system counts to a job besides, as pages of files
-#     @AGAIN@    --overwrite, where the job has been started before: it may have ended between its result and its last
-#                word. A result that was there before its first start has refused that one.
-# No word is split or expanded otherwise, so paths may hold spaces.
+#     @MEMORY@   90% of its memory; the rest is for other memory that the system counts for a job, such as file pages
+#     @AGAIN@    --overwrite if the job has been started before: it may have ended after writing its result and before
+#                its exit. If the result existed before the first start, that start was refused.
+# Words are not split or expanded otherwise, so paths may contain spaces.
 set -uo pipefail
 
-# So often a job puts itself back. One that its own time limit cuts short every time would do so for ever.
+# Maximum number of requeues. A job that its time limit ends every time would otherwise requeue itself forever.
 most=${SPLATSIEVE_RESTARTS:-100}
 restarts=${SLURM_RESTART_COUNT:-0}
 
@@ -39,7 +39,7 @@ trap 'told=1; [[ -z $child ]] || kill -TERM "$child" 2>/dev/null' TERM
 "${words[@]}" &
 child=$!
 [[ -z $told ]] || kill -TERM "$child" 2>/dev/null
-# A trap ends a wait before the child has ended.
+# `wait` returns early when a trap runs, so wait again until the child has ended.
 while :; do
     told=''
     wait "$child"
@@ -51,8 +51,8 @@ done
 job=${SLURM_ARRAY_JOB_ID:+${SLURM_ARRAY_JOB_ID}_$SLURM_ARRAY_TASK_ID}
 job=${job:-${SLURM_JOB_ID:-}}
 [[ -n $job ]] || exit 143
-# scancel, or a preemption that has put the job back already, tells it to end too. That stays as it is.
-# By the array's number and the task's: one of the tasks has the array's own number, which stands for all of them.
+# scancel also sends SIGTERM, and so does a preemption that has requeued the job already; neither needs a requeue.
+# The job is named by array number and task number, because the number of the array alone means all its tasks.
 state=$(squeue --noheader --states=all --jobs="$job" --format=%T)
 [[ $state == RUNNING ]] || exit 143
 if ((restarts >= most)); then
@@ -60,7 +60,7 @@ if ((restarts >= most)); then
     exit 1
 fi
 echo "told to end; back into the queue" >&2
-# Putting it back ends this script as well.
+# A requeue ends this script as well.
 trap '' TERM
 scontrol requeue "$job" && sleep 60
 exit 143

@@ -141,7 +141,7 @@ fn misuse_exits_with_2() {
 }
 
 #[test]
-fn recipe_files_with_unknown_or_impossible_parameters_are_refused() {
+fn recipes_with_unknown_or_impossible_values_are_refused() {
     let workplace = Workplace::new();
     for (text, part) in [
         ("[score]\nnu = 1.0\n", "nu"),

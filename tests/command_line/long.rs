@@ -104,7 +104,7 @@ fn check_file_and_stream(sequence: LongSequence, budget: u64) {
 }
 
 #[test]
-fn memory_for_many_frames_is_that_for_few() {
+fn hundred_thousand_frames_fit_40_mib() {
     check_file_and_stream(LongSequence { gaussians: 10, frames: 100_000 }, 40);
 }
 
@@ -115,14 +115,14 @@ fn million_gaussians_in_two_frames_fit() {
 
 /// Case 42 of EXTREMES: many frames.
 #[test]
-#[ignore = "slow: minutes unless optimised"]
+#[ignore = "slow: minutes unless optimized"]
 fn slow_a_million_frames_of_ten_gaussians_fit_64_mib() {
     check_file_and_stream(LongSequence { gaussians: 10, frames: 1_000_000 }, 64);
 }
 
 /// Case 42 of EXTREMES: many Gaussians.
 #[test]
-#[ignore = "slow: minutes unless optimised"]
+#[ignore = "slow: minutes unless optimized"]
 fn slow_ten_million_gaussians_in_two_frames_fit() {
     check_file_and_stream(LongSequence { gaussians: 10_000_000, frames: 2 }, 7000);
 }

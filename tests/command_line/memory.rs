@@ -121,20 +121,14 @@ fn named_minimum_memory_works_and_changes_no_byte() {
             std::fs::create_dir_all(workplace.path(name)).unwrap();
         }
         workplace.done(&format!("{} --memory 8GiB", request("free")));
-        let minimum_memory = minimum_memory(&workplace, &request("tight"));
-        workplace.done(&format!("{} --memory {minimum_memory}MiB", request("tight")));
+        let least = minimum_memory(&workplace, &request("tight"));
+        workplace.done(&format!("{} --memory {least}MiB", request("tight")));
         let [free, tight] = ["free", "tight"].map(|name| workplace.path(name));
         if let Some(peak_memory) = peak_memory(&tight.join("small.gseq")) {
-            assert!(
-                peak_memory <= minimum_memory,
-                "{input} {rest}: {peak_memory} MiB resident, {minimum_memory} promised"
-            );
-            assert!(
-                minimum_memory < 63 || rest != "--no-refine",
-                "{input} {rest}: {minimum_memory} MiB would hold the scene"
-            );
+            assert!(peak_memory <= least, "{input} {rest}: {peak_memory} MiB resident, {least} promised");
+            assert!(least < 63 || rest != "--no-refine", "{input} {rest}: {least} MiB would hold the scene");
         }
-        assert!(lasting_files(&free) == lasting_files(&tight), "{input} {rest}: other bytes at {minimum_memory} MiB");
+        assert!(lasting_files(&free) == lasting_files(&tight), "{input} {rest}: other bytes at {least} MiB");
     }
 }
 
@@ -154,15 +148,15 @@ fn every_command_that_reads_frames_keeps_its_memory_limit() {
         "convert packed.gseq within.gseq --max-error position=0.1%,rotation=1e-2,log_scale=1e-2,sh=1e-2".to_owned(),
         "convert packed.gseq plys --as ply-sequence".to_owned(),
     ] {
-        let minimum_memory = minimum_memory(&workplace, &arguments);
-        let run = workplace.run(&format!("{arguments} --memory {minimum_memory}MiB --explain"));
+        let least = minimum_memory(&workplace, &arguments);
+        let run = workplace.run(&format!("{arguments} --memory {least}MiB --explain"));
         assert_eq!(run.code, 0, "{}", run.stderr);
         for part in ["memory: at most", "N x", "full reads of the input"] {
             assert!(run.stderr.contains(part), "{arguments}: {part:?} is not in {:?}", run.stderr);
         }
         if let Some(taken) = crate::scene::taken(&run.stderr) {
-            println!("{arguments}: {taken} of {minimum_memory} MiB");
-            assert!(taken <= minimum_memory as f64, "{arguments}: {taken} MiB resident, {minimum_memory} promised");
+            println!("{arguments}: {taken} of {least} MiB");
+            assert!(taken <= least as f64, "{arguments}: {taken} MiB resident, {least} promised");
         }
     }
 }
@@ -186,8 +180,8 @@ fn plan_is_printed_before_refusal_and_bad_sizes_fail() {
 fn next_run_cleans_up_after_a_killed_run() {
     let workplace = scene_workplace();
     let request = "--cameras cameras.json --split all --set frame_stride=24 --ratio 0.5 -o small.gseq";
-    let minimum_memory = minimum_memory(&workplace, &format!("compress packed.gseq {request}"));
-    let arguments = format!("compress packed.gseq {request} --memory {minimum_memory}MiB");
+    let least = minimum_memory(&workplace, &format!("compress packed.gseq {request}"));
+    let arguments = format!("compress packed.gseq {request} --memory {least}MiB");
     let start = Instant::now();
     workplace.done(&arguments);
     let whole = start.elapsed();

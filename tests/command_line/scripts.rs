@@ -305,7 +305,7 @@ fn scale_script_reports_cost_of_every_size() {
 /// The bar of a sweep is drawn above the bars of its runs. No bar is longer than the terminal or remains at the end.
 #[test]
 #[ignore = "needs Python"]
-fn bars_fit_terminals_of_60_to_120_columns_and_leave_nothing_behind() {
+fn bars_fit_the_terminal_and_leave_no_line_behind() {
     let workplace = Workplace::new();
     workplace.done("demo --gaussians 2000 --frames 16 -o demo --no-refine");
     let program = assert_cmd::cargo::cargo_bin("splatsieve");

@@ -43,14 +43,14 @@ fn write_faint_above(workplace: &Workplace, degree: usize) -> PathBuf {
     model
 }
 
-const UNREFINED: &str = "model --cameras {tiny} --no-refine --prune-only --set field=exact --overwrite";
+const QUICKLY: &str = "model --cameras {tiny} --no-refine --prune-only --set field=exact --overwrite";
 
 #[test]
 fn invisible_sh_coefficients_and_their_degree_go() {
     for degree in [0, 1, 2] {
         let workplace = Workplace::new();
         let model = write_faint_above(&workplace, degree);
-        let summary = workplace.summary(&format!("{UNREFINED} --ratio 0.5 --set bands_margin=90 -o small"));
+        let summary = workplace.summary(&format!("{QUICKLY} --ratio 0.5 --set bands_margin=90 -o small"));
         let bands = &summary["bands"];
         assert_eq!((&bands["sh_degree"], reason_left_out(&summary)), (&Value::from(degree), None), "{bands}");
         let of_degree = |tried: &Value| tried[0] == degree && tried[1].as_f64() >= bands["least"].as_f64();
@@ -85,7 +85,7 @@ fn invisible_sh_coefficients_and_their_degree_go() {
 fn visible_sh_coefficients_stay_and_are_reported() {
     let workplace = Workplace::new();
     let model = write_faint_above(&workplace, 3);
-    let summary = workplace.summary(&format!("{UNREFINED} --ratio 0.5 --set bands_margin=90 -o small"));
+    let summary = workplace.summary(&format!("{QUICKLY} --ratio 0.5 --set bands_margin=90 -o small"));
     let why = reason_left_out(&summary).unwrap();
     assert!(why.contains("dB at degree 2") && why.contains("at least 60.0 dB against all degrees required"), "{why}");
     assert_eq!(summary["bands"]["sh_degree"], 3);
@@ -95,21 +95,21 @@ fn visible_sh_coefficients_stay_and_are_reported() {
     assert_eq!(after, before);
 
     // Without the request nothing is searched and nothing reported.
-    let all = workplace.summary(&format!("{UNREFINED} --ratio 0.5 --set bands=all -o small"));
+    let all = workplace.summary(&format!("{QUICKLY} --ratio 0.5 --set bands=all -o small"));
     assert!(all["bands"].is_null() && reason_left_out(&all).is_none());
 }
 
 #[test]
 fn sh_coefficients_stay_with_an_sh_head_or_at_degree_0() {
     let workplace = Workplace::new();
-    let quickly = UNREFINED.replacen("model", "{tiny}", 1);
+    let quickly = QUICKLY.replacen("model", "{tiny}", 1);
     let summary = workplace.summary(&format!("{quickly} --ratio 0.5 --set bands_margin=0 -o small"));
     assert!(reason_left_out(&summary).unwrap().contains("SH head") && summary["bands"].is_null());
     assert_eq!(PlyRows::read(&point_cloud(&workplace.path("small"))).names.len(), 62);
 
     write_faint_above(&workplace, 0);
-    workplace.done(&format!("compress {UNREFINED} -o plain"));
-    let again = UNREFINED.replacen("model", "plain", 1);
+    workplace.done(&format!("compress {QUICKLY} -o plain"));
+    let again = QUICKLY.replacen("model", "plain", 1);
     let summary = workplace.summary(&format!("{again} --ratio 0.5 -o small"));
     assert!(reason_left_out(&summary).unwrap().contains("degree 0") && summary["bands"].is_null());
 }
@@ -158,7 +158,7 @@ fn lower_degree_passes_the_loader_check_and_a_wrong_one_fails() {
     let workplace = Workplace::new();
     let model = write_faint_above(&workplace, 1);
     let small = workplace.path("small");
-    workplace.done(&format!("compress {UNREFINED} --ratio 0.4 -o small"));
+    workplace.done(&format!("compress {QUICKLY} --ratio 0.4 -o small"));
     let (accepted, text) = check_model_folder(&model, &small);
     assert!(accepted && text.contains("SH degree 1 of 3") && text.contains("can open it"), "{text}");
 
@@ -272,6 +272,6 @@ fn target_size_picks_the_best_sh_degree() {
     let said = |note: &&Value| note.as_str().unwrap().contains("SH degree 0 gives the best quality");
     assert_eq!(chosen["notes"].as_array().unwrap().iter().filter(said).count(), 1, "{}", chosen["notes"]);
     assert!(chosen["bands"].is_null() && chosen["output_bytes"].as_u64().unwrap() <= 85_000);
-    let of = |summary: &Value| summary["gaussians"].as_u64().unwrap();
-    assert!(of(&chosen) > 2 * of(&all), "{} at degree 0, {} at degree 3", of(&chosen), of(&all));
+    let count = |summary: &Value| summary["gaussians"].as_u64().unwrap();
+    assert!(count(&chosen) > 2 * count(&all), "{} at degree 0, {} at degree 3", count(&chosen), count(&all));
 }

@@ -66,7 +66,7 @@ fn assert_kept_are_untouched(workplace: &Workplace, model: &Path, preset: &str, 
 }
 
 #[test]
-fn kept_gaussians_of_the_tiny_model_are_untouched_at_every_frame() {
+fn kept_gaussians_of_the_tiny_model_are_untouched() {
     let workplace = Workplace::new();
     for preset in ["paper", "default"] {
         assert_kept_are_untouched(&workplace, &tiny(), preset, &(0..10).collect::<Vec<_>>());
@@ -126,7 +126,7 @@ fn targets_out_of_reach_are_refused() {
 }
 
 #[test]
-fn only_options_leave_out_a_stage() {
+fn prune_only_and_merge_only_leave_out_a_stage() {
     let workplace = Workplace::new();
     let pruned = workplace.summary("{tiny} -o pruned --preset paper --prune-only");
     assert_eq!(pruned["gaussians"], 240, "stage 1 keeps 80% of 300");

@@ -14,8 +14,7 @@ fn with_demo() -> Workplace {
 }
 
 /// Arguments for a short refinement.
-const SHORT_REFINEMENT: &str =
-    "demo/scene.gseq --cameras demo/cameras.json --set refine_steps=120 --set refine_cut_steps=20";
+const QUICKLY: &str = "demo/scene.gseq --cameras demo/cameras.json --set refine_steps=120 --set refine_cut_steps=20";
 
 /// Returns the bytes of all files below the output folder, or of the output file and the files beside it that begin
 /// with its name.
@@ -28,7 +27,7 @@ fn bytes_written(workplace: &Workplace, output: &str) -> u64 {
 fn psnr_search_is_reported_on_separate_views() {
     let workplace = with_demo();
     let found = [32.0, 38.0].map(|least| {
-        let summary = workplace.summary(&format!("{SHORT_REFINEMENT} --min-psnr {least}dB --overwrite -o small.gseq"));
+        let summary = workplace.summary(&format!("{QUICKLY} --min-psnr {least}dB --overwrite -o small.gseq"));
         let goal = &summary["goal"];
         let number = |name: &str| goal[name].as_f64().unwrap();
         assert_eq!((goal["name"].as_str(), number("asked")), (Some("min_psnr"), least));
@@ -50,12 +49,12 @@ fn psnr_search_is_reported_on_separate_views() {
 #[test]
 fn unreachable_psnr_keeps_all_and_no_refine_holds() {
     let workplace = with_demo();
-    let summary = workplace.summary(&format!("{SHORT_REFINEMENT} --no-refine --min-psnr 99 --overwrite -o small.gseq"));
+    let summary = workplace.summary(&format!("{QUICKLY} --no-refine --min-psnr 99 --overwrite -o small.gseq"));
     assert!(summary["goal"]["searched"].as_f64().unwrap() >= 99.0, "{summary}");
     let stages: Vec<&str> =
         summary["stages"].as_array().unwrap().iter().map(|stage| stage["name"].as_str().unwrap()).collect();
     assert!(stages.contains(&"search") && !stages.contains(&"refine"), "{stages:?}");
-    let other = workplace.summary(&format!("{SHORT_REFINEMENT} --no-refine --min-psnr 30 --overwrite -o small.gseq"));
+    let other = workplace.summary(&format!("{QUICKLY} --no-refine --min-psnr 30 --overwrite -o small.gseq"));
     assert!(other["gaussians"].as_u64() < summary["gaussians"].as_u64());
 }
 
@@ -64,8 +63,7 @@ fn unreachable_psnr_keeps_all_and_no_refine_holds() {
 fn max_loss_compares_with_photographs() {
     let workplace = with_demo();
     workplace.done("render demo/scene.gseq --cameras demo/cameras.json --all --split all -o photographs");
-    let summary =
-        workplace.summary(&format!("{SHORT_REFINEMENT} --max-loss 60dB --ground-truth photographs -o small.gseq"));
+    let summary = workplace.summary(&format!("{QUICKLY} --max-loss 60dB --ground-truth photographs -o small.gseq"));
     let goal = &summary["goal"];
     // Photographs that are renders of the original reach 59 dB with their 8 bits.
     assert_eq!(goal["name"], "max_loss");
@@ -76,7 +74,7 @@ fn max_loss_compares_with_photographs() {
         "{goal}"
     );
     let tighter = workplace.summary(&format!(
-        "{SHORT_REFINEMENT} --no-refine --max-loss 22dB --ground-truth photographs --overwrite -o small.gseq"
+        "{QUICKLY} --no-refine --max-loss 22dB --ground-truth photographs --overwrite -o small.gseq"
     ));
     assert!(tighter["gaussians"].as_u64() > summary["gaussians"].as_u64(), "{}", tighter["goal"]);
     assert!(tighter["goal"]["searched"].as_f64().unwrap() <= 22.0, "{}", tighter["goal"]);
@@ -88,7 +86,7 @@ fn output_size_is_just_below_the_target() {
     let workplace = with_demo();
     let model = "{tiny} --cameras {tiny} --set refine_steps=40 --set refine_cut_steps=10";
     for (how, output, most) in
-        [(SHORT_REFINEMENT, "small.gseq", 90_000u64), (SHORT_REFINEMENT, "frames", 400_000), (model, "model", 110_000)]
+        [(QUICKLY, "small.gseq", 90_000u64), (QUICKLY, "frames", 400_000), (model, "model", 110_000)]
     {
         let kind = if output == "frames" { "--as ply-sequence" } else { "" };
         let summary = workplace.summary(&format!("{how} --size {most}B {kind} -o {output}"));
@@ -96,7 +94,7 @@ fn output_size_is_just_below_the_target() {
         assert!(written <= most && written > most * 9 / 10 - 24_576, "{output}: {written} of {most}, {summary}");
         assert!(summary["gaussians"].as_u64().unwrap() > 30, "{summary}");
     }
-    workplace.refused(2, &format!("compress {SHORT_REFINEMENT} --size 20KB -o none.gseq"), &["one Gaussian", "20000"]);
+    workplace.refused(2, &format!("compress {QUICKLY} --size 20KB -o none.gseq"), &["one Gaussian", "20000"]);
 }
 
 #[test]
@@ -121,7 +119,6 @@ fn contradictory_targets_are_refused() {
 #[ignore = "needs time"]
 fn target_size_above_the_input_only_drops_named_ids() {
     let workplace = with_demo();
-    let summary =
-        workplace.summary(&format!("{SHORT_REFINEMENT} --no-refine --size 10MB --drop-ids 5-14 -o small.gseq"));
+    let summary = workplace.summary(&format!("{QUICKLY} --no-refine --size 10MB --drop-ids 5-14 -o small.gseq"));
     assert_eq!(summary["gaussians"], 790);
 }

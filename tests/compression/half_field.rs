@@ -22,25 +22,25 @@ fn reason_left_out(summary: &Value) -> Option<String> {
     left.iter().find(is_half_precision).map(|left| left["why"].as_str().unwrap().to_owned())
 }
 
-const UNREFINED: &str = "{tiny} --cameras {tiny} --no-refine --prune-only --overwrite";
+const QUICKLY: &str = "{tiny} --cameras {tiny} --no-refine --prune-only --overwrite";
 
 #[test]
 fn half_precision_is_used_only_within_its_bound() {
     let workplace = Workplace::new();
     let own = field_file(&tiny());
-    let exact = workplace.summary(&format!("{UNREFINED} -o exact --set field=exact"));
+    let exact = workplace.summary(&format!("{QUICKLY} -o exact --set field=exact"));
     assert_eq!(fs::read(field_file(&workplace.path("exact"))).unwrap(), fs::read(&own).unwrap());
     assert!(exact["field"].is_null() && reason_left_out(&exact).is_none());
 
     // A margin of 0 dB accepts any rounding error that is smaller than the error of pruning.
-    let half = workplace.summary(&format!("{UNREFINED} -o half --ratio 0.3 --set field_margin=0"));
+    let half = workplace.summary(&format!("{QUICKLY} -o half --ratio 0.3 --set field_margin=0"));
     let found = &half["field"];
     assert_eq!((&found["half"], reason_left_out(&half)), (&Value::Bool(true), None));
     assert!(found["rounding"].as_f64().unwrap() >= found["least"].as_f64().unwrap(), "{found}");
     assert!(len(&field_file(&workplace.path("half"))) < len(&own) * 9 / 10);
 
     // No render reaches 100 dB: after nearly lossless pruning a margin of 90 dB refuses the rounding.
-    let refused = workplace.summary(&format!("{UNREFINED} -o refused --ratio 0.3 --set field_margin=90"));
+    let refused = workplace.summary(&format!("{QUICKLY} -o refused --ratio 0.3 --set field_margin=90"));
     match refused["field"]["half"].as_bool().unwrap() {
         // A rounding PSNR of 60 dB is always accepted.
         true => assert!(refused["field"]["rounding"].as_f64().unwrap() >= 60.0, "{}", refused["field"]),
@@ -91,7 +91,7 @@ fn target_size_counts_the_field_as_written() {
 #[ignore = "needs Python"]
 fn original_loader_opens_a_half_precision_field() {
     let workplace = Workplace::new();
-    workplace.done(&format!("compress {UNREFINED} --ratio 0.4 --set field_margin=0 -o small"));
+    workplace.done(&format!("compress {QUICKLY} --ratio 0.4 --set field_margin=0 -o small"));
     let (accepted, text) = check_model_folder(&tiny(), &workplace.path("small"));
     assert!(accepted && text.contains("tensors in half precision") && text.contains("can open it"), "{text}");
 }

@@ -16,7 +16,7 @@ use splatsieve::scene::{InputOptions, Scene, open_scene};
 /// Change to the merging parameters that tightens one test.
 type Tighten = fn(&mut MergeParams);
 
-/// All frames of a model in memory.
+/// Model with all its frames in memory.
 struct AllFrames {
     frames: Vec<Gaussians>,
     alive: Vec<Vec<bool>>,
@@ -300,8 +300,7 @@ fn assert_solved_at_leaders(
         let merged = merge_state(&members, at_reference, leader as u32, merge, Attributes::all());
         assert_is_mixture(&merged, &members, at_reference, leader, merge);
         let length = at_reference.rotation.row::<4>(leader).iter().map(|x| f64::from(x * x)).sum::<f64>().sqrt();
-        // (property, merged state, state of the leader, raw value of the leader); then the state of the result is
-        // compared.
+        // (property, merged state, state of the leader, state of the proxy in the result)
         let mut columns: Vec<(String, f64, f32, f32)> = Vec::new();
         let found = &frames[all_frames.reference];
         for c in 0..3 {

@@ -426,7 +426,7 @@ fn every_command_accepts_models_of_control_nodes() {
 /// A network evaluated for every Gaussian takes half an hour without optimization; run this test by name, with
 /// `SPLATSIEVE_PROGRAM`.
 #[test]
-#[ignore = "slow: half an hour unless optimised"]
+#[ignore = "slow: half an hour unless optimized"]
 fn slow_every_command_accepts_deep_networks() {
     check_every_command(&[
         ("deformable3d", "deform2", "Deformable-3D-Gaussians", 4000.0),

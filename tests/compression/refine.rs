@@ -54,7 +54,7 @@ fn still_without_cameras_is_refined_by_virtual_ones() {
 
 #[test]
 #[ignore = "needs time"]
-fn ssim_weight_raises_ssim_and_lowers_psnr() {
+fn ssim_weight_raises_ssim_and_costs_at_most_1_db() {
     let workplace = Workplace::new();
     workplace.done("demo --gaussians 1500 --frames 6 -o demo");
     let found = ["0", "0.5"].map(|part| {

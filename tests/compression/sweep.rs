@@ -63,7 +63,7 @@ fn every_method_has_points_at_the_asked_counts() {
 }
 
 #[test]
-fn point_equals_compress_and_evaluate() {
+fn sweep_points_equal_compress_and_evaluate() {
     let workplace = Workplace::new();
     let swept = json(&workplace.done(
         "sweep {tiny} --cameras {tiny} -o curves --methods default,no-refine,paper-prune --fractions 0.4 --max-frames 3 --json",

@@ -1,6 +1,6 @@
-//! What people hand in, damaged in every way: it is read, or refused in plain words, within a stated memory, and nothing
-//! panics. The saved inputs (`make.py`) and the findings of the fuzz targets (`fuzz`), each also cut short and with bytes
-//! changed, the same every time.
+//! Damaged inputs of every format are read or refused in plain words, within a stated memory, and never cause a panic.
+//! The inputs are those of `make.py` and findings of the fuzz targets (`fuzz`), as they are, cut short, and with
+//! changed bytes; they are the same in every run.
 
 mod entries;
 mod memory;
@@ -10,22 +10,22 @@ use std::panic::{self, AssertUnwindSafe};
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 
-use entries::{ENTRIES, Entry, Place};
+use entries::{ENTRIES, Entry, InputFolder};
 use splatsieve::model::hash_id;
 
 #[global_allocator]
 static ALLOCATOR: memory::Counting = memory::Counting;
 
-/// One test at a time: memory is counted for the whole process.
+/// Lock for one test at a time, because memory is counted for the whole process.
 static COUNTED: Mutex<()> = Mutex::new(());
 
-/// Changed copies of each saved input: cut short, and with bytes changed.
+/// Number of cut and of changed copies of each saved input.
 const CUTS: u64 = 24;
 const CHANGES: u64 = 76;
-/// Of each whole one, as many times more.
-const OF_WHOLE: u64 = 8;
+/// Number of rounds of copies for each `whole` input.
+const ROUNDS_OF_WHOLE: u64 = 8;
 
-/// The saved inputs of an entry, by name.
+/// Returns the saved inputs of an entry with their paths.
 fn saved(entry: &Entry) -> Vec<(PathBuf, Vec<u8>)> {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/corpus").join(entry.corpus);
     let mut files: Vec<PathBuf> = fs::read_dir(folder).unwrap().map(|file| file.unwrap().path()).collect();
@@ -33,30 +33,30 @@ fn saved(entry: &Entry) -> Vec<(PathBuf, Vec<u8>)> {
     files.into_iter().map(|path| (path.clone(), fs::read(path).unwrap())).collect()
 }
 
-/// Numbers without a pattern, the same every time.
-struct Dice(u64);
+/// Pseudorandom numbers that are the same in every run.
+struct Random(u64);
 
-impl Dice {
+impl Random {
     fn below(&mut self, end: usize) -> usize {
         self.0 += 1;
         (hash_id(self.0) % end.max(1) as u64) as usize
     }
 }
 
-/// The `k`th change of `bytes`.
-fn changed(bytes: &[u8], k: u64, dice: &mut Dice) -> Vec<u8> {
+/// Returns change number `k` of `bytes`.
+fn changed(bytes: &[u8], k: u64, random: &mut Random) -> Vec<u8> {
     if k < CUTS {
-        return bytes[..dice.below(bytes.len())].to_vec();
+        return bytes[..random.below(bytes.len())].to_vec();
     }
     let mut bytes = bytes.to_vec();
-    for _ in 0..=dice.below(4) {
-        let (at, other) = (dice.below(bytes.len()), dice.below(bytes.len()));
+    for _ in 0..=random.below(4) {
+        let (at, other) = (random.below(bytes.len()), random.below(bytes.len()));
         let Some(&byte) = bytes.get(at) else { break };
-        bytes[at] = match dice.below(4) {
-            0 => byte ^ 1 << dice.below(8),
-            1 => [0, 0xFF, 0x7F, 0x80][dice.below(4)],
-            // A sign, a digit, a bracket: what means something in a text.
-            2 => b"-+.0129eE[](){}\"'\\,: \n"[dice.below(22)],
+        bytes[at] = match random.below(4) {
+            0 => byte ^ 1 << random.below(8),
+            1 => [0, 0xFF, 0x7F, 0x80][random.below(4)],
+            // A sign, digit or bracket, which has a meaning in text formats.
+            2 => b"-+.0129eE[](){}\"'\\,: \n"[random.below(22)],
             _ => bytes[other],
         };
     }
@@ -64,19 +64,19 @@ fn changed(bytes: &[u8], k: u64, dice: &mut Dice) -> Vec<u8> {
 }
 
 #[test]
-fn saved_inputs_and_changes_of_them_are_read_or_refused_in_plain_words_within_memory() {
+fn damaged_inputs_are_read_or_refused_within_memory() {
     let _counted = COUNTED.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
     let mut runs = 0;
     for entry in &ENTRIES {
-        let place = Place::new();
+        let folder = InputFolder::new();
         for (path, bytes) in saved(entry) {
             let whole = path.file_name().is_some_and(|name| name == "whole");
-            let mut dice = Dice(hash_id(bytes.len() as u64));
-            for round in 0..if whole { OF_WHOLE } else { 1 } {
+            let mut random = Random(hash_id(bytes.len() as u64));
+            for round in 0..if whole { ROUNDS_OF_WHOLE } else { 1 } {
                 for k in 0..=CUTS + CHANGES {
-                    // The first as it is.
-                    let input = if k == 0 { bytes.clone() } else { changed(&bytes, k - 1, &mut dice) };
-                    let kept = panic::catch_unwind(AssertUnwindSafe(|| entry.check(&input, &place)));
+                    // The first input is unchanged.
+                    let input = if k == 0 { bytes.clone() } else { changed(&bytes, k - 1, &mut random) };
+                    let kept = panic::catch_unwind(AssertUnwindSafe(|| entry.check(&input, &folder)));
                     assert!(kept.is_ok(), "{} of {}, change {k} of round {round}", entry.name, path.display());
                     runs += 1;
                 }
@@ -90,34 +90,35 @@ fn saved_inputs_and_changes_of_them_are_read_or_refused_in_plain_words_within_me
 #[test]
 fn whole_inputs_are_read() {
     let _counted = COUNTED.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
-    let place = Place::new();
+    let folder = InputFolder::new();
     for entry in &ENTRIES {
         let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/corpus").join(entry.corpus).join("whole");
-        let outcome = (entry.read)(&fs::read(path).unwrap(), &place);
+        let outcome = (entry.read)(&fs::read(path).unwrap(), &folder);
         assert!(outcome.is_ok(), "{}: {}", entry.name, outcome.unwrap_err());
     }
 }
 
 #[test]
-fn checksums_put_right_let_a_changed_value_through() {
+fn repaired_checksums_let_changed_values_through() {
     let _counted = COUNTED.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
-    let place = Place::new();
+    let folder = InputFolder::new();
     for (entry, name) in ENTRIES.iter().filter(|entry| ["container", "archive"].contains(&entry.name)).zip([
-        // The last byte of an archive is of its table's blobs; a container's first tile stores position.
+        // The last byte of an archive belongs to the blobs of its table; the first tile of a container stores
+        // positions.
         "archive",
         "container",
     ]) {
         assert_eq!(entry.name, name);
         let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/corpus").join(name).join("whole");
         let whole = fs::read(path).unwrap();
-        assert_eq!((entry.mended)(&whole).unwrap(), whole, "{name}: what is right stays");
+        assert_eq!((entry.repair_checksums)(&whole).unwrap(), whole, "{name}: what is right stays");
         let record = whole.windows(4).position(|four| four == b"TILE");
-        // A stored minimum, which `verify` compares with the values; a length in the head.
+        // A stored minimum, which `verify` compares with the values, or a length in the header.
         let at = record.map_or(20, |record| record + 44);
         let mut damaged = whole.clone();
         damaged[at] ^= 1;
-        let [before, after] = [damaged.clone(), (entry.mended)(&damaged).unwrap()]
-            .map(|bytes| (entry.read)(&bytes, &place).unwrap_err().to_string());
+        let [before, after] = [damaged.clone(), (entry.repair_checksums)(&damaged).unwrap()]
+            .map(|bytes| (entry.read)(&bytes, &folder).unwrap_err().to_string());
         assert!(before.contains("checksum"), "{name}: {before}");
         assert!(!after.contains("checksum"), "{name}: {after}");
     }

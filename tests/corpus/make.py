@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
-"""Makes the saved corpus beside it: whole files of a few Gaussians, and what is left of them after what happens to files.
+"""Makes the saved corpus in its own folder: complete files of a few Gaussians, and damaged versions of them.
 
     python3 tests/corpus/make.py target/release/splatsieve
 
-Needs zstandard. PROGRAM packs the container, the stream and the archive; everything else is written
-here, by the formats' descriptions, so that no code under test makes what it is tested with.
+Needs zstandard. PROGRAM packs the container, the stream and the archive; the script writes everything else from the
+descriptions of the formats, so that no code under test makes its own test data.
 """
 
 import io
@@ -26,7 +26,7 @@ import zstandard
 HERE = Path(__file__).resolve().parent
 COUNT, WIDTH, CHANNELS, SIZE = 6, 4, 2, 2
 DICE = random.Random(15)
-# What text files come with from other programs.
+# Byte order mark and Latin-1 text of other programs.
 BOM, LATIN = b"\xef\xbb\xbf", "é".encode("latin-1")
 
 
@@ -47,7 +47,9 @@ def write(target, name, data):
 
 
 def damaged(target, whole, places=()):
-    """What a copy that breaks off or a bad disk leaves; `places` are bytes that mean something."""
+    """Writes damaged copies: cut short, or with changed bytes as on a bad disk; `places` are offsets of bytes with a
+    meaning.
+    """
     write(target, "whole", whole)
     write(target, "empty", b"")
     for part in (1, 8, len(whole) // 3, len(whole) - 1):
@@ -61,7 +63,7 @@ def damaged(target, whole, places=()):
 
 
 def texts(target, whole, replaced):
-    """A text file, `replaced` by name: what is looked for, and what stands there instead."""
+    """Writes a text file with replacements by name: the text to find, and the text to put in its place."""
     damaged(target, whole.encode())
     write(target, "bom", BOM + whole.encode())
     write(target, "latin_1", whole.encode() + LATIN)
@@ -133,14 +135,14 @@ def make_ply():
 
 
 class Storage:
-    """Stands for a tensor's storage; the pickle refers to it by what `persistent_id` gives."""
+    """Replacement of a tensor's storage; the pickle refers to it by the result of `persistent_id`."""
 
     def __init__(self, key, values):
         self.key, self.values = key, values
 
 
 def named(module, name):
-    """Something that a pickle calls `module.name`, without that module's being there."""
+    """Returns an object that is pickled as a call of `module.name`, although that module is not installed."""
     made = type(name, (), {})
     made.__module__, made.__qualname__ = module, name
     for part in (module[: at] for at, letter in enumerate(module + ".") if letter == "."):
@@ -163,7 +165,7 @@ class Tensor:
 
 
 class Parameter:
-    """What training optimises: a tensor in a wrapping of its own."""
+    """Trained parameter: a tensor in its own wrapper."""
 
     def __init__(self, tensor):
         self.tensor = tensor
@@ -173,7 +175,7 @@ class Parameter:
 
 
 class Rebuilt:
-    """Callable, so that `__reduce__` takes it, and pickled as the name of what PyTorch calls."""
+    """Callable, as `__reduce__` requires, that is pickled under the name of PyTorch's function."""
 
     def __init__(self, called=REBUILD):
         self.called = called
@@ -211,7 +213,7 @@ def zipped(entries, method=zipfile.ZIP_STORED, folder="archive/"):
 
 
 def checkpoint(tensors, change=lambda data: data, method=zipfile.ZIP_STORED):
-    """A file as torch.save writes it; `tensors` by name: shape and values."""
+    """Returns a file like those of torch.save; `tensors` by name: shape and values."""
     state, data = OrderedDict(), {}
     for name, (shape, values) in tensors.items():
         storage = Storage(str(len(data)), values)
@@ -222,7 +224,7 @@ def checkpoint(tensors, change=lambda data: data, method=zipfile.ZIP_STORED):
 
 
 def field():
-    """Planes of one level, and heads that move and fade."""
+    """Returns planes of one level, and heads for position and opacity."""
     tensors = {"deformation_net.grid.aabb": ((2, 3), [1.6] * 3 + [-1.6] * 3)}
     for plane in range(6):
         shape = (1, CHANNELS, SIZE, SIZE)
@@ -419,7 +421,7 @@ TRACKS = 24
 
 
 def make_colmap():
-    """Length of the cameras' part, cameras, images: of the binary kind, and of the textual one."""
+    """Writes COLMAP inputs (length of the camera part, cameras, images) in the binary and in the text format."""
 
     def both(cameras, images):
         return struct.pack("<I", len(cameras)) + cameras + images
@@ -455,9 +457,9 @@ def make_colmap():
 
 
 def stream(frames):
-    """Frames whose positions move smoothly, so that tiles of them are filtered (format/STREAM.md)."""
+    """Returns a stream of frames whose positions move smoothly, so that their tiles are filtered (format/STREAM.md)."""
     out = struct.pack("<8sIIQII", b"\x89GSTR\r\n\x1a", 1, 0, TRACKS, 1, 0)
-    # Rotations and colours that are alike, so that some constant tiles are packed and some are not.
+    # Similar rotations and colors, so that some constant tiles are compressed and some are not.
     out += floats([1.0] * TRACKS + [0.0] * 3 * TRACKS + normal(3 * TRACKS, 0.5, -3) + normal(TRACKS) + [0.5] * 3 * TRACKS)
     rest, phase = normal(3 * TRACKS), normal(3 * TRACKS)
     for frame in range(frames):
@@ -542,7 +544,7 @@ def make_frames(program, ply):
 
 
 def make_sections(archive):
-    """An archive's sections as they are before they are packed, and tables that lie."""
+    """Writes the sections of an archive before compression, and tables with wrong contents."""
     heads = [struct.unpack_from("<QQ", archive, 12 + 24 * k) for k in range(4)]
     at, stored = 116, []
     for length, _ in heads:
@@ -585,7 +587,9 @@ def make_sections(archive):
 
 
 def saved(make, change=lambda data: data):
-    """A file as torch.save writes whatever `make` gives; `make` calls what it is handed to get a tensor of shape and values."""
+    """Returns a file like those of torch.save with the result of `make`, which calls its argument to get a tensor of a shape and
+    values.
+    """
     storages = []
 
     def tensor(shape, values=None, **view):
@@ -609,7 +613,7 @@ SPLATS = {
 
 
 def splats(**change):
-    """A gsplat checkpoint of Gaussians that move; `change` by name: a shape, or none to leave it out."""
+    """Returns a gsplat checkpoint of moving Gaussians; `change` by name: a shape, or None to leave it out."""
 
     def make(tensor):
         shapes = {name: shape for name, shape in (SPLATS | change).items() if shape}
@@ -626,7 +630,7 @@ CAPTURE_4D = {13: (COUNT, 1), 14: (COUNT, 1), 15: (COUNT, 4)}
 
 
 def capture(change={}, length=19):
-    """What a Gaussian model of four dimensions captures, or of three with a length of 12; `change` by place."""
+    """Returns the `capture` of a 4D Gaussian model, or of a 3D one with a length of 12; `change` by index."""
 
     def make(tensor):
         shapes = CAPTURE | CAPTURE_4D if length == 19 else CAPTURE | {3: (COUNT, 3, 3)}
@@ -699,7 +703,7 @@ def make_checkpoints():
 
 
 def network(heads=("gaussian_warp", "gaussian_rotation", "gaussian_scaling"), prefix="", time=True, **change):
-    """A network of two layers, of which the second reads the encodings too."""
+    """Returns a network of two layers, of which the second reads the encodings too."""
     of_time = 5 if time else 13
     layers = {"timenet.0": (WIDTH, 13), "timenet.2": (of_time, WIDTH)} if time else {}
     layers |= {"linear.0": (WIDTH, 63 + of_time), "linear.1": (WIDTH, WIDTH + 63 + of_time)}
@@ -800,7 +804,7 @@ def make_splatv():
 
     camera = {"id": 0, "img_name": "a", "width": 32, "height": 24, "position": [0, 0, 4], "fy": 40, "fx": 40}
     camera["rotation"] = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
-    # A viewer's texture is 4096 texels wide; the sizes are the file's own to say.
+    # The texture of a viewer is 4096 texels wide; the file states its own size.
     texture = b"".join(row() for _ in range(COUNT)) + bytes(64 * 2)
     entry = {"type": "splat", "size": len(texture), "texwidth": 8, "texheight": len(texture) // 128, "cameras": [camera]}
     whole = file([entry], texture)
@@ -831,7 +835,7 @@ def make_splatv():
 
 
 def make_spacetime():
-    """Clouds of SpacetimeGaussians, whose properties a loader counts by how their names begin."""
+    """Writes point clouds of SpacetimeGaussians, whose loader counts properties by prefix."""
     lite = ["x", "y", "z", "trbf_center", "trbf_scale", "nx", "ny", "nz", *(f"motion_{k}" for k in range(9))]
     rest = ["opacity", *(f"scale_{k}" for k in range(3)), *(f"rot_{k}" for k in range(4)), *(f"omega_{k}" for k in range(4))]
     of_lite = [*lite, *(f"f_dc_{k}" for k in range(3)), *rest]
@@ -846,7 +850,7 @@ def make_spacetime():
 
 
 def make_families():
-    # What comes before changes nothing here.
+    # Independent of the random numbers used before.
     DICE.seed(16)
     make_checkpoints()
     make_networks()

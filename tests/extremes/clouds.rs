@@ -1,19 +1,19 @@
-//! Odd clouds, file to file.
+//! Tests of unusual point clouds, from input file to output file.
 
 use std::fs;
 
 use super::scene::{self, PlyRows, Workplace, index_map};
-use super::{CAMERA, balls, says};
+use super::{CAMERA, balls, list_contains};
 use splatsieve::model::Gaussians;
 
-/// Makes something of a scene odd.
+/// Change that makes a scene unusual.
 type Edit = fn(&mut Gaussians);
 
 fn numbers(summary: &serde_json::Value, key: &str) -> Vec<f64> {
     summary["terms"].as_array().unwrap().iter().map(|term| term[key].as_f64().unwrap()).collect()
 }
 
-/// Row 1.
+/// Case 1.
 #[test]
 fn no_gaussians_give_a_valid_empty_output() {
     let workplace = Workplace::new();
@@ -29,7 +29,7 @@ fn no_gaussians_give_a_valid_empty_output() {
     }
 }
 
-/// Row 2.
+/// Case 2.
 #[test]
 fn one_gaussian_is_kept_byte_for_byte() {
     let workplace = Workplace::new();
@@ -40,14 +40,14 @@ fn one_gaussian_is_kept_byte_for_byte() {
     }
 }
 
-/// Row 3.
+/// Case 3.
 #[test]
-fn one_frame_is_static_and_said_to_be() {
+fn one_frame_is_static_and_noted() {
     let workplace = Workplace::new();
     workplace.ply("one.ply", &balls(50));
     let summary = workplace.summary("one.ply -o out.ply");
-    assert!(says(&summary, "left_out", "motion, curvature, opacity variance"), "{}", summary["left_out"]);
-    assert!(says(&summary, "left_out", "1 frame"));
+    assert!(list_contains(&summary, "left_out", "motion, curvature, opacity variance"), "{}", summary["left_out"]);
+    assert!(list_contains(&summary, "left_out", "1 frame"));
     workplace.done("score one.ply -o rows.npz");
     let rows = scene::arrays(&workplace.path("rows.npz"));
     for name in ["D", "kappa", "V", "dynamic_score"] {
@@ -56,35 +56,34 @@ fn one_frame_is_static_and_said_to_be() {
     assert!(rows["life"].iter().all(|&frames| frames == 1.0));
 }
 
-/// Row 6.
+/// Case 6.
 #[test]
-fn identical_gaussians_are_pruned_to_the_exact_count_by_hash() {
+fn identical_gaussians_are_pruned_to_exact_count_by_hash() {
     let workplace = Workplace::new();
     let one = balls(1).pick(&[0; 100]);
     workplace.ply("same.ply", &one);
     for preset in ["paper", "default"] {
-        // What pictures show of them is told apart by who is drawn first.
-        let request =
-            format!("same.ply --overwrite -o out.ply --prune-only --preset {preset} --set coverage=projected");
+        // Projected coverage, because visible contribution would differ by drawing order.
+        let request = format!("same.ply --overwrite -o out.ply --prune-only --preset {preset} --set coverage=projected");
         let summary = workplace.summary(&format!("{request} --count 37"));
         assert_eq!(summary["gaussians"], 37);
-        assert!(says(&summary, "left_out", "grading by coverage"), "{}", summary["left_out"]);
+        assert!(list_contains(&summary, "left_out", "grading by coverage"), "{}", summary["left_out"]);
         let map = index_map(&workplace.path("out.ply.index_map.npy"));
         let kept: Vec<usize> = (0..100).filter(|&i| map[i] >= 0).collect();
         assert_ne!(kept, (0..37).collect::<Vec<_>>(), "{preset}: places in the file decide");
-        // Without a target: stage 1 alone, which counts; stage 2 has nothing to tell them apart by.
+        // Without a target only stage 1 prunes, by count; stage 2 finds no differences.
         let expected = if preset == "paper" { 80 } else { 100 };
         assert_eq!(workplace.summary(&request)["gaussians"], expected, "{preset}");
         assert!(kept.iter().any(|&i| i < 20) && kept.iter().any(|&i| i > 80), "{preset}: {kept:?}");
     }
 }
 
-/// Row 7.
+/// Case 7.
 #[test]
-fn static_neighbors_merge_and_the_dynamic_arm_is_off() {
+fn static_neighbors_merge_and_dynamic_scores_are_off() {
     let workplace = Workplace::new();
     let mut cloud = balls(40).pick(&(0..80).map(|i| i / 2).collect::<Vec<_>>());
-    // Beside each other, not at one place.
+    // Side by side, not at the same position.
     for i in (0..80).step_by(2) {
         cloud.position.plane_mut(2)[i] = 0.001;
     }
@@ -92,20 +91,20 @@ fn static_neighbors_merge_and_the_dynamic_arm_is_off() {
         workplace.ply(&format!("frames/frame_{frame}.ply"), &cloud);
     }
     let summary = workplace.summary("frames -o out --no-refine");
-    assert!(says(&summary, "left_out", "grading by motion"), "{}", summary["left_out"]);
-    assert!(says(&summary, "left_out", "grading by the dynamic score"));
+    assert!(list_contains(&summary, "left_out", "grading by motion"), "{}", summary["left_out"]);
+    assert!(list_contains(&summary, "left_out", "grading by the dynamic score"));
     assert_eq!(summary["merge"]["proxies"], summary["gaussians"], "each pair is one");
     let gaussians = summary["gaussians"].as_u64().unwrap();
     assert_eq!(gaussians * 2, summary["selection"]["kept"].as_u64().unwrap());
-    // The rows of a result that nothing moves are the same in every frame.
+    // A result without motion has the same rows in every frame.
     let frames: Vec<PlyRows> =
         (0..4).map(|frame| PlyRows::read(&workplace.path(&format!("out/frame_{frame}.ply")))).collect();
     assert!(frames.iter().all(|frame| frame.rows == frames[0].rows));
 }
 
-/// Row 8.
+/// Case 8.
 #[test]
-fn movers_around_one_percent_are_kept_whatever_their_number() {
+fn all_movers_are_kept_at_around_one_percent() {
     for movers in [1, 2, 3] {
         let workplace = Workplace::new();
         let mut cloud = balls(200);
@@ -125,9 +124,9 @@ fn movers_around_one_percent_are_kept_whatever_their_number() {
     }
 }
 
-/// Row 9.
+/// Case 9.
 #[test]
-fn invisible_gaussians_are_all_prunable_without_nan() {
+fn invisible_gaussians_are_prunable_without_nan() {
     for logit in [-100.0, -30.0] {
         let workplace = Workplace::new();
         let mut cloud = balls(60);
@@ -145,9 +144,9 @@ fn invisible_gaussians_are_all_prunable_without_nan() {
 }
 
 #[test]
-fn what_looks_like_its_background_counts_by_the_contrast_floor() {
+fn gaussians_like_their_background_use_the_contrast_floor() {
     let workplace = Workplace::new();
-    // The first is as black as what it hides; the second is fainter and hardly lighter.
+    // The first has the same black as what it hides; the second is fainter and slightly lighter.
     let mut two = balls(2);
     for (i, sh, logit) in [(0, -1.78, 2.0), (1, -1.70, 0.0)] {
         two.position.set_row(i, [0.2 + 0.6 * i as f32, 0.5, 0.0]);
@@ -164,7 +163,7 @@ fn what_looks_like_its_background_counts_by_the_contrast_floor() {
     }
 }
 
-/// Row 10.
+/// Case 10.
 #[test]
 fn solid_gaussians_have_no_variance_and_finite_logits() {
     let workplace = Workplace::new();
@@ -184,9 +183,9 @@ fn solid_gaussians_have_no_variance_and_finite_logits() {
     }
 }
 
-/// Row 18.
+/// Case 18.
 #[test]
-fn not_finite_gaussians_are_refused_dropped_or_kept_as_asked() {
+fn nonfinite_gaussians_are_refused_dropped_or_kept() {
     let edits: [(&str, Edit); 5] = [
         ("position", |g| g.position.plane_mut(1)[7] = f32::NAN),
         ("scale", |g| g.log_scale.plane_mut(0)[7] = f32::INFINITY),
@@ -214,8 +213,8 @@ fn not_finite_gaussians_are_refused_dropped_or_kept_as_asked() {
         let (before, after) = (PlyRows::read(&odd), PlyRows::read(&workplace.path("kept.ply")));
         assert!(place >= 0 && after.rows[place as usize] == before.rows[7], "{what}");
 
-        // The percentiles are those of the other 99, from the same camera. Of projected coverage: what is visible
-        // of the others depends on what stands before them.
+        // The percentiles are those of the other 99 Gaussians from the same camera. The test uses projected coverage,
+        // because visible contribution depends on the Gaussians in front.
         fs::write(workplace.path("cameras.json"), CAMERA).unwrap();
         let others: Vec<u32> = (0..100).filter(|&i| i != 7).collect();
         workplace.ply("others.ply", &odd_cloud.pick(&others));
@@ -227,21 +226,21 @@ fn not_finite_gaussians_are_refused_dropped_or_kept_as_asked() {
     }
 }
 
-/// Row 28.
+/// Case 28.
 #[test]
-fn without_cameras_a_virtual_rig_is_used_and_said() {
+fn without_cameras_a_virtual_rig_is_used_and_noted() {
     let workplace = Workplace::new();
     workplace.ply("some.ply", &balls(20));
     let summary = workplace.summary("some.ply -o out.ply");
-    assert!(says(&summary, "notes", "no cameras given or found: virtual rig"), "{}", summary["notes"]);
+    assert!(list_contains(&summary, "notes", "no cameras given or found: virtual rig"), "{}", summary["notes"]);
     assert!(summary["cameras"]["origin"].as_str().unwrap().contains("virtual rig"));
     assert!(summary["cameras"]["pairs"].as_u64().unwrap() > 1);
     assert_eq!(summary["flags"]["never_in_view"], 0);
 }
 
-/// Row 40.
+/// Case 40.
 #[test]
-fn without_cameras_what_stays_does_not_depend_on_the_unit_of_length() {
+fn without_cameras_survivors_ignore_the_length_unit() {
     let kept = |power: i32| {
         let (workplace, unit) = (Workplace::new(), 2f32.powi(power));
         let mut cloud = balls(2000);
@@ -257,20 +256,20 @@ fn without_cameras_what_stays_does_not_depend_on_the_unit_of_length() {
         index_map(&workplace.path("out.ply.index_map.npy"))
     };
     let expected = kept(1);
-    // Cameras stand two extents away.
+    // The virtual cameras are two extents away.
     for power in [-4, 20] {
         assert!(kept(power) == expected, "2^{power}: other Gaussians stay");
     }
 }
 
-/// Row 31.
+/// Case 31: three copies, opacity by rule.
 #[test]
-fn exact_duplicates_merge_to_one_and_the_summary_names_the_opacity_rule() {
+fn duplicates_merge_to_one_with_the_named_opacity_rule() {
     let workplace = Workplace::new();
     let cloud = balls(10).pick(&(0..30).map(|i| i / 3).collect::<Vec<_>>());
     workplace.ply("three.ply", &cloud);
     let single = PlyRows::read(&workplace.ply("single.ply", &balls(10)));
-    // Three opacities of 0.731 over one area.
+    // Three opacities of 0.731 over the same area.
     let rules = [("sum", 1.0f64), ("union", 1.0 - (1.0f64 - 0.731_058_6).powi(3)), ("area", 1.0)];
     for (rule, opacity) in rules {
         let request = format!("three.ply --overwrite -o out.ply --merge-only --no-refine --set opacity={rule}");
@@ -288,9 +287,9 @@ fn exact_duplicates_merge_to_one_and_the_summary_names_the_opacity_rule() {
     }
 }
 
-/// Row 31.
+/// Case 31: any number of copies.
 #[test]
-fn duplicates_merge_to_one_whatever_their_number() {
+fn any_number_of_duplicates_merges_to_one() {
     for count in [34, 100, 5000] {
         let workplace = Workplace::new();
         workplace.ply("same.ply", &balls(1).pick(&vec![0; count]));
@@ -299,14 +298,14 @@ fn duplicates_merge_to_one_whatever_their_number() {
     }
 }
 
-/// Row 43.
+/// Case 43.
 #[test]
-fn frames_that_disagree_are_named() {
+fn frames_with_unequal_counts_are_named() {
     let workplace = Workplace::new();
     workplace.ply("frames/frame_1.ply", &balls(5));
     workplace.ply("frames/frame_2.ply", &balls(5));
     workplace.ply("frames/frame_3.ply", &balls(4));
     workplace.refused(1, "compress frames -o out --link never", &["frame_3.ply", "5", "4"]);
-    // Where nobody forbids it they are linked.
+    // By default such frames are linked.
     assert!(workplace.summary("frames -o out")["notes"].to_string().contains("linked"));
 }

@@ -1,4 +1,4 @@
-//! What merges, what must not, and what comes of it, file to file.
+//! Tests of merging, from input file to output file: pairs that merge, pairs that must not, and their proxies.
 
 use std::fs;
 
@@ -6,20 +6,20 @@ use glam::{DMat3, DQuat, DVec3};
 use splatsieve::model::Gaussians;
 
 use super::scene::{PlyRows, Workplace, arrays, index_map};
-use super::{CAMERA, balls, close};
+use super::{CAMERA, assert_close, balls};
 
-/// Merges nothing but what formulas let merge.
+/// Options with which only the merging tests decide, not renders.
 const MERGE: &str = "--merge-only --no-refine --set choose_by_views=false --set coverage=projected --overwrite";
 
-/// Two equal balls at one place, and one far off so that the scene has an extent.
+/// Returns two equal balls at the same position, and one far away that gives the scene an extent.
 fn twins() -> Gaussians {
     let mut cloud = balls(1).pick(&[0, 0, 0]);
     cloud.position.set_row(2, [3.0, 2.0, 1.0]);
     cloud
 }
 
-/// How many of the first two of [`twins`] are left, if `edit` changes the state of both at frame t.
-fn left(frames: usize, edit: impl Fn(usize, &mut Gaussians)) -> usize {
+/// Returns how many of the first two of [`twins`] remain if `edit` changes the states at frame t.
+fn count_after_merging(frames: usize, edit: impl Fn(usize, &mut Gaussians)) -> usize {
     let workplace = Workplace::new();
     for t in 0..frames {
         let mut cloud = twins();
@@ -32,40 +32,40 @@ fn left(frames: usize, edit: impl Fn(usize, &mut Gaussians)) -> usize {
     if map[0] == map[1] { 1 } else { 2 }
 }
 
-fn moved(cloud: &mut Gaussians, i: usize, by: f64) {
+fn shift_along_x(cloud: &mut Gaussians, i: usize, by: f64) {
     cloud.position.plane_mut(0)[i] += by as f32;
 }
 
-/// Rows 13, 17 and 38, each beside the same without what is odd, which merges.
+/// Cases 13, 17 and 38; each is checked next to a pair without the difference, which merges.
 #[test]
-fn what_moves_or_lives_otherwise_never_merges() {
+fn different_motion_or_life_never_merges() {
     const T: usize = 12;
     for speed in [1e-3, 0.02, 1.0] {
         let both = |other: f64| {
-            left(T, |t, cloud| {
-                moved(cloud, 0, speed * (t as f64 - 6.0));
-                moved(cloud, 1, other * speed * (t as f64 - 6.0));
+            count_after_merging(T, |t, cloud| {
+                shift_along_x(cloud, 0, speed * (t as f64 - 6.0));
+                shift_along_x(cloud, 1, other * speed * (t as f64 - 6.0));
             })
         };
         assert_eq!([both(1.0), both(-1.0), both(10.0), both(0.1)], [1, 2, 2, 2], "speed {speed}");
     }
     for (distance, expected) in [(0.0, 1), (0.5, 2), (100.0, 2)] {
-        let teleport = |t: usize, cloud: &mut Gaussians| moved(cloud, 1, if t >= 5 { distance } else { 0.0 });
-        assert_eq!(left(T, teleport), expected, "a teleport by {distance}");
+        let teleport = |t: usize, cloud: &mut Gaussians| shift_along_x(cloud, 1, if t >= 5 { distance } else { 0.0 });
+        assert_eq!(count_after_merging(T, teleport), expected, "a teleport by {distance}");
     }
     for (birth, death, expected) in [(0, T, 1), (6, T, 2), (1, 6, 2), (11, T, 2)] {
         let lives = |t: usize, cloud: &mut Gaussians| {
-            let of = |alive: bool| if alive { 2.0 } else { -9.0 };
-            // The first lives where the second does not, or both all the time.
+            let logit = |alive: bool| if alive { 2.0 } else { -9.0 };
+            // The first is alive exactly where the second is not, or both are alive in all frames.
             let second = (birth..death).contains(&t);
-            cloud.opacity_logit.plane_mut(0)[0] = of(expected == 1 || !second);
-            cloud.opacity_logit.plane_mut(0)[1] = of(second);
+            cloud.opacity_logit.plane_mut(0)[0] = logit(expected == 1 || !second);
+            cloud.opacity_logit.plane_mut(0)[1] = logit(second);
         };
-        assert_eq!(left(T, lives), expected, "a second life from {birth} to {death}");
+        assert_eq!(count_after_merging(T, lives), expected, "a second life from {birth} to {death}");
     }
 }
 
-/// Row 19: equal but for the signs of zeros, no two of them alike, duplicates are duplicates, whatever their number.
+/// Case 19: any number of Gaussians that differ only in the signs of zeros, in 200 ways, are duplicates.
 #[test]
 fn duplicates_that_differ_in_the_sign_of_0_merge_to_one() {
     const N: usize = 200;
@@ -85,20 +85,21 @@ fn duplicates_that_differ_in_the_sign_of_0_merge_to_one() {
     assert!(map[..N].iter().all(|&place| place == map[0]), "{map:?}");
 }
 
-/// Row 35: coefficients of one direction, of which one is black.
+/// Case 35: coefficients of the same direction, one of which gives black.
 #[test]
-fn what_looks_otherwise_never_merges() {
-    let colored = |dc: [[f32; 3]; 2]| left(1, |_, cloud| (0..2).for_each(|i| cloud.sh.set_row(i, dc[i])));
+fn different_colors_never_merge() {
+    let colored =
+        |dc: [[f32; 3]; 2]| count_after_merging(1, |_, cloud| (0..2).for_each(|i| cloud.sh.set_row(i, dc[i])));
     assert_eq!(colored([[-1.772; 3]; 2]), 1);
     for gray in [-1.2, -0.9, -0.5, -0.1] {
-        assert_eq!(colored([[-1.772; 3], [gray; 3]]), 2, "black beside a grey of {gray}");
+        assert_eq!(colored([[-1.772; 3], [gray; 3]]), 2, "black beside a gray of {gray}");
     }
-    // Black however much less than nothing.
+    // Coefficients below black are also black.
     assert_eq!(colored([[-1.78; 3], [-2.5; 3]]), 1);
 }
 
-/// The one Gaussian that two make, with `edit` made to both: scales, the axes as columns, and its row.
-fn merged(edit: impl Fn(&mut Gaussians), flags: &str) -> ([f64; 3], DMat3, PlyRows) {
+/// Merges two Gaussians changed by `edit` to one. Returns its scales, its axes as columns, and its row.
+fn merge_two(edit: impl Fn(&mut Gaussians), flags: &str) -> ([f64; 3], DMat3, PlyRows) {
     let workplace = Workplace::new();
     let mut cloud = balls(1).pick(&[0, 0]);
     edit(&mut cloud);
@@ -112,12 +113,12 @@ fn merged(edit: impl Fn(&mut Gaussians), flags: &str) -> ([f64; 3], DMat3, PlyRo
     (scales, DMat3::from_quat(DQuat::from_xyzw(x, y, z, w).normalize()), rows)
 }
 
-/// Lengths are scene units and pairs a whole unit apart may merge, however unlike in place.
+/// Lengths are in scene units, and pairs may merge at a distance of one unit with any differences.
 const WIDE: &str = "--set length_unit=scene --set passes=1,1e9,-1,-1";
 
-/// Row 21, for needles along every axis and any way round.
+/// Case 21, for needles along every axis and with any order of axes.
 #[test]
-fn a_needle_keeps_its_smallest_scale_through_a_ply() {
+fn needle_keeps_its_smallest_scale_through_a_ply() {
     for turn in [[1.0, 0.0, 0.0, 0.0], [0.5, -0.5, 0.1, 0.7], [0.2, 0.9, -0.3, 0.1]] {
         for long in 0..3 {
             let mut log_scale = [(1e-6f32).ln(); 3];
@@ -128,17 +129,17 @@ fn a_needle_keeps_its_smallest_scale_through_a_ply() {
                     cloud.rotation.set_row(i, turn);
                 }
             };
-            let (scales, _, _) = merged(needle, "");
+            let (scales, _, _) = merge_two(needle, "");
             for k in 0..3 {
                 let expected = f64::from(log_scale[k]).exp();
-                close(format!("scale {k} of {turn:?}"), scales[k], expected, 1e-6 * expected);
+                assert_close(format!("scale {k} of {turn:?}"), scales[k], expected, 1e-6 * expected);
             }
         }
     }
 }
 
-/// Row 22: beside each other in their plane, however it lies and however flat they are, f32 rotations allowing: their error of
-/// 1e-7 lifts what lies 0.02 away by 2e-9.
+/// Case 22: pancakes side by side in their common plane, of any orientation and flatness. Rotations in f32 limit the
+/// flatness: their error of 1e-7 moves a point at a distance of 0.02 by 2e-9.
 #[test]
 fn coplanar_pancakes_stay_flat() {
     for turn in [[1.0, 0.0, 0.0, 0.0], [0.5, -0.5, 0.1, 0.7], [0.2, 0.9, -0.3, 0.1]] {
@@ -153,44 +154,44 @@ fn coplanar_pancakes_stay_flat() {
                     cloud.log_scale.set_row(i, [0.05f64, 0.04, thickness].map(|s| s.ln() as f32));
                 }
             };
-            let (mut scales, found, _) = merged(pancakes, WIDE);
+            let (mut scales, found, _) = merge_two(pancakes, WIDE);
             let flat = (0..3).min_by(|&a, &b| scales[a].total_cmp(&scales[b])).unwrap();
-            close("the angle between normals", found.col(flat).dot(axes.z_axis).abs(), 1.0, 1e-9);
+            assert_close("the angle between normals", found.col(flat).dot(axes.z_axis).abs(), 1.0, 1e-9);
             scales.sort_by(f64::total_cmp);
-            close(format!("thickness of {turn:?}"), scales[0], thickness, 1e-6 * thickness + 4e-9);
+            assert_close(format!("thickness of {turn:?}"), scales[0], thickness, 1e-6 * thickness + 4e-9);
             assert!(scales[1] > 0.039, "{scales:?}");
         }
     }
 }
 
-/// Row 23: two balls along a diagonal have a covariance with equal diagonal, and the diagonal is its axis.
+/// Case 23: two balls along a diagonal have a covariance with equal diagonal entries, and the diagonal is its axis.
 #[test]
-fn a_covariance_with_equal_diagonal_has_its_axes() {
+fn covariance_with_equal_diagonal_has_correct_axes() {
     for direction in [[1.0, 1.0, 1.0], [1.0, -1.0, 1.0], [-1.0, 1.0, 1.0], [1.0, 1.0, -1.0]] {
         let half = 0.02;
         let apart = |cloud: &mut Gaussians| {
             cloud.position.set_row(0, direction.map(|x| (half * x) as f32));
             cloud.position.set_row(1, direction.map(|x| (-half * x) as f32));
         };
-        let (scales, axes, rows) = merged(apart, &format!("{WIDE} --set placement=mean"));
+        let (scales, axes, rows) = merge_two(apart, &format!("{WIDE} --set placement=mean"));
         let long = (0..3).max_by(|&a, &b| scales[a].total_cmp(&scales[b])).unwrap();
         let along = DVec3::from(direction).normalize();
-        close(format!("axis of {direction:?}"), axes.col(long).dot(along).abs(), 1.0, 1e-6);
+        assert_close(format!("axis of {direction:?}"), axes.col(long).dot(along).abs(), 1.0, 1e-6);
         let own = f64::from(-3.0f32).exp();
-        // Where between both it lies tells what each weighs.
+        // The position of the proxy between the two shows their weights.
         let x = f64::from(rows.value(0, "x")) / (half * direction[0]);
         let between = 3.0 * half * half * (1.0 - x * x);
         assert!(x.abs() < 0.1, "{x}");
-        close("the long scale", scales[long], (own * own + between).sqrt(), 1e-6);
+        assert_close("the long scale", scales[long], (own * own + between).sqrt(), 1e-6);
         for k in (0..3).filter(|&k| k != long) {
-            close("another scale", scales[k], own, 1e-6);
+            assert_close("another scale", scales[k], own, 1e-6);
         }
     }
 }
 
-/// Row 24: with its scales it merges as the identity does, and counts.
+/// Case 24: a zero quaternion merges like the identity with the same scales, and is counted.
 #[test]
-fn a_zero_quaternion_is_the_identity_and_flagged() {
+fn zero_quaternion_is_the_identity_and_flagged() {
     let score = |turn: [f32; 4]| {
         let workplace = Workplace::new();
         let mut cloud = balls(6);
@@ -206,7 +207,7 @@ fn a_zero_quaternion_is_the_identity_and_flagged() {
     assert_eq!((&zero, flagged, none), (&identity, 1, 0));
     assert_ne!(zero, other, "the rotation must matter");
     let pancakes = |first: [f32; 4]| {
-        merged(
+        merge_two(
             |cloud: &mut Gaussians| {
                 (0..2).for_each(|i| cloud.log_scale.set_row(i, [-1.0, -2.0, -3.0]));
                 cloud.rotation.set_row(0, first);
@@ -220,9 +221,9 @@ fn a_zero_quaternion_is_the_identity_and_flagged() {
     }
 }
 
-/// Row 20: half a standard deviation apart they are one, whatever their size, and three apart they are two.
+/// Case 20: two balls half a standard deviation apart merge, and two balls three apart do not, at any size.
 #[test]
-fn balls_of_1e_minus_12_and_of_1e6_merge_with_what_is_near_for_their_size() {
+fn merging_distance_scales_with_size_from_1e_minus_12_to_1e6() {
     for size in [1e-12, 1e-9, 1e-6, 1e-3, 1e3, 1e6f64] {
         let far: &[f64] = if size < 0.1 { &[3.0] } else { &[] };
         for &apart in [0.5].iter().chain(far) {
@@ -237,14 +238,14 @@ fn balls_of_1e_minus_12_and_of_1e6_merge_with_what_is_near_for_their_size() {
             assert_eq!(rows.rows.len(), if apart < 1.0 { 1 } else { 2 }, "size {size:e}, {apart} apart");
             for k in 0..3 {
                 let scale = f64::from(rows.value(0, &format!("scale_{k}"))).exp();
-                // What lies apart makes it longer along one axis.
+                // The distance makes the proxy longer along one axis.
                 assert!((0.999_99..1.2).contains(&(scale / size)), "{scale:e} of {size:e}, {apart} apart");
             }
         }
     }
 }
 
-/// Rows 20 and 27: from points to what fills the sky, before, around and behind the camera.
+/// Cases 20 and 27: sizes from points to the whole sky, in front of, around and behind the camera.
 #[test]
 fn scales_from_1e_minus_12_to_1e6_overflow_nothing() {
     let workplace = Workplace::new();
@@ -252,12 +253,12 @@ fn scales_from_1e_minus_12_to_1e6_overflow_nothing() {
     for i in 0..300 {
         let log = |k: usize| (10f64.powi([-12, -6, -2, 0, 3, 6][(i / (k + 1)) % 6]).ln()) as f32;
         cloud.log_scale.set_row(i, [log(0), log(1), log(2)]);
-        // The camera stands at z = -3.
+        // The camera is at z = -3.
         cloud.position.plane_mut(2)[i] = [-3.3, -3.0, -2.81, -2.79, 0.0, 1e3][(i / 7) % 6];
         cloud.opacity_logit.plane_mut(0)[i] = (i % 9) as f32 - 4.0;
     }
     workplace.ply("cloud.ply", &cloud);
-    // The second as through a telescope: squares of what it shows of the largest pass 1e38.
+    // The second camera has a long focal length: squared areas of the largest Gaussian exceed 1e38.
     let [near, far] = [CAMERA.to_owned(), CAMERA.replace("fx\": 60, \"fy\": 60", "fx\": 6000, \"fy\": 6000")];
     let far = far.replace("\"id\": 0, \"img_name\": \"a\"", "\"id\": 1, \"img_name\": \"b\"");
     fs::write(
@@ -277,25 +278,25 @@ fn scales_from_1e_minus_12_to_1e6_overflow_nothing() {
         workplace.done(&score.replace(" --no-refine", "").replace("--overwrite", "--overwrite"));
         for (name, values) in arrays(&workplace.path("rows.npz")) {
             assert!(values.iter().all(|x| x.is_finite()), "{preset}: {name}");
-            // The picture has so many pixels.
+            // The number of pixels of the image.
             assert!(name != "C" || values.iter().all(|&c| (0.0..=64.0 * 64.0).contains(&c)), "{preset}: {values:?}");
         }
     }
 }
 
-/// Rows 29 and 30.
+/// Cases 29 and 30.
 #[test]
-fn what_is_hidden_goes_first_and_a_giant_background_stays_and_swallows_nothing() {
+fn hidden_go_first_and_giant_background_merges_with_none() {
     let workplace = Workplace::new();
     let mut cloud = balls(60);
     for i in 0..60 {
         cloud.opacity_logit.plane_mut(0)[i] = 9.0;
         cloud.sh.set_row(i, [0.05 * i as f32 - 1.4, 0.3, 0.0]);
     }
-    // A wall before the first ten, and behind all a giant.
+    // A wall in front of the first ten, and a giant Gaussian behind everything.
     for i in 0..10 {
         cloud.position.set_row(i, [0.45 + 0.01 * i as f32, 0.5, 8.0]);
-        // Larger than what stands around the wall: only that they are hidden is against them.
+        // They are larger than the Gaussians around the wall; only their being hidden counts against them.
         cloud.log_scale.set_row(i, [-1.0; 3]);
     }
     for i in 10..20 {
@@ -316,7 +317,7 @@ fn what_is_hidden_goes_first_and_a_giant_background_stays_and_swallows_nothing()
         assert!(map[20] >= 0, "{more}: the background went");
         assert_eq!(map.iter().filter(|&&place| place == map[20]).count(), 1, "{more}: it swallowed others");
     }
-    // Detail of its color at its center: only by its size does the giant differ.
+    // Detail with the color of the giant at its center: the giant differs only in size.
     for i in 50..60 {
         cloud.position.set_row(i, [0.5 + 1e-3 * (i - 50) as f32, 0.5, 60.0]);
         cloud.sh.set_row(i, cloud.sh.row::<3>(20));
@@ -330,9 +331,9 @@ fn what_is_hidden_goes_first_and_a_giant_background_stays_and_swallows_nothing()
     }
 }
 
-/// Row 32; ten million points: `ten_million_points_in_one_voxel_cost_bounded_time`, by name.
+/// Case 32. For ten million points see `ten_million_points_in_one_voxel_cost_bounded_time`, which runs only by name.
 #[test]
-fn a_crowd_in_one_voxel_is_cut_and_said_to_be() {
+fn crowded_voxel_is_truncated_and_noted() {
     const N: usize = 30_000;
     let workplace = Workplace::new();
     let mut cloud = balls(1).pick(&vec![0; N]);
@@ -348,24 +349,24 @@ fn a_crowd_in_one_voxel_is_cut_and_said_to_be() {
     assert!(pass["candidates"].as_u64().unwrap() <= 32 * N as u64 && pass["joins"].as_u64().unwrap() > 0, "{pass}");
 }
 
-/// Row 33: balls along a line, ordered by size, in which each leads its follower.
+/// Case 33: balls along a line, ordered by size, in which each is the leader of the next.
 #[test]
-fn a_sorted_chain_merges_as_the_sequential_rule_says() {
+fn sorted_chain_merges_by_the_sequential_rule() {
     const N: usize = 4000;
     let workplace = Workplace::new();
     let mut cloud = balls(1).pick(&vec![0; N]);
     for i in 0..N {
         cloud.position.set_row(i, [i as f32 / 1024.0, 0.0, 0.0]);
-        // Opacities fall along the line, and C with them.
+        // Opacities fall along the line, and so does C.
         cloud.opacity_logit.set_row(i, [4.0 - 6.0 * i as f32 / N as f32]);
         cloud.log_scale.set_row(i, [-9.0; 3]);
     }
     workplace.ply("chain.ply", &cloud);
-    // From afar, so that every ball is as large in the picture.
+    // A camera far away, so that every ball has the same size in the image.
     let camera =
         CAMERA.replace("[0.5, 0.5, -3]", "[2, 0, -400]").replace("\"fx\": 60, \"fy\": 60", "\"fx\": 900, \"fy\": 900");
     fs::write(workplace.path("cameras.json"), camera).unwrap();
-    // Neighbors lie within reach, and who comes next but one does not.
+    // The next neighbor is within reach, the one after it is not.
     let flags = "--set length_unit=scene --set passes=0.0011,1e9,-1,-1 --cameras cameras.json";
     let summary = workplace.summary(&format!("chain.ply -o out.ply {MERGE} {flags}"));
     workplace.done("score chain.ply --set coverage=projected --cameras cameras.json -o rows.npz");
@@ -377,12 +378,12 @@ fn a_sorted_chain_merges_as_the_sequential_rule_says() {
     assert_eq!(summary["merge"]["passes"][0]["sequential"], true, "{}", summary["merge"]);
 }
 
-/// Row 36: behind the camera C and Vis are 0; opacity × area weighs, and where that is nothing too, all weigh the same.
+/// Case 36: behind the camera C and Vis are 0. The weights are opacity × area, and equal if those are 0 too.
 #[test]
-fn what_nobody_sees_merges_by_opacity_times_area() {
+fn unseen_gaussians_merge_by_opacity_times_area() {
     for (logits, weight) in [([2.0f32, -1.0], None), ([-200.0, -200.0], Some(0.5))] {
         let workplace = Workplace::new();
-        // The third is in view.
+        // The third Gaussian is in view.
         let mut cloud = balls(1).pick(&[0, 0, 0]);
         cloud.position.set_row(2, [0.5, 0.5, 0.0]);
         for (i, logit) in logits.into_iter().enumerate() {
@@ -398,6 +399,6 @@ fn what_nobody_sees_merges_by_opacity_times_area() {
         let second = weight.unwrap_or(opacity[1] / (opacity[0] + opacity[1]));
         let place = index_map(&workplace.path("out.ply.index_map.npy"))[0] as usize;
         let found = PlyRows::read(&workplace.path("out.ply")).value(place, "x");
-        close("x of the proxy", f64::from(found), second * f64::from(0.01f32), 1e-8);
+        assert_close("x of the proxy", f64::from(found), second * f64::from(0.01f32), 1e-8);
     }
 }

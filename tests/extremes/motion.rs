@@ -1,19 +1,19 @@
-//! Statistics of trajectories and lives, from a stream to rows.
+//! Tests of the statistics of trajectories and life spans, from a stream to scores.
 
 use std::f64::consts::TAU;
 
 use splatsieve::model::Attributes;
 
-use super::{Rows, Sequence, close};
+use super::{Rows, Sequence, assert_close};
 
 const ALIVE: f32 = 0.0;
 const DEAD: f32 = -7.0;
-/// Both ways to count motion; rounding noise stays in, as here nothing is noise.
+/// Presets of both definitions of motion. Noise removal is off, because these scenes have no noise.
 const RUNS: &str = "--preset default --set snap_noise=false";
 const LITERAL: &str = "--preset paper --set snap_noise=false";
 
-/// Rows of Gaussians that move along x, `x(i, t)`, with logits `life(i, t)`.
-fn walking(
+/// Returns the statistics of Gaussians that move along x by `x(i, t)`, with opacity logits `life(i, t)`.
+fn move_along_x(
     count: usize,
     frames: usize,
     flags: &str,
@@ -28,26 +28,27 @@ fn walking(
     })
 }
 
-/// A statistic of Gaussian `i`.
-fn of(rows: &Rows, name: &str, i: usize) -> f64 {
+/// Returns a statistic of Gaussian `i`.
+fn statistic(rows: &Rows, name: &str, i: usize) -> f64 {
     rows[name][i]
 }
 
-/// Row 4.
+/// Case 4.
 #[test]
 fn two_frames_have_one_step_and_no_curvature() {
-    let rows = walking(30, 2, RUNS, |i, t| (i * t) as f64 * 0.25, |_, _| ALIVE);
+    let rows = move_along_x(30, 2, RUNS, |i, t| (i * t) as f64 * 0.25, |_, _| ALIVE);
     for i in 0..30 {
         assert_eq!(
-            (of(&rows, "D", i), of(&rows, "kappa", i), of(&rows, "V", i)),
+            (statistic(&rows, "D", i), statistic(&rows, "kappa", i), statistic(&rows, "V", i)),
             (0.25 * i as f64, 0.0, 0.0),
             "Gaussian {i}"
         );
     }
 }
 
-/// Row 5, for a sweep of periods and phases: D to 1e-6 of itself, κ to 1e-6 of the amplitude, which is what rounding
-/// positions to f32 leaves of second differences of 4e-5; against those of the rounded positions κ holds to 1e-6 of itself.
+/// Case 5, for a range of periods and phases. D holds to a relative error of 1e-6, and κ to 1e-6 of the amplitude:
+/// rounding positions to f32 leaves that error in second differences of 4e-5. Against the second differences of the
+/// rounded positions κ holds to a relative error of 1e-6.
 #[test]
 #[ignore = "needs time"]
 fn sinusoids_over_100_000_frames_have_their_analytic_motion() {
@@ -56,7 +57,7 @@ fn sinusoids_over_100_000_frames_have_their_analytic_motion() {
     let x = |i: usize, t: usize| (TAU * t as f64 / PERIODS[i % 8] + i as f64).sin();
     let count = 2 * PERIODS.len();
     for (flags, literal) in [(RUNS, false), (LITERAL, true)] {
-        let rows = walking(count, T, flags, x, |_, _| ALIVE);
+        let rows = move_along_x(count, T, flags, x, |_, _| ALIVE);
         for i in 0..count {
             let steps: f64 = (1..T).map(|t| (x(i, t) - x(i, t - 1)).powi(2)).sum();
             // The paper divides by |life|.
@@ -66,15 +67,15 @@ fn sinusoids_over_100_000_frames_have_their_analytic_motion() {
             let rounded = |t: usize| f64::from(x(i, t) as f32);
             let of_rounded: f64 = (1..T - 1).map(|t| (rounded(t + 1) - 2.0 * rounded(t) + rounded(t - 1)).abs()).sum();
             let what = |name: &str| format!("{name} of period {}, {flags}", PERIODS[i % 8]);
-            close(what("D"), of(&rows, "D", i), d, 1e-6 * d);
-            close(what("kappa"), of(&rows, "kappa", i), turns / (T - 2) as f64, 1e-6);
+            assert_close(what("D"), statistic(&rows, "D", i), d, 1e-6 * d);
+            assert_close(what("kappa"), statistic(&rows, "kappa", i), turns / (T - 2) as f64, 1e-6);
             let kappa = of_rounded / (T - 2) as f64;
-            close(what("kappa of what was rounded"), of(&rows, "kappa", i), kappa, 1e-6 * kappa);
+            assert_close(what("kappa of what was rounded"), statistic(&rows, "kappa", i), kappa, 1e-6 * kappa);
         }
     }
 }
 
-/// Row 11, for opacities up to the last that f32 tells from 1, stored once and stored anew in every frame.
+/// Case 11, for opacities up to the largest f32 below 1, stored once and in every frame.
 #[test]
 #[ignore = "needs time"]
 fn constant_opacity_has_variance_exactly_0_over_100_000_frames() {
@@ -89,19 +90,19 @@ fn constant_opacity_has_variance_exactly_0_over_100_000_frames() {
     }
 }
 
-/// Row 12, for a sweep of distances.
+/// Case 12, for a range of distances.
 #[test]
-fn a_teleport_while_dead_changes_no_motion() {
+fn teleport_while_dead_changes_no_motion() {
     let distance = |i: usize| 2f64.powi(i as i32 - 10);
     let dead = |_: usize, t: usize| if (6..9).contains(&t) { DEAD } else { ALIVE };
-    let walk = move |i: usize, t: usize, jump: f64| 0.125 * t as f64 + if t >= 7 { jump * distance(i) } else { 0.0 };
-    let [still, jumped] = [0.0, 1.0].map(|jump| walking(30, 16, RUNS, move |i, t| walk(i, t, jump), dead));
+    let x = move |i: usize, t: usize, jump: f64| 0.125 * t as f64 + if t >= 7 { jump * distance(i) } else { 0.0 };
+    let [still, jumped] = [0.0, 1.0].map(|jump| move_along_x(30, 16, RUNS, move |i, t| x(i, t, jump), dead));
     for name in ["D", "kappa"] {
         for i in 0..30 {
-            close(
+            assert_close(
                 format!("{name} at {}", distance(i)),
-                of(&jumped, name, i),
-                of(&still, name, i),
+                statistic(&jumped, name, i),
+                statistic(&still, name, i),
                 1e-6 * distance(i).max(1.0) * 1e-1,
             );
         }
@@ -109,63 +110,64 @@ fn a_teleport_while_dead_changes_no_motion() {
     }
 }
 
-/// Row 13, for a sweep of distances; that it never merges: `merging.rs`.
+/// Case 13, for a range of distances; `merging.rs` checks that the pair never merges.
 #[test]
-fn a_teleport_while_alive_is_motion() {
+fn teleport_while_alive_is_motion() {
     let distance = |i: usize| 2f64.powi(i as i32 - 10);
-    let rows = walking(30, 10, RUNS, move |i, t| if t < 5 { 0.0 } else { distance(i) }, |_, _| ALIVE);
+    let rows = move_along_x(30, 10, RUNS, move |i, t| if t < 5 { 0.0 } else { distance(i) }, |_, _| ALIVE);
     for i in 0..30 {
-        close("D", of(&rows, "D", i), distance(i) / 3.0, 1e-12 * distance(i));
-        close("kappa", of(&rows, "kappa", i), 2.0 * distance(i) / 8.0, 1e-12 * distance(i));
+        assert_close("D", statistic(&rows, "D", i), distance(i) / 3.0, 1e-12 * distance(i));
+        assert_close("kappa", statistic(&rows, "kappa", i), 2.0 * distance(i) / 8.0, 1e-12 * distance(i));
     }
 }
 
-/// Row 14, wherever the life begins.
+/// Case 14, for every first frame of the life.
 #[test]
-fn lives_of_1_2_and_3_frames_have_0_0_and_1_curvature_terms() {
-    // Gaussian 3·b + l − 1 lives for l frames from frame b on.
+fn lives_of_1_2_3_frames_have_0_0_1_curvature_terms() {
+    // Gaussian 3·b + l − 1 is alive for l frames from frame b on.
     let life = |i: usize, t: usize| if (i / 3..i / 3 + i % 3 + 1).contains(&t) { ALIVE } else { DEAD };
     for flags in [RUNS, LITERAL] {
-        let rows = walking(21, 9, flags, |_, t| (t * t) as f64, life);
+        let rows = move_along_x(21, 9, flags, |_, t| (t * t) as f64, life);
         for i in 0..21 {
-            assert_eq!(of(&rows, "life", i), (i % 3 + 1) as f64);
+            assert_eq!(statistic(&rows, "life", i), (i % 3 + 1) as f64);
             // The second difference of t² is 2.
-            assert_eq!(of(&rows, "kappa", i), if i % 3 == 2 { 2.0 } else { 0.0 }, "{flags}, Gaussian {i}");
+            assert_eq!(statistic(&rows, "kappa", i), if i % 3 == 2 { 2.0 } else { 0.0 }, "{flags}, Gaussian {i}");
         }
     }
 }
 
-/// Row 15, for every pattern without two living frames side by side.
+/// Case 15, for every pattern without two adjacent alive frames.
 #[test]
 fn alternating_lives_have_no_interior_triples() {
     let life = |i: usize, t: usize| if t % (2 + i / 2) == i % 2 { ALIVE } else { DEAD };
-    let rows = walking(12, 19, RUNS, |_, t| (t * t) as f64, life);
+    let rows = move_along_x(12, 19, RUNS, |_, t| (t * t) as f64, life);
     for i in 0..12 {
-        assert_eq!((of(&rows, "D", i), of(&rows, "kappa", i)), (0.0, 0.0), "Gaussian {i}");
-        assert!(of(&rows, "life", i) >= 2.0, "Gaussian {i} must live");
+        assert_eq!((statistic(&rows, "D", i), statistic(&rows, "kappa", i)), (0.0, 0.0), "Gaussian {i}");
+        assert!(statistic(&rows, "life", i) >= 2.0, "Gaussian {i} must live");
     }
 }
 
-/// Row 16, wherever death comes, the end of the sequence included.
+/// Case 16, for death at any frame, also at the end of the sequence.
 #[test]
-fn the_turn_about_the_last_life_frame_is_discarded() {
-    // Straight until death, then far away: only a turn about the last life frame sees that.
+fn curvature_at_the_last_alive_frame_is_discarded() {
+    // Straight until death, then far away: only a second difference centered on the last alive frame would see the
+    // jump.
     let x = |i: usize, t: usize| if t <= i + 2 { t as f64 } else { 50.0 };
     let life = |i: usize, t: usize| if t <= i + 2 { ALIVE } else { DEAD };
     for flags in [RUNS, LITERAL] {
-        let rows = walking(8, 10, flags, x, life);
+        let rows = move_along_x(8, 10, flags, x, life);
         assert_eq!(rows["kappa"], [0.0; 8], "{flags}");
         assert_eq!(rows["life"], [3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0]);
     }
 }
 
-/// Row 19: whatever is not normal is a value like any other.
+/// Case 19: subnormal numbers are values like any other.
 #[test]
 fn subnormals_move_as_values_and_minus_0_is_0() {
     let step = |i: usize| f64::from(f32::from_bits(1)) * (i + 1) as f64;
-    let rows = walking(40, 6, RUNS, move |i, t| step(i) * t as f64, |_, _| ALIVE);
+    let rows = move_along_x(40, 6, RUNS, move |i, t| step(i) * t as f64, |_, _| ALIVE);
     for i in 0..40 {
-        close(format!("D of steps of {:e}", step(i)), of(&rows, "D", i), step(i), 1e-12 * step(i));
+        assert_close(format!("D of steps of {:e}", step(i)), statistic(&rows, "D", i), step(i), 1e-12 * step(i));
     }
     let signed = |zero: f32| {
         Sequence::new(40, 4, Attributes::POSITION | Attributes::OPACITY).rows(RUNS, move |t, state| {
@@ -181,15 +183,15 @@ fn subnormals_move_as_values_and_minus_0_is_0() {
     assert!(plus == minus, "the sign of 0 shows");
 }
 
-/// Row 25, for a sweep of offsets: what rests on jittering floats has no motion, and is counted; what moves has the motion of
-/// its rounded positions.
+/// Case 25, for a range of offsets: resting Gaussians whose floats jitter have no motion and are counted; moving
+/// Gaussians have the motion of their rounded positions.
 #[test]
-fn far_from_the_origin_noise_is_snapped_and_counted_and_motion_is_that_of_the_floats() {
+fn far_from_the_origin_float_noise_is_snapped_and_counted() {
     const RESTING: usize = 30;
     for exponent in 2..=7 {
         let offset = 10f64.powi(exponent);
         let ulp = f64::from((offset as f32).next_up()) - f64::from(offset as f32);
-        // Of every axis a pattern of its own, one ulp high; the others walk in steps of 64 ulps.
+        // Each axis has its own pattern, one ulp high; the other Gaussians move in steps of 64 ulps.
         let x = move |i: usize, t: usize| match i {
             0..RESTING => offset + ulp * ((t >> (i % 3)) % 2) as f64,
             _ => offset + 64.0 * ulp * (t * (i - RESTING + 1) % 7) as f64,
@@ -205,7 +207,7 @@ fn far_from_the_origin_noise_is_snapped_and_counted_and_motion_is_that_of_the_fl
             let at = |t: usize| f64::from(x(i, t) as f32);
             let steps: f64 = (1..40).map(|t| (at(t) - at(t - 1)).powi(2)).sum();
             let expected = if i < RESTING { 0.0 } else { (steps / 39.0).sqrt() };
-            close(format!("D of {i} at {offset:e}"), of(&rows, "D", i), expected, 1e-6 * expected);
+            assert_close(format!("D of {i} at {offset:e}"), statistic(&rows, "D", i), expected, 1e-6 * expected);
         }
         assert_eq!(summary["flags"]["snapped_d"], RESTING, "offset {offset:e}: {}", summary["flags"]);
     }

@@ -1,4 +1,4 @@
-//! Streams whose frames contradict one another.
+//! Tests of streams whose frames contradict one another.
 
 use super::scene::{Workplace, files};
 use super::{balls, piped};
@@ -7,7 +7,7 @@ use splatsieve::model::Attributes;
 use splatsieve::outputs::frame_stream::StreamWriter;
 use std::path::Path;
 
-/// A stream of five frames of four balls.
+/// Returns a stream of five frames with four balls.
 fn stream() -> Vec<u8> {
     let (mut bytes, state) = (Vec::new(), balls(4));
     let header = StreamHeader { count: 4, sh_degree: 0, varying: Attributes::POSITION, is_unlinked: false };
@@ -17,12 +17,13 @@ fn stream() -> Vec<u8> {
     bytes
 }
 
-/// Where frame `t` begins: header, four balls without their positions, then marks of 24 bytes and positions.
-fn frame(t: usize) -> usize {
+/// Returns the byte offset of frame `t`: header, four balls without positions, then for each frame a mark of 24 bytes
+/// and positions.
+fn frame_offset(t: usize) -> usize {
     32 + 4 * 4 * (4 + 3 + 1 + 3) + t * (24 + 4 * 4 * 3)
 }
 
-/// Every verb that reads streams refuses `bytes` with these parts in its message, and leaves nothing.
+/// Checks that every command that reads streams refuses `bytes` with these parts in its message, and leaves no files.
 fn refused(bytes: &[u8], parts: &[&str]) {
     for arguments in ["compress - -o out", "convert - a.gseq", "score - -o rows.npz", "info -"] {
         let (workplace, bytes) = (Workplace::new(), bytes.to_owned());
@@ -36,9 +37,9 @@ fn refused(bytes: &[u8], parts: &[&str]) {
     }
 }
 
-/// Row 41.
+/// Case 41.
 #[test]
-fn time_stamps_that_do_not_increase_are_named() {
+fn nonincreasing_time_stamps_are_named() {
     for (stamp, expected) in [
         (2.0, "a time stamp above 2, that of frame 2"),
         (-1e300, "a time stamp above 2, that of frame 2"),
@@ -48,25 +49,25 @@ fn time_stamps_that_do_not_increase_are_named() {
         (f64::NEG_INFINITY, "a time stamp"),
     ] {
         let mut bytes = stream();
-        bytes[frame(3) + 8..frame(3) + 16].copy_from_slice(&stamp.to_le_bytes());
+        bytes[frame_offset(3) + 8..frame_offset(3) + 16].copy_from_slice(&stamp.to_le_bytes());
         refused(&bytes, &["standard input, frame 3", expected]);
     }
 }
 
-/// Row 43.
+/// Case 43.
 #[test]
-fn frames_of_another_size_or_columns_are_named() {
-    // (length that frame 3 claims, what the message makes of it)
+fn frames_of_another_size_or_attributes_are_named() {
+    // (length that frame 3 claims, number of Gaussians that the message computes from it)
     for (length, found) in
         [(5 * 4 * 3u64, "5 Gaussians"), (0, "0 Gaussians"), (4 * 4 * 7 + 4, "no number of Gaussians")]
     {
         let mut bytes = stream();
-        bytes[frame(3) + 16..frame(3) + 24].copy_from_slice(&length.to_le_bytes());
+        bytes[frame_offset(3) + 16..frame_offset(3) + 24].copy_from_slice(&length.to_le_bytes());
         refused(&bytes, &["standard input, frame 3", "4 Gaussians of position", found]);
     }
     for (index, found) in [(2u32, "frame 2"), (4, "frame 4")] {
         let mut bytes = stream();
-        bytes[frame(3) + 4..frame(3) + 8].copy_from_slice(&index.to_le_bytes());
+        bytes[frame_offset(3) + 4..frame_offset(3) + 8].copy_from_slice(&index.to_le_bytes());
         refused(&bytes, &["standard input, frame 3", "expected frame 3", found]);
     }
 }

@@ -1,7 +1,7 @@
 //! Binary inputs that announce more than they hold: PLY files, frame streams, containers, archives and arrays; and files
 //! of other kinds than regular ones in their place.
 //!
-//! Large inputs are sparse: they take no room on the disk and no memory of the test process.
+//! Large inputs are sparse files: they take no space on disk and no memory of the test process.
 
 use std::fs::{self, File};
 use std::io::{self, BufWriter, Read, Write};
@@ -19,17 +19,17 @@ use crate::runner::{Folder, MIB, Outcome, Random, SMALL_MEMORY, is_optimized, se
 
 /// Properties of a PLY of SH degree 0.
 const NAMES: &str = "x y z f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3";
-/// Bytes of a row of them.
+/// Bytes of a row with these properties.
 const ROW: u64 = 14 * 4;
 
-/// Writes a file of `head` and then zeros up to `len` bytes, which take no room on the disk.
+/// Writes a file with `head` and then zeros up to `len` bytes; the zeros take no space on disk.
 fn sparse(folder: &Folder, name: &str, head: impl AsRef<[u8]>, len: u64) -> PathBuf {
     let path = folder.write(name, head);
     File::options().write(true).open(&path).unwrap().set_len(len).unwrap();
     path
 }
 
-/// Header of a PLY of `count` Gaussians with `extra` further properties.
+/// Returns the header of a PLY of `count` Gaussians with `extra` further properties.
 fn ply_header(format: &str, count: u64, extra: usize) -> String {
     let mut header = format!("ply\nformat {format} 1.0\nelement vertex {count}\n");
     NAMES.split(' ').for_each(|name| header += &format!("property float {name}\n"));
@@ -37,7 +37,7 @@ fn ply_header(format: &str, count: u64, extra: usize) -> String {
     header + "end_header\n"
 }
 
-/// Row `i` of a PLY with `extra` further properties.
+/// Returns row `i` of a PLY with `extra` further properties.
 fn ply_row(i: usize, extra: usize) -> Vec<u8> {
     let values = [(i % 31) as f32, (i % 17) as f32, (i % 7) as f32, 0.5, 0.5, 0.5, 2.0, -3.0, -3.0, -3.0, 1.0];
     let mut row: Vec<u8> = values.iter().flat_map(|value| value.to_le_bytes()).collect();
@@ -93,7 +93,7 @@ fn archive_of_a_ply_with_a_large_tail_names_the_limit() {
 }
 
 #[test]
-fn ply_headers_of_bombs_end_soon_and_small() {
+fn malicious_ply_headers_are_refused_in_little_memory() {
     let folder = Folder::new();
     let whole = ply_header("binary_little_endian", 10, 0);
     let more = |count: usize, line: &str| {
@@ -134,7 +134,7 @@ fn ply_of_a_gigabyte_without_a_line_end_is_refused() {
 }
 
 #[test]
-fn text_ply_is_parsed_once_however_many_blocks_it_has() {
+fn text_ply_is_parsed_once_for_any_number_of_blocks() {
     let folder = Folder::new();
     let rows = if is_optimized() { 200_000 } else { 30_000 };
     text_ply(&folder, "text.ply", rows);
@@ -152,7 +152,7 @@ fn text_ply(folder: &Folder, name: &str, rows: u64) {
     }
 }
 
-/// Header of a frame stream (format/STREAM.md).
+/// Returns the header of a frame stream (format/STREAM.md).
 fn stream_header(version: u32, gaussians: u64, columns: u32) -> Vec<u8> {
     let mut out = b"\x89GSTR\r\n\x1a".to_vec();
     out.extend([version, 0].map(u32::to_le_bytes).concat());
@@ -161,7 +161,7 @@ fn stream_header(version: u32, gaussians: u64, columns: u32) -> Vec<u8> {
     out
 }
 
-/// What stands before a frame of `bytes` bytes.
+/// Returns the bytes in front of a frame of `bytes` bytes.
 fn stream_frame(bytes: u64) -> Vec<u8> {
     [&b"FRAM"[..], &0u32.to_le_bytes(), &0f64.to_le_bytes(), &bytes.to_le_bytes()].concat()
 }
@@ -197,7 +197,7 @@ fn stream_with_constant_rows_beyond_memory_is_refused() {
     small_with_stdin(&folder, "info -", &path).refused(1, &["standard input, byte 16", "constant columns"]);
 }
 
-/// Bytes of an archive with these stored sections and lengths of content (format/ARCHIVE.md).
+/// Returns an archive with these stored sections and declared lengths of their content (format/ARCHIVE.md).
 fn archive(stored: [&[u8]; 4], content: [u64; 4]) -> Vec<u8> {
     let mut out = b"\x89GSZ\r\n\x1a\n\x01\0\0\0".to_vec();
     for (bytes, length) in stored.iter().zip(content) {
@@ -208,7 +208,7 @@ fn archive(stored: [&[u8]; 4], content: [u64; 4]) -> Vec<u8> {
     out
 }
 
-/// So many zeros as a zstd frame.
+/// Returns `count` zeros as a zstd frame.
 fn packed_zeros(count: u64) -> Vec<u8> {
     let mut encoder = zstd::stream::Encoder::new(Vec::new(), 1).unwrap();
     io::copy(&mut io::repeat(0).take(count), &mut encoder).unwrap();
@@ -228,7 +228,7 @@ fn archives_that_decompress_to_gigabytes_are_refused() {
     ];
     for (name, bytes, says) in bombs {
         folder.write(&format!("{name}.gsz"), bytes);
-        // Whatever the budget is.
+        // The limit does not depend on `--memory`.
         let arguments = [format!("info {name}.gsz"), format!("convert {name}.gsz out")];
         for arguments in arguments {
             let outcome = folder.attack(&arguments).run().refused(1, &[&format!("{name}.gsz"), says]);
@@ -240,7 +240,7 @@ fn archives_that_decompress_to_gigabytes_are_refused() {
 }
 
 #[test]
-fn sparse_archives_are_refused_by_their_head() {
+fn sparse_archives_are_refused_by_their_header() {
     let folder = Folder::new();
     sparse(&folder, "zeros.gsz", "", 3 << 30);
     folder.attack("info zeros.gsz").run().refused(1, &["zeros.gsz, byte 0"]).within(SMALL_MEMORY.1);
@@ -312,7 +312,7 @@ fn arrays_that_unpack_to_far_more_than_their_file_are_refused() {
 }
 
 #[test]
-fn zip_ends_that_announce_too_many_files_are_refused() {
+fn zip_directories_with_too_many_files_are_refused() {
     let folder = Folder::new();
     let end = |files: u16, list: u32| {
         let mut end = b"PK\x05\x06\0\0\0\0".to_vec();
@@ -341,7 +341,7 @@ fn splatv_of_100_mib_of_zeros_keeps_within_memory() {
     let len = head.len() as u64 + size;
     let path = sparse(&folder, "zeros.splatv", &head, len);
     small(&folder, "info zeros.splatv").ended();
-    // A last byte that is not zero makes every row before it a Gaussian.
+    // With a last byte that is not zero every row before it is a Gaussian.
     File::options().write(true).open(&path).unwrap().set_len(len - 1).unwrap();
     File::options().append(true).open(&path).unwrap().write_all(&[1]).unwrap();
     small(&folder, "info zeros.splatv").refused(1, &["zeros.splatv, its texture", "--memory"]);
@@ -351,7 +351,7 @@ fn splatv_of_100_mib_of_zeros_keeps_within_memory() {
 }
 
 #[test]
-fn container_with_2_to_the_27_announced_frames_is_refused() {
+fn container_declaring_2_to_the_27_frames_is_refused() {
     let folder = Folder::new();
     let path = folder.path("bomb.gseq");
     let columns = [("position", 3), ("rotation", 4), ("log_scale", 3), ("opacity_logit", 1), ("sh", 3)];
@@ -395,7 +395,7 @@ fn files_of_other_kinds_are_refused_by_name_without_waiting() {
 }
 
 #[test]
-fn pipe_as_a_frame_or_a_picture_is_not_waited_for() {
+fn pipe_as_a_frame_or_an_image_is_not_waited_for() {
     let folder = Folder::new();
     let pipe = |name: &str| {
         let path = folder.path(name);
@@ -419,7 +419,7 @@ fn pipe_as_a_frame_or_a_picture_is_not_waited_for() {
 }
 
 #[test]
-fn input_cut_short_while_it_is_read_is_an_error_that_names_it() {
+fn input_cut_short_while_read_is_an_error_that_names_it() {
     cut_while_read(if is_optimized() { 24 } else { 6 });
 }
 

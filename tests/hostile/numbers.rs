@@ -1,4 +1,4 @@
-//! Tiny counts, empty inputs and one extreme value per attribute.
+//! Tests of tiny counts, empty inputs, and one extreme value per attribute.
 
 use std::fs;
 use std::path::PathBuf;
@@ -12,7 +12,7 @@ use crate::runner::{Attack, Folder, Outcome};
 const QUICK: &str =
     "--cameras cameras.json --set refine_pictures=26 --set refine_steps=12 --set refine_cut_steps=3 --quiet";
 
-/// Gaussians of a middle size strewn over a cube of side 2 by the golden ratio, of SH degree 1.
+/// Returns Gaussians of medium size and SH degree 1, distributed over a cube of side 2 by the golden ratio.
 fn cloud(count: usize) -> Gaussians {
     let mut cloud = Gaussians::zeros(count, 1);
     let at = |k: usize| ((k + 1) as f32 * 0.618_034).fract();
@@ -26,14 +26,14 @@ fn cloud(count: usize) -> Gaussians {
     cloud
 }
 
-/// A folder with `cameras.json`, six small pictures from all sides, and the given Gaussians as `in.ply`.
-fn folder_of(cloud: &Gaussians) -> Folder {
+/// Returns a folder with `cameras.json` (six small images from all sides) and the given Gaussians as `in.ply`.
+fn folder_with(cloud: &Gaussians) -> Folder {
     let folder = Folder::new();
     write_inria(cloud, &[], &folder.path("in.ply")).unwrap();
     let axes = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
     let turned = [axes, [axes[2], axes[1], [-1.0, 0.0, 0.0]], [axes[0], [0.0, 0.0, -1.0], axes[1]]];
     let camera = |k: usize| {
-        // Rows of camera to world: the third column looks at the origin.
+        // Rows of the camera-to-world matrix: the third column points at the origin.
         let sign = if k < 3 { 1.0 } else { -1.0 };
         let rotation = turned[k % 3].map(|row| [sign * row[0], row[1], sign * row[2]]);
         let position = [0, 1, 2].map(|axis| -4.0 * rotation[axis][2]);
@@ -49,7 +49,7 @@ fn compress(folder: &Folder, output: &str, options: &str) -> Attack {
     folder.attack(&format!("compress in.ply -o {output} {QUICK} {options}"))
 }
 
-/// The summary beside `output`.
+/// Reads the summary beside `output`.
 fn summary(folder: &Folder, output: &str) -> serde_json::Value {
     let path = match folder.path(output).is_dir() {
         true => format!("{output}/summary.json"),
@@ -58,8 +58,8 @@ fn summary(folder: &Folder, output: &str) -> serde_json::Value {
     serde_json::from_str(&fs::read_to_string(folder.path(&path)).unwrap()).unwrap()
 }
 
-/// Confirms that a run which ended has written all of `output`, or has said why not and left nothing of it; returns the
-/// number of Gaussians in it.
+/// Checks that a run either wrote all of `output` or explained its failure and left no part of it. Returns the number
+/// of Gaussians in the output.
 fn wrote_all_or_nothing(outcome: Outcome, folder: &Folder, output: &str) -> Option<u64> {
     let outcome = outcome.ended();
     if outcome.code == Some(0) {
@@ -77,17 +77,17 @@ fn wrote_all_or_nothing(outcome: Outcome, folder: &Folder, output: &str) -> Opti
 }
 
 #[test]
-fn searches_among_less_than_six_gaussians_end() {
+fn searches_with_fewer_than_six_gaussians_end() {
     for count in [1, 3, 5] {
-        let folder = folder_of(&cloud(count));
+        let folder = folder_with(&cloud(count));
         let left = wrote_all_or_nothing(compress(&folder, "out.ply", "--min-psnr 30dB").run(), &folder, "out.ply");
         assert!((1..=count as u64).contains(&left.unwrap()), "{left:?} of {count}");
     }
 }
 
 #[test]
-fn no_gaussians_give_an_empty_output_by_any_size() {
-    let folder = folder_of(&cloud(0));
+fn no_gaussians_give_an_empty_output_for_any_target() {
+    let folder = folder_with(&cloud(0));
     for size in ["", "--ratio 0.5", "--count 1", "--min-psnr 30dB", "--size 100kB"] {
         let outcome = compress(&folder, "out.ply", size).run().succeeded();
         assert_eq!(summary(&folder, "out.ply")["gaussians"], 0, "{}", outcome.shown);
@@ -99,26 +99,26 @@ fn no_gaussians_give_an_empty_output_by_any_size() {
 
 #[test]
 fn recipe_values_that_make_a_run_endless_are_refused() {
-    let folder = folder_of(&cloud(7));
+    let folder = folder_with(&cloud(7));
     let refused = |options: &str, parts: &[&str]| {
         compress(&folder, "out.ply", options).run().refused(2, parts);
     };
     refused("--ratio 0.5 --set round_fraction=0.9999999999", &["select.round_fraction", "0.1 to 0.99"]);
-    let folder = folder_of(&cloud(7));
-    let outcome =
-        folder.attack("compress in.ply -o out.ply --cameras cameras.json --set refine_steps=4000000000").run();
+    let folder = folder_with(&cloud(7));
+    let outcome = folder.attack("compress in.ply -o out.ply --cameras cameras.json --set refine_steps=4000000000").run();
     outcome.refused(2, &["refine.refine_steps", "0 to 1000000"]);
 }
 
-/// The last of 41 Gaussians has an infinite color: without it the ids of the others are the same.
+/// The last of 41 Gaussians has an infinite color; without it the ids of the others are the same.
 #[test]
 fn dropped_gaussians_change_no_byte_of_the_others() {
     let whole = cloud(40);
     let mut odd = whole.pick(&(0..40).chain([39]).collect::<Vec<u32>>());
     odd.sh.plane_mut(0)[40] = f32::INFINITY;
     odd.sh.plane_mut(1)[40] = f32::NAN;
-    let [odd, whole] = [odd, whole].map(|cloud| folder_of(&cloud));
-    for (output, size) in [("a.ply", "--count 25"), ("b.ply", "--min-psnr 25dB"), ("c.gsz", "--count 30")] {
+    let [odd, whole] = [odd, whole].map(|cloud| folder_with(&cloud));
+    for (output, size) in [("a.ply", "--count 25"), ("b.ply", "--min-psnr 25dB"), ("c.gsz", "--count 30")]
+    {
         let options = format!("{size} --no-refine");
         compress(&odd, output, &format!("{options} --set non_finite=drop")).run().succeeded();
         compress(&whole, output, &options).run().succeeded();
@@ -128,22 +128,22 @@ fn dropped_gaussians_change_no_byte_of_the_others() {
 }
 
 #[test]
-fn an_infinite_color_is_no_panic_in_an_archive() {
+fn infinite_color_in_an_archive_is_no_panic() {
     let mut odd = cloud(16);
     odd.sh.plane_mut(2)[3] = f32::INFINITY;
-    let folder = folder_of(&odd);
+    let folder = folder_with(&odd);
     let left = wrote_all_or_nothing(compress(&folder, "q.gsz", "--set non_finite=drop").run(), &folder, "q.gsz");
     assert!(left.unwrap() <= 15);
-    let folder = folder_of(&odd);
+    let folder = folder_with(&odd);
     let outcome = compress(&folder, "q.gsz", "--set non_finite=keep").run();
     assert_eq!(wrote_all_or_nothing(outcome, &folder, "q.gsz"), None, "an archive holds finite values");
 }
 
 #[test]
-fn lossy_files_are_refused_where_an_outlier_takes_their_bits() {
+fn lossy_files_are_refused_if_an_outlier_takes_all_bits() {
     let mut odd = cloud(50);
     odd.position.plane_mut(0)[3] = 1e7;
-    let folder = folder_of(&odd);
+    let folder = folder_with(&odd);
     let before = folder.names();
     let attack = folder.attack("convert in.ply out.spz --quiet");
     attack.run().refused(2, &["a .spz", "position of Gaussian", "scene units", "Gaussian 3 is the furthest"]);
@@ -159,7 +159,7 @@ fn lossy_files_are_refused_where_an_outlier_takes_their_bits() {
     assert_eq!(folder.names(), before);
 }
 
-/// An edit of Gaussian 3, by name.
+/// Change of Gaussian 3, by name.
 type Edit = (&'static str, fn(&mut Gaussians));
 
 /// Values that are not finite, one per attribute.
@@ -174,7 +174,7 @@ const NOT_FINITE: [Edit; 8] = [
     ("harmonic nan", |cloud| cloud.sh.plane_mut(7)[3] = f32::NAN),
 ];
 
-/// Finite values that are far beyond those of any scene.
+/// Finite values far beyond those of any scene.
 const EXTREME: [Edit; 12] = [
     ("position 1e30", |cloud| cloud.position.plane_mut(1)[3] = 1e30),
     ("position 1e7", |cloud| cloud.position.plane_mut(0)[3] = 1e7),
@@ -192,22 +192,22 @@ const EXTREME: [Edit; 12] = [
 
 const OUTPUTS: [&str; 5] = ["out.ply", "out.gseq", "out.spz", "out.splatv", "out.gsz"];
 
-/// A folder with the Gaussians that `edit` makes of 24.
-fn edited(edit: &Edit) -> Folder {
+/// Returns a folder with 24 Gaussians changed by `edit`.
+fn folder_with_edit(edit: &Edit) -> Folder {
     let mut cloud = cloud(24);
     (edit.1)(&mut cloud);
-    folder_of(&cloud)
+    folder_with(&cloud)
 }
 
 #[test]
 #[ignore = "slow: 225 runs"]
-fn slow_tiny_counts_by_every_size_to_every_kind_end() {
+fn slow_few_gaussians_end_for_every_target_and_output() {
     let sizes = ["", "--ratio 0.5", "--count 2", "--min-psnr 20dB", "--size 200kB"];
     for count in [0u64, 1, 2, 3, 4, 5, 7, 16, 50] {
         let cloud = cloud(count as usize);
         for size in sizes {
             for output in OUTPUTS {
-                let folder = folder_of(&cloud);
+                let folder = folder_with(&cloud);
                 let left = wrote_all_or_nothing(compress(&folder, output, size).run(), &folder, output);
                 let case = format!("{count} Gaussians, {size:?}, {output}: {left:?}");
                 match (size, left) {
@@ -226,15 +226,15 @@ fn slow_tiny_counts_by_every_size_to_every_kind_end() {
 
 #[test]
 #[ignore = "slow: 136 runs"]
-fn slow_values_that_are_not_finite_are_refused_dropped_or_kept() {
+fn slow_nonfinite_values_are_refused_dropped_or_kept() {
     for edit in &NOT_FINITE {
-        let folder = edited(edit);
+        let folder = folder_with_edit(edit);
         for size in ["", "--ratio 0.5"] {
             compress(&folder, "out.ply", size).run().refused(1, &["in.ply", "Gaussian 3", "--non-finite"]);
         }
         for size in ["--ratio 0.5", "--min-psnr 20dB", "--size 100kB"] {
             for output in OUTPUTS {
-                let folder = edited(edit);
+                let folder = folder_with_edit(edit);
                 let outcome = compress(&folder, output, &format!("{size} --set non_finite=drop")).run();
                 let left = wrote_all_or_nothing(outcome, &folder, output);
                 assert!(left.is_some_and(|left| (1..=23).contains(&left)), "{}, {size}, {output}: {left:?}", edit.0);
@@ -245,11 +245,11 @@ fn slow_values_that_are_not_finite_are_refused_dropped_or_kept() {
 
 #[test]
 #[ignore = "slow: 120 runs"]
-fn slow_values_that_are_kept_though_not_finite_end() {
+fn slow_runs_that_keep_nonfinite_values_end() {
     for edit in &NOT_FINITE {
         for size in ["", "--ratio 0.5", "--min-psnr 20dB"] {
             for output in OUTPUTS {
-                let folder = edited(edit);
+                let folder = folder_with_edit(edit);
                 let outcome = compress(&folder, output, &format!("{size} --set non_finite=keep")).run();
                 wrote_all_or_nothing(outcome, &folder, output);
             }
@@ -263,7 +263,7 @@ fn slow_extreme_values_end_with_a_result_or_a_clear_error() {
     for edit in &EXTREME {
         for size in ["", "--ratio 0.5", "--min-psnr 20dB"] {
             for output in OUTPUTS {
-                let folder = edited(edit);
+                let folder = folder_with_edit(edit);
                 let left = wrote_all_or_nothing(compress(&folder, output, size).run(), &folder, output);
                 let is_exact = output == "out.ply" || output == "out.gseq";
                 let is_seen = edit.0 != "all behind the cameras";
@@ -277,7 +277,7 @@ fn slow_extreme_values_end_with_a_result_or_a_clear_error() {
 #[ignore = "slow: sweep and precision of 0 and 3 Gaussians"]
 fn slow_sweep_and_precision_of_few_gaussians_end() {
     for count in [0, 3] {
-        let folder = folder_of(&cloud(count));
+        let folder = folder_with(&cloud(count));
         for attack in [
             "sweep in.ply --cameras cameras.json --fractions 0.5,1 --methods default,paper --steps 10 -o sweep --quiet",
             "precision in.ply --cameras cameras.json -o precision --runs 1 --max-frames 1 --set refine_steps=12 --quiet",
@@ -291,7 +291,7 @@ fn slow_sweep_and_precision_of_few_gaussians_end() {
 #[test]
 #[ignore = "slow: 12 runs"]
 fn slow_extreme_parameters_end() {
-    let folder = folder_of(&cloud(16));
+    let folder = folder_with(&cloud(16));
     for (k, options) in [
         "--epsilon 1e300 --no-refine",
         "--set max_neighbors=1024 --no-refine",

@@ -1,4 +1,4 @@
-//! Links, devices, shared outputs, kills and failures in place of ordinary output files.
+//! Tests of links, devices, shared outputs, kills and failures in place of ordinary output files.
 
 use std::collections::BTreeMap;
 use std::ffi::CString;
@@ -17,9 +17,9 @@ use super::runner::{Folder, Outcome, Random, SMALL_MEMORY, is_optimized, program
 
 /// Gaussians of the smallest input.
 const COUNT: usize = 40;
-/// First line of the lock file in a workspace of the program, as `src/files/atomic/workspace.rs` has it.
+/// First line of the lock file in a workspace of the program, defined in `src/files/atomic/workspace.rs`.
 const LOCK_LINE: &str = "workspace of a splatsieve run\n";
-/// User without rights of its own, for tests that the superuser runs.
+/// User without privileges, for tests that the superuser runs.
 const NOBODY: u32 = 65534;
 
 /// Writes a PLY of [`COUNT`] Gaussians as `in.ply`, and a camera of a few pixels as `views.json`.
@@ -51,18 +51,18 @@ fn folder_with_input() -> Folder {
     folder
 }
 
-/// Names in the folder besides the input.
+/// Returns the names in the folder except the input.
 fn outputs(folder: &Folder) -> Vec<String> {
     folder.names().into_iter().filter(|name| name != "in.ply" && name != "views.json").collect()
 }
 
-/// Arguments of the fastest run that writes four files, or a folder: `count` Gaussians are kept.
+/// Returns the arguments of the fastest run that writes four files, or a folder, and keeps `count` Gaussians.
 fn compress(output: &str, count: u64) -> String {
     let fast = "--cameras views.json --prune-only --no-refine --threads 1 --quiet";
     format!("compress in.ply -o {output} --count {count} {fast}")
 }
 
-/// Number of Gaussians in a PLY.
+/// Returns the number of Gaussians in a PLY.
 fn ply_count(path: &Path) -> usize {
     let bytes = fs::read(path).unwrap();
     let header = String::from_utf8_lossy(&bytes[..bytes.len().min(200)]).into_owned();
@@ -70,8 +70,8 @@ fn ply_count(path: &Path) -> usize {
     count.parse().unwrap()
 }
 
-/// Number of Gaussians in a result and in each of the files beside it: equal if all belong to one run. `None` if no file
-/// of the result exists.
+/// Returns the number of Gaussians in a result and in each file beside it, which are equal if all files belong to one
+/// run. Returns `None` if no file of the result exists.
 fn counts_of_set(folder: &Folder, output: &str) -> Option<Vec<usize>> {
     let path = |name: &str| match folder.path(output).is_dir() {
         true => folder.path(output).join(name),
@@ -97,7 +97,7 @@ fn counts_of_set(folder: &Folder, output: &str) -> Option<Vec<usize>> {
     Some(vec![ply_count(&main), summary["gaussians"].as_u64().unwrap() as usize, target.parse().unwrap(), kept])
 }
 
-/// Confirms that all files of a result belong to one run.
+/// Checks that all files of a result belong to one run.
 fn check_set(folder: &Folder, output: &str) {
     if let Some(counts) = counts_of_set(folder, output) {
         let is_one = counts.iter().all(|count| *count == counts[0]);
@@ -105,13 +105,13 @@ fn check_set(folder: &Folder, output: &str) {
     }
 }
 
-/// Confirms that no workspace of the program is left in the folder; `foreign` entries have such names, too.
+/// Checks that no workspace of the program is left in the folder, except `foreign` entries with such names.
 fn check_no_leftovers(folder: &Folder, foreign: &[&str]) {
     let left: Vec<String> = folder.names().into_iter().filter(|name| name.contains("splatsieve-tmp")).collect();
     assert_eq!(left, foreign);
 }
 
-/// All entries below a folder: contents of files, targets of links.
+/// Returns all entries below a folder: contents of files, targets of links.
 fn tree(path: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
     let mut found = BTreeMap::new();
     for entry in fs::read_dir(path).unwrap() {
@@ -140,7 +140,7 @@ fn is_superuser() -> bool {
     unsafe { libc::geteuid() == 0 }
 }
 
-/// A folder in which everybody may write, and the change that starts a program as an ordinary user.
+/// Makes the folder writable for everybody. Returns the change that starts a program as an unprivileged user.
 fn ordinary_user(folder: &Folder) -> impl Fn(&mut Command) {
     fs::set_permissions(folder.path(""), fs::Permissions::from_mode(0o777)).unwrap();
     |command: &mut Command| {
@@ -151,7 +151,7 @@ fn ordinary_user(folder: &Folder) -> impl Fn(&mut Command) {
 }
 
 #[test]
-fn a_link_named_like_a_leftover_is_not_followed() {
+fn link_named_like_a_leftover_is_not_followed() {
     let folder = folder_with_input();
     folder.write("victim/thesis", "years of work");
     folder.write("victim/lock", LOCK_LINE);
@@ -177,7 +177,7 @@ fn a_folder_named_like_a_leftover_stays() {
 }
 
 #[test]
-fn a_lock_that_is_a_fifo_or_a_link_is_left_alone() {
+fn lock_that_is_a_fifo_or_a_link_is_left_alone() {
     let folder = folder_with_input();
     let lock = folder.write("precious", LOCK_LINE);
     for name in [".small.ply.a.splatsieve-tmp", ".small.ply.b.splatsieve-tmp"] {
@@ -192,7 +192,7 @@ fn a_lock_that_is_a_fifo_or_a_link_is_left_alone() {
 }
 
 #[test]
-fn a_link_in_a_leftover_goes_and_its_target_stays() {
+fn link_in_a_leftover_goes_and_its_target_stays() {
     let folder = folder_with_input();
     folder.write("victim/thesis", "years of work");
     folder.write(".small.ply.AbCdEf.splatsieve-tmp/lock", LOCK_LINE);
@@ -301,7 +301,7 @@ fn a_folder_does_not_replace_a_device() {
 }
 
 #[test]
-fn of_parallel_runs_without_flags_exactly_one_succeeds() {
+fn exactly_one_of_parallel_runs_without_flags_succeeds() {
     let folder = folder_with_input();
     for round in 0..10 {
         let output = format!("{round}.ply");
@@ -330,7 +330,7 @@ fn parallel_overwriting_runs_do_not_mix_their_files() {
 }
 
 #[test]
-fn a_huge_or_endless_summary_is_not_read() {
+fn huge_or_endless_summary_is_not_read() {
     let folder = folder_with_input();
     folder.attack("convert in.ply small.ply").run().succeeded();
     let summary = File::create(folder.path("small.ply.summary.json")).unwrap();
@@ -451,8 +451,8 @@ impl WithUser for Command {
     }
 }
 
-/// Runs that the stress test starts at a time.
-const AT_ONCE: usize = 3;
+/// Number of runs that the stress test starts at the same time.
+const PARALLEL_RUNS: usize = 3;
 /// Names of outputs that share a folder: three files with their companions, and a folder.
 const SHARED: [&str; 4] = ["a.ply", "b.ply", "c.ply", "d"];
 
@@ -471,7 +471,7 @@ fn prepare_stress(folder: &Folder) -> Vec<&'static str> {
     vec![links[0], ".b.ply.AbCdEf.splatsieve-tmp", links[1], links[2]]
 }
 
-/// Entries that no run may change.
+/// Returns the entries that no run may change.
 fn foreign_entries(folder: &Folder) -> Vec<BTreeMap<PathBuf, Vec<u8>>> {
     let file = |name: &str| {
         let path = folder.path(name);
@@ -488,7 +488,7 @@ fn foreign_entries(folder: &Folder) -> Vec<BTreeMap<PathBuf, Vec<u8>>> {
     ]
 }
 
-/// Arguments of a run of the stress test.
+/// Returns the arguments of a run of the stress test.
 fn stress_line(random: &mut Random, output: &str) -> String {
     // --overwrite would replace the folder with the foreign file in it.
     let flags =
@@ -507,15 +507,15 @@ fn slow_killed_parallel_runs_neither_mix_nor_lose_files() {
     let before = foreign_entries(&folder);
     let start = Instant::now();
     folder.attack(&compress("c.ply", 20)).run().succeeded();
-    // Kills come at any time of a run, often in its last part, in which it publishes.
-    let mut usual = start.elapsed().as_secs_f64() * AT_ONCE as f64 / 2.0;
+    // Kills come at any time of a run, often in its last part, in which it publishes its files.
+    let mut usual = start.elapsed().as_secs_f64() * PARALLEL_RUNS as f64 / 2.0;
     let (mut runs, mut kills, mut published) = (0, 0, 0);
     let total = if is_optimized() { 1000 } else { 100 };
     while runs < total {
         let mut batch = Vec::new();
         let started = Instant::now();
-        for _ in 0..AT_ONCE {
-            // Mostly the same output, so that the runs meet.
+        for _ in 0..PARALLEL_RUNS {
+            // The same output is drawn most often, so that runs collide.
             let output = SHARED[random.below(4).min(random.below(4)) as usize];
             let signal = [None, Some(libc::SIGKILL), Some(libc::SIGTERM)][random.below(3) as usize];
             let delay = usual * random.below(1000) as f64 / 800.0;

@@ -1,4 +1,4 @@
-//! Starts the program under attack and measures what it takes.
+//! Starts the program under test and measures what it uses.
 
 #![allow(dead_code, reason = "each attack uses a part of this module")]
 
@@ -15,20 +15,20 @@ use tempfile::TempDir;
 /// Bytes of one MiB.
 pub(crate) const MIB: u64 = 1 << 20;
 
-/// Memory that every resource bomb must stay within, as the value of `--memory` and in bytes.
+/// Memory limit of every test of an oversized input, as the value of `--memory` and in bytes.
 pub(crate) const SMALL_MEMORY: (&str, u64) = ("64MiB", 64 * MIB);
 
-/// Seconds that one run may take. An unoptimized program gets more.
+/// Returns the time limit of one run in seconds; longer for an unoptimized program.
 pub(crate) fn time_limit() -> f64 {
     if is_optimized() { 10.0 } else { 60.0 }
 }
 
-/// Whether `SPLATSIEVE_PROGRAM` names an optimized program to attack instead of the one built with the tests.
+/// Returns whether `SPLATSIEVE_PROGRAM` names an optimized program to test in place of the one built with the tests.
 pub(crate) fn is_optimized() -> bool {
     std::env::var_os("SPLATSIEVE_PROGRAM").is_some()
 }
 
-/// Path of the program under attack.
+/// Returns the path of the program under test.
 pub(crate) fn program() -> PathBuf {
     match std::env::var_os("SPLATSIEVE_PROGRAM") {
         Some(named) => fs::canonicalize(named).expect("SPLATSIEVE_PROGRAM names a file"),
@@ -36,12 +36,12 @@ pub(crate) fn program() -> PathBuf {
     }
 }
 
-/// Path of the model of 300 Gaussians that is part of the repository.
+/// Returns the path of the model of 300 Gaussians in the repository.
 pub(crate) fn tiny_model() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/tiny_model")
 }
 
-/// Seed of the random choices of a test: the value of `SPLATSIEVE_SEED`, else `default`.
+/// Returns the seed of the random choices of a test: the value of `SPLATSIEVE_SEED`, or else `default`.
 pub(crate) fn seed(default: u64) -> u64 {
     let seed = std::env::var("SPLATSIEVE_SEED").ok().and_then(|text| text.parse().ok()).unwrap_or(default);
     println!("SPLATSIEVE_SEED={seed}");
@@ -71,7 +71,7 @@ impl Random {
     }
 }
 
-/// A temporary folder in which the program runs.
+/// Temporary folder in which the program runs.
 pub(crate) struct Folder(TempDir);
 
 impl Folder {
@@ -79,12 +79,12 @@ impl Folder {
         Folder(tempfile::tempdir().unwrap())
     }
 
-    /// Absolute path of the file or folder `name` in this folder; an empty name gives the folder itself.
+    /// Returns the absolute path of the file or folder `name` in this folder; an empty name gives the folder itself.
     pub(crate) fn path(&self, name: &str) -> PathBuf {
         if name.is_empty() { self.0.path().to_owned() } else { self.0.path().join(name) }
     }
 
-    /// Writes a file and the folders above it; returns its path.
+    /// Writes a file and the folders above it. Returns its path.
     pub(crate) fn write(&self, name: &str, bytes: impl AsRef<[u8]>) -> PathBuf {
         let path = self.path(name);
         fs::create_dir_all(path.parent().unwrap()).unwrap();
@@ -92,7 +92,7 @@ impl Folder {
         path
     }
 
-    /// Names of all entries of this folder, hidden ones included, sorted.
+    /// Returns the sorted names of all entries of this folder, including hidden ones.
     pub(crate) fn names(&self) -> Vec<String> {
         let entries = fs::read_dir(self.0.path()).unwrap();
         let mut names: Vec<String> =
@@ -101,7 +101,7 @@ impl Folder {
         names
     }
 
-    /// Prepares a run of the program in this folder. Arguments are separated by blanks; `{tiny}` stands for the
+    /// Prepares a run of the program in this folder. Arguments are separated by spaces; `{tiny}` is replaced by the
     /// path of the tiny model.
     pub(crate) fn attack(&self, arguments: &str) -> Attack {
         let tiny = tiny_model();
@@ -110,13 +110,13 @@ impl Folder {
         Attack::new(self.0.path(), words)
     }
 
-    /// Prepares a run of the program in this folder with arguments that may contain blanks.
+    /// Prepares a run of the program in this folder with arguments that may contain spaces.
     pub(crate) fn attack_with(&self, arguments: impl IntoIterator<Item = impl AsRef<OsStr>>) -> Attack {
         Attack::new(self.0.path(), arguments)
     }
 }
 
-/// A run of the program that has not been started.
+/// Run of the program that has not been started.
 pub(crate) struct Attack {
     command: Command,
     seconds: f64,
@@ -131,7 +131,7 @@ impl Attack {
         Attack { command, seconds: time_limit(), shown: shown.join(" ") }
     }
 
-    /// Kills the run after so many seconds; the default is [`time_limit`].
+    /// Sets the time limit in seconds, after which the run is killed; the default is [`time_limit`].
     pub(crate) fn within(mut self, seconds: f64) -> Attack {
         self.seconds = seconds;
         self
@@ -155,7 +155,7 @@ impl Attack {
         self
     }
 
-    /// Sets a variable of the environment.
+    /// Sets an environment variable.
     pub(crate) fn env(mut self, name: &str, value: impl AsRef<OsStr>) -> Attack {
         self.command.env(name, value);
         self
@@ -191,7 +191,7 @@ fn collect(mut pipe: impl Read + Send + 'static) -> thread::JoinHandle<String> {
     })
 }
 
-/// A run that goes on.
+/// Run that has been started.
 pub(crate) struct Running {
     child: Child,
     stdout: Option<thread::JoinHandle<String>>,
@@ -202,7 +202,7 @@ pub(crate) struct Running {
 }
 
 impl Running {
-    /// Process id of the run.
+    /// Returns the process id of the run.
     pub(crate) fn id(&self) -> u32 {
         self.child.id()
     }
@@ -247,7 +247,7 @@ impl Running {
     }
 }
 
-/// What a run did.
+/// Result of a run.
 #[derive(Debug)]
 pub(crate) struct Outcome {
     /// Exit code; `None` if a signal ended the run.
@@ -267,7 +267,7 @@ pub(crate) struct Outcome {
 }
 
 impl Outcome {
-    /// Confirms that the run ended by itself and without a panic.
+    /// Checks that the run ended by itself and without a panic.
     pub(crate) fn ended(self) -> Outcome {
         let Outcome { shown, stderr, .. } = &self;
         assert!(!self.is_timed_out, "{shown}: killed after {:.0} s\n{stderr}", self.seconds);
@@ -276,14 +276,14 @@ impl Outcome {
         self
     }
 
-    /// Confirms that the run succeeded.
+    /// Checks that the run succeeded.
     pub(crate) fn succeeded(self) -> Outcome {
         let outcome = self.ended();
         assert_eq!(outcome.code, Some(0), "{}\n{}", outcome.shown, outcome.stderr);
         outcome
     }
 
-    /// Confirms that the run failed with `code` and that each of `parts` is in its message.
+    /// Checks that the run failed with `code` and that its message contains each of `parts`.
     pub(crate) fn refused(self, code: i32, parts: &[&str]) -> Outcome {
         let outcome = self.ended();
         assert_eq!(outcome.code, Some(code), "{}\n{}{}", outcome.shown, outcome.stdout, outcome.stderr);
@@ -298,7 +298,7 @@ impl Outcome {
         outcome
     }
 
-    /// Confirms that the run ended by itself, whatever its exit code, within `bytes` of peak memory.
+    /// Checks that the run ended by itself, with any exit code, within `bytes` of peak memory.
     pub(crate) fn within(self, bytes: u64) -> Outcome {
         let outcome = self.ended();
         assert!(
@@ -313,7 +313,7 @@ impl Outcome {
     }
 }
 
-/// Opens a file that is always full for writing.
+/// Opens a device that is always full for writing.
 pub(crate) fn full_device() -> File {
     File::options().write(true).open("/dev/full").unwrap()
 }

@@ -1,4 +1,4 @@
-//! Pickles and JSON texts that cost far more memory to read than they have bytes.
+//! Tests of pickles and JSON texts that cost far more memory to read than they have bytes.
 
 use std::fs::{self, File};
 use std::io::{BufWriter, Write};
@@ -9,26 +9,26 @@ use flate2::{Compression, Crc};
 
 use crate::runner::{Folder, MIB, Outcome, SMALL_MEMORY, tiny_model};
 
-/// Most bytes of a pickle that a checkpoint may have.
+/// Maximum number of bytes of a pickle in a checkpoint.
 const LARGEST_PICKLE: usize = 8 << 20;
 
-/// Bytes as pieces, each with the number of times that it is repeated. A test's own memory counts as that of the runs that it
-/// starts, so that large inputs are written piece by piece.
+/// Bytes as pieces, each with its number of repetitions. The memory of the test process counts in the runs that it
+/// starts, so large inputs are written piece by piece.
 type Pieces = Vec<(Vec<u8>, usize)>;
 
-/// One piece.
+/// Returns one piece without repetition.
 fn once(bytes: &[u8]) -> Pieces {
     vec![(bytes.to_vec(), 1)]
 }
 
-/// `start`, and then `piece` as often as it takes to fill a pickle.
-fn flood(start: &[u8], piece: &[u8]) -> Pieces {
+/// Returns `start`, followed by `piece` repeated until the pickle is full.
+fn fill(start: &[u8], piece: &[u8]) -> Pieces {
     let block = piece.repeat(4096 / piece.len());
     let count = (LARGEST_PICKLE - start.len() - 4096) / block.len();
     vec![(start.to_vec(), 1), (block, count)]
 }
 
-/// A file of a zip archive.
+/// File in a zip archive.
 struct Entry {
     name: String,
     pieces: Pieces,
@@ -41,7 +41,7 @@ impl Entry {
         Entry { name: name.into(), pieces, deflated: None }
     }
 
-    /// `count` times `piece`, deflated.
+    /// Returns an entry with `piece` repeated `count` times, deflated.
     fn deflated(name: &str, piece: &[u8], count: usize) -> Entry {
         let (mut out, mut sum) = (DeflateEncoder::new(Vec::new(), Compression::best()), Crc::new());
         for _ in 0..count {
@@ -53,7 +53,7 @@ impl Entry {
     }
 }
 
-/// Writes a zip archive that says it has `announced` entries, or as many as it has.
+/// Writes a zip archive that declares `announced` entries, or the true number.
 fn write_zip(path: &Path, entries: impl IntoIterator<Item = Entry>, announced: Option<u16>) {
     fs::create_dir_all(path.parent().unwrap()).unwrap();
     let mut out = BufWriter::new(File::create(path).unwrap());
@@ -94,7 +94,7 @@ fn write_checkpoint(path: &Path, pickle: Pieces) {
     write_zip(path, [Entry::stored("a/data.pkl", pickle), Entry::stored("a/version", once(b"3\n"))], None);
 }
 
-/// The tiny model, whose network is the checkpoint with `pickle`.
+/// Copies the tiny model with its network replaced by the checkpoint with `pickle`.
 fn model_with_network(folder: &Folder, pickle: Entry) -> &'static str {
     let cloud = "point_cloud/iteration_7/point_cloud.ply";
     for name in ["cfg_args", cloud] {
@@ -104,28 +104,28 @@ fn model_with_network(folder: &Folder, pickle: Entry) -> &'static str {
     "model"
 }
 
-/// Runs `info` on `input` within the small memory.
+/// Runs `info` on `input` within 64 MiB.
 fn info(folder: &Folder, input: &str) -> Outcome {
     folder.attack(&format!("info {input} --memory {}", SMALL_MEMORY.0)).run().within(SMALL_MEMORY.1)
 }
 
-/// Confirms that a checkpoint full of `piece` behind `start` is refused within memory.
+/// Checks that a checkpoint filled with `piece` after `start` is refused within the memory limit.
 fn assert_flood_is_refused(start: &[u8], piece: &[u8]) {
     let folder = Folder::new();
-    write_checkpoint(&folder.path("a.pt"), flood(start, piece));
+    write_checkpoint(&folder.path("a.pt"), fill(start, piece));
     let outcome = info(&folder, "a.pt").refused(1, &["a.pt, data.pkl, byte ", "expected at most "]);
     let is_known = ["for the values of the pickle", "instructions"].iter().any(|part| outcome.stderr.contains(part));
     assert!(is_known, "{piece:?}: {}", outcome.stderr);
 }
 
 #[test]
-fn a_flood_of_pickled_lists_stays_within_memory() {
+fn many_pickled_lists_stay_within_memory() {
     assert_flood_is_refused(b"", b"]");
 }
 
 #[test]
 #[ignore = "slow: reads a million pickle instructions several times"]
-fn slow_floods_of_pickle_instructions_stay_within_memory() {
+fn slow_many_pickle_instructions_stay_within_memory() {
     for (start, piece) in [
         (&b""[..], &b"}NNs"[..]),
         (b"", b"N\x85"),
@@ -141,7 +141,7 @@ fn slow_floods_of_pickle_instructions_stay_within_memory() {
 }
 
 #[test]
-fn a_long_name_shared_by_many_is_not_copied_for_each() {
+fn shared_long_names_are_not_copied_for_each_use() {
     let folder = Folder::new();
     let length = 4u32 << 20;
     let pickle = vec![
@@ -158,7 +158,7 @@ fn a_long_name_shared_by_many_is_not_copied_for_each() {
 fn deeply_nested_pickles_are_refused_by_their_depth() {
     let folder = Folder::new();
     let appended = once(&[&b"]".repeat(1000)[..], &b"a".repeat(999), b"."].concat());
-    for pickle in [flood(b"", b"("), flood(b")", b"\x85"), appended] {
+    for pickle in [fill(b"", b"("), fill(b")", b"\x85"), appended] {
         write_checkpoint(&folder.path("a.pt"), pickle.clone());
         info(&folder, "a.pt").refused(1, &["data.pkl, byte ", "containers nested at most 100 deep"]);
         let model = model_with_network(&folder, Entry::stored("a/data.pkl", pickle));
@@ -167,7 +167,7 @@ fn deeply_nested_pickles_are_refused_by_their_depth() {
 }
 
 #[test]
-fn lengths_that_a_pickle_does_not_hold_are_refused() {
+fn pickle_lengths_beyond_its_end_are_refused() {
     let folder = Folder::new();
     for start in [
         &b"\x80\x02\x8b\xff\xff\xff\x7f"[..],
@@ -190,9 +190,9 @@ fn the_largest_memo_numbers_cost_no_memory() {
 }
 
 #[test]
-fn what_contains_itself_or_one_thing_often_is_refused() {
+fn recursive_and_repeated_pickle_values_are_refused() {
     let folder = Folder::new();
-    // A dict of two of a list of two of a list of two …: 2^60 paths.
+    // Nested lists that contain the next level twice: 2^60 paths.
     let mut shared = b"\x80\x02}X\x01\x00\x00\x00a]q\x00".to_vec();
     for level in 0..60u8 {
         shared.extend([b']', b'q', level + 1, b'(', b'h', level, b'h', level, b'e']);
@@ -209,7 +209,7 @@ fn what_contains_itself_or_one_thing_often_is_refused() {
 #[test]
 fn a_deflated_pickle_is_refused_without_inflating_it() {
     let folder = Folder::new();
-    // 25 KB that the program once inflated to 25 MB and read into 4.3 GB.
+    // An archive of 25 KB that an earlier version inflated to 25 MB and read into 4.3 GB.
     let entry = || Entry::deflated("a/data.pkl", &b"]".repeat(1 << 20), 25);
     write_zip(&folder.path("a.pt"), [entry()], None);
     assert!(fs::metadata(folder.path("a.pt")).unwrap().len() < 40_000);
@@ -228,14 +228,14 @@ fn many_empty_files_in_a_checkpoint_are_counted_first() {
 }
 
 #[test]
-fn a_checkpoint_that_announces_billions_of_files_is_refused() {
+fn checkpoint_declaring_billions_of_files_is_refused() {
     let folder = Folder::new();
     write_zip(&folder.path("b.pt"), [Entry::stored("a/data.pkl", once(b"N."))], Some(0xffff));
     let mut bytes = fs::read(folder.path("b.pt")).unwrap();
     let end = bytes.len() - 22;
     let tail = bytes.split_off(end);
     let at = bytes.len() as u64;
-    // The 64-bit records: so many files, of which the list begins at 0.
+    // The 64-bit end records with the number of files, whose list begins at offset 0.
     bytes.extend([&b"PK\x06\x06"[..], &44u64.to_le_bytes(), &[45, 0, 45, 0], &[0; 8]].concat());
     bytes.extend([1u64 << 40, 1 << 40, 100, 0].iter().flat_map(|number| number.to_le_bytes()));
     bytes.extend([&b"PK\x06\x07"[..], &[0; 4], &at.to_le_bytes(), &[1, 0, 0, 0]].concat());
@@ -254,7 +254,7 @@ fn repeated_keys_of_a_state_dict_do_not_add_up() {
 }
 
 #[test]
-fn an_old_checkpoint_is_refused_with_the_way_out() {
+fn old_checkpoint_is_refused_with_a_remedy() {
     let folder = Folder::new();
     let old = b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P\x19.\x80\x02M\xe9\x03.".to_vec();
     let model = model_with_network(&folder, Entry::stored("a/data.pkl", once(b"N.")));
@@ -270,7 +270,7 @@ fn write_pieces(path: &Path, write: impl FnOnce(&mut BufWriter<File>)) -> PathBu
     path.to_owned()
 }
 
-/// A picture of a camera of its own.
+/// Returns the JSON of an image with a camera of its own.
 fn frame(k: u32) -> String {
     let x = f64::from(k) * 1e-3;
     format!(
@@ -280,7 +280,7 @@ fn frame(k: u32) -> String {
     )
 }
 
-/// Writes `count` pictures as a `transforms.json`.
+/// Writes `count` images as a `transforms.json`.
 fn write_transforms(folder: &Folder, count: u32) {
     write_pieces(&folder.path("transforms.json"), |out| {
         out.write_all(b"{\"camera_angle_x\": 1.0, \"w\": 32, \"h\": 32, \"frames\": [").unwrap();
@@ -292,15 +292,15 @@ fn write_transforms(folder: &Folder, count: u32) {
     });
 }
 
-/// Foresees a run with the cameras of `transforms.json`.
-fn foresee(folder: &Folder, memory: &str) -> Outcome {
+/// Runs a dry run with the cameras of `transforms.json`.
+fn dry_run(folder: &Folder, memory: &str) -> Outcome {
     let line = format!("compress {{tiny}} -o out --cameras transforms.json --dry-run --explain --memory {memory}");
     folder.attack(&line).run().ended()
 }
 
-/// Memory that the plan of a run promises, in bytes.
-fn promised(outcome: &Outcome) -> u64 {
-    // That of the whole run comes before what was taken so far.
+/// Returns the memory that the plan of a run states, in bytes.
+fn planned_memory(outcome: &Outcome) -> u64 {
+    // The first figure is that of the whole run; memory used so far follows.
     let said = outcome.stdout.split("memory: at most ").nth(1).unwrap_or_else(|| panic!("{}", outcome.stdout));
     let mut words = said.split_whitespace();
     let number: f64 = words.next().unwrap().parse().unwrap();
@@ -314,31 +314,31 @@ fn promised(outcome: &Outcome) -> u64 {
 }
 
 #[test]
-fn the_plan_promises_what_many_views_take() {
+fn memory_plan_covers_many_views() {
     let folder = Folder::new();
     write_transforms(&folder, 20_000);
-    let outcome = foresee(&folder, "512MiB").succeeded();
-    let promised = promised(&outcome);
-    outcome.within(promised);
+    let outcome = dry_run(&folder, "512MiB").succeeded();
+    let planned_memory = planned_memory(&outcome);
+    outcome.within(planned_memory);
 }
 
 #[test]
 fn more_views_than_fit_are_refused_with_their_number() {
     let folder = Folder::new();
     write_transforms(&folder, 20_000);
-    let outcome = foresee(&folder, "30MiB").refused(1, &["transforms.json", "--memory"]);
+    let outcome = dry_run(&folder, "30MiB").refused(1, &["transforms.json", "--memory"]);
     outcome.within(SMALL_MEMORY.1);
 }
 
 #[test]
 #[ignore = "slow: writes and reads 15 MB of JSON several times"]
-fn slow_100_000_views_stay_within_memory_and_promise() {
+fn slow_100_000_views_stay_within_memory_and_plan() {
     let folder = Folder::new();
     write_transforms(&folder, 100_000);
-    foresee(&folder, SMALL_MEMORY.0).refused(1, &["transforms.json", "--memory"]).within(SMALL_MEMORY.1);
-    let outcome = foresee(&folder, "256MiB").succeeded();
-    let promised = promised(&outcome);
-    outcome.within(promised);
+    dry_run(&folder, SMALL_MEMORY.0).refused(1, &["transforms.json", "--memory"]).within(SMALL_MEMORY.1);
+    let outcome = dry_run(&folder, "256MiB").succeeded();
+    let planned_memory = planned_memory(&outcome);
+    outcome.within(planned_memory);
 }
 
 #[test]
@@ -347,11 +347,11 @@ fn slow_165_mb_of_views_are_refused_within_memory() {
     let folder = Folder::new();
     write_transforms(&folder, 1_000_000);
     assert!(fs::metadata(folder.path("transforms.json")).unwrap().len() > 165_000_000);
-    foresee(&folder, SMALL_MEMORY.0).refused(1, &["transforms.json", "1000000 pictures"]).within(SMALL_MEMORY.1);
+    dry_run(&folder, SMALL_MEMORY.0).refused(1, &["transforms.json", "1000000 pictures"]).within(SMALL_MEMORY.1);
 }
 
 #[test]
-fn a_huge_text_number_or_nesting_in_json_is_refused() {
+fn huge_json_texts_numbers_and_nesting_are_refused() {
     let folder = Folder::new();
     for (start, piece, expected) in [
         ("{\"note\": \"", "x".repeat(1 << 16), "a text of at most 1048576 bytes"),
@@ -366,7 +366,7 @@ fn a_huge_text_number_or_nesting_in_json_is_refused() {
             out.write_all(start.as_bytes()).unwrap();
             (0..800).for_each(|_| out.write_all(piece.as_bytes()).unwrap());
         });
-        let outcome = foresee(&folder, SMALL_MEMORY.0).refused(1, &["transforms.json, byte ", expected]);
+        let outcome = dry_run(&folder, SMALL_MEMORY.0).refused(1, &["transforms.json, byte ", expected]);
         outcome.within(SMALL_MEMORY.1);
     }
 }
@@ -382,7 +382,7 @@ fn values_of_a_camera_that_are_too_long_are_not_kept() {
             out.write_all(b"]}]}").unwrap();
         });
         let parts = ["transforms.json, frame 1, key \"transform_matrix\"", expected];
-        foresee(&folder, SMALL_MEMORY.0).refused(1, &parts).within(SMALL_MEMORY.1);
+        dry_run(&folder, SMALL_MEMORY.0).refused(1, &parts).within(SMALL_MEMORY.1);
     }
 }
 
@@ -394,13 +394,13 @@ fn repeated_keys_in_json_do_not_add_up() {
         "transforms.json",
         format!("{{\"frames\": [{frame}], \"w\": 32, \"h\": 32, \"camera_angle_x\": 1, \"frames\": [{frame}]}}"),
     );
-    foresee(&folder, SMALL_MEMORY.0).refused(1, &["key \"frames\"", "this key once"]).within(SMALL_MEMORY.1);
+    dry_run(&folder, SMALL_MEMORY.0).refused(1, &["key \"frames\"", "this key once"]).within(SMALL_MEMORY.1);
     write_pieces(&folder.path("transforms.json"), |out| {
         write!(out, "{{\"camera_angle_x\": 1, \"h\": 32, \"frames\": [{frame}]").unwrap();
         (0..100_000).for_each(|k| write!(out, ", \"w\": 32, \"k{k}\": 1").unwrap());
         out.write_all(b"}").unwrap();
     });
-    foresee(&folder, SMALL_MEMORY.0).succeeded().within(SMALL_MEMORY.1);
+    dry_run(&folder, SMALL_MEMORY.0).succeeded().within(SMALL_MEMORY.1);
 }
 
 #[test]
@@ -422,7 +422,7 @@ fn a_long_line_of_points_in_a_reconstruction_is_passed_over() {
 }
 
 #[test]
-fn an_array_of_poses_larger_than_memory_is_refused_by_its_header() {
+fn pose_array_larger_than_memory_is_refused_by_its_header() {
     let folder = Folder::new();
     let header = "{'descr': '<f8', 'fortran_order': False, 'shape': (1000000, 17), }";
     let file =

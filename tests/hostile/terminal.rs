@@ -1,5 +1,5 @@
-//! Standard streams that cannot be written, file names and texts that a terminal, a spreadsheet or a browser would run as
-//! instructions, and outputs that would tell the folders of the machine that made them.
+//! Tests of standard streams that cannot be written, of names and texts that a terminal, a spreadsheet or a browser
+//! would execute, and of outputs that would reveal folder names of the machine.
 
 use std::ffi::OsString;
 use std::fs::{self, File};
@@ -25,32 +25,33 @@ fn the_runner_reports_code_message_and_memory() {
     assert!(outcome.stdout.contains('='));
 }
 
-/// A standard stream that takes no more bytes.
+/// Standard stream that takes no more bytes.
 #[derive(Debug, Clone, Copy, PartialEq)]
-enum Broken {
-    /// A device without room.
+enum BrokenStream {
+    /// Device without space.
     Full,
     /// A pipe whose reader has ended.
     Unread,
-    /// No stream at all.
+    /// No stream.
     Closed,
     /// A terminal whose window has been closed.
     HungUp,
 }
 
-const BROKEN: [Broken; 4] = [Broken::Full, Broken::Unread, Broken::Closed, Broken::HungUp];
+const BROKEN_STREAMS: [BrokenStream; 4] =
+    [BrokenStream::Full, BrokenStream::Unread, BrokenStream::Closed, BrokenStream::HungUp];
 
-impl Broken {
-    /// Replaces stream `descriptor` (1: standard output, 2: standard error) of a run.
-    fn of(self, attack: Attack, descriptor: i32) -> Attack {
+impl BrokenStream {
+    /// Replaces the stream `descriptor` (1: standard output, 2: standard error) of a run.
+    fn replace_stream(self, attack: Attack, descriptor: i32) -> Attack {
         let stream: Stdio = match self {
-            Broken::Full => full_device().into(),
-            Broken::Unread => std::io::pipe().unwrap().1.into(),
-            Broken::Closed => Stdio::null(),
-            Broken::HungUp => terminal().1.into(),
+            BrokenStream::Full => full_device().into(),
+            BrokenStream::Unread => std::io::pipe().unwrap().1.into(),
+            BrokenStream::Closed => Stdio::null(),
+            BrokenStream::HungUp => terminal().1.into(),
         };
         let attack = if descriptor == 1 { attack.stdout(stream) } else { attack.stderr(stream) };
-        if self != Broken::Closed {
+        if self != BrokenStream::Closed {
             return attack;
         }
         attack.with(|command| {
@@ -65,18 +66,18 @@ impl Broken {
     }
 }
 
-/// The two ends of a new terminal: what the window holds, and what the program gets.
+/// Opens a new terminal. Returns the end of the window and the end of the program.
 fn terminal() -> (OwnedFd, OwnedFd) {
     let (mut window, mut program) = (-1, -1);
     let none = std::ptr::null_mut();
-    // SAFETY: both pointers are valid for writes, the others may be null.
+    // SAFETY: the first two pointers are valid for writes, and openpty allows the others to be null.
     let made = unsafe { libc::openpty(&mut window, &mut program, none, none.cast(), none.cast()) };
     assert_eq!(made, 0, "no terminal");
-    // SAFETY: openpty has just opened both, and nobody else owns them.
+    // SAFETY: openpty has just opened both descriptors, and nothing else owns them.
     unsafe { (OwnedFd::from_raw_fd(window), OwnedFd::from_raw_fd(program)) }
 }
 
-/// Quick commands that print, and their exit codes.
+/// Quick commands that print, with their exit codes.
 const QUICK: [(&str, i32); 10] = [
     ("--help", 0),
     ("compress --help", 0),
@@ -90,24 +91,24 @@ const QUICK: [(&str, i32); 10] = [
     ("compress", 2),
 ];
 
-/// Runs a command with a broken standard error: it ends as it does else.
+/// Checks that a command with a broken standard error ends with its usual exit code.
 fn check_broken_stderr(folder: &Folder, arguments: &str, code: i32) {
-    for broken in BROKEN {
-        let outcome = broken.of(folder.attack(arguments), 2).run().ended();
+    for broken in BROKEN_STREAMS {
+        let outcome = broken.replace_stream(folder.attack(arguments), 2).run().ended();
         assert_eq!(outcome.code, Some(code), "{arguments}, standard error {broken:?}");
     }
 }
 
-/// Runs a command that prints with a broken standard output: that is an error, but for a reader that has seen enough.
-/// A stream that is closed when a program starts is the null device for it, as the operating system's start code makes it.
+/// Checks that a command with a broken standard output fails, except if its reader has ended. A stream that is closed
+/// when the program starts becomes the null device, because the start code of the operating system opens it there.
 fn check_broken_stdout(folder: &Folder, arguments: &str) {
-    for broken in BROKEN {
-        let outcome = broken.of(folder.attack(arguments), 1).run().ended();
+    for broken in BROKEN_STREAMS {
+        let outcome = broken.replace_stream(folder.attack(arguments), 1).run().ended();
         match broken {
-            Broken::Full => drop(outcome.refused(1, &["cannot write standard output: No space left"])),
-            Broken::HungUp => drop(outcome.refused(1, &["cannot write standard output"])),
-            Broken::Closed => drop(outcome.succeeded()),
-            Broken::Unread => {
+            BrokenStream::Full => drop(outcome.refused(1, &["cannot write standard output: No space left"])),
+            BrokenStream::HungUp => drop(outcome.refused(1, &["cannot write standard output"])),
+            BrokenStream::Closed => drop(outcome.succeeded()),
+            BrokenStream::Unread => {
                 let outcome = outcome.succeeded();
                 assert!(!outcome.stderr.contains("standard output"), "{arguments}\n{}", outcome.stderr);
             }
@@ -116,7 +117,7 @@ fn check_broken_stdout(folder: &Folder, arguments: &str) {
 }
 
 #[test]
-fn a_broken_standard_error_changes_no_exit_code() {
+fn broken_standard_error_changes_no_exit_code() {
     let folder = Folder::new();
     for (arguments, code) in QUICK {
         check_broken_stderr(&folder, arguments, code);
@@ -124,7 +125,7 @@ fn a_broken_standard_error_changes_no_exit_code() {
 }
 
 #[test]
-fn a_broken_standard_output_is_an_error() {
+fn broken_standard_output_is_an_error() {
     let folder = Folder::new();
     for (arguments, _) in QUICK.into_iter().filter(|(_, code)| *code == 0) {
         check_broken_stdout(&folder, arguments);
@@ -134,15 +135,16 @@ fn a_broken_standard_output_is_an_error() {
 }
 
 #[test]
-fn a_run_with_broken_streams_writes_its_whole_result() {
+fn run_with_broken_streams_writes_its_whole_result() {
     let folder = Folder::new();
     let line = format!("compress {{tiny}} --cameras {{tiny}} {SHORT} --explain -o");
     folder.attack(&format!("{line} full --view")).stderr(full_device()).run().succeeded();
     assert!(folder.path("full/summary.json").is_file());
-    let unread = Broken::Unread.of(Broken::HungUp.of(folder.attack(&format!("{line} unread --view")), 2), 1);
+    let unread = BrokenStream::Unread
+        .replace_stream(BrokenStream::HungUp.replace_stream(folder.attack(&format!("{line} unread --view")), 2), 1);
     unread.run().succeeded();
     assert!(folder.path("unread/summary.json").is_file());
-    // Whether or not somebody reads the summary, the page was asked for.
+    // The page was asked for, so it is written even if the summary cannot be printed.
     assert!(folder.path("unread.html").is_file());
     assert_eq!(folder.names(), ["full", "full.html", "unread", "unread.html"]);
 }
@@ -180,15 +182,15 @@ fn slow_every_command_survives_broken_streams() {
     ];
     for arguments in &commands {
         check_broken_stderr(&folder, arguments, 0);
-        // A stream is no text: a reader that is gone ends it, a full device is an error, as for text.
+        // A frame stream behaves like text: it ends without an error if the reader ends, and a full device is an error.
         check_broken_stdout(&folder, arguments);
     }
 }
 
-/// Characters that may not reach a terminal from a name: escape sequences of both sets, line ends, marks of direction.
+/// Characters of a name that may not reach a terminal: escape sequences of both sets, line ends, marks of direction.
 const EVIL: &str = "a\u{1b}[31m\u{9b}2J\u{1b}]0;x\u{7}\r\nsplatsieve: b\u{202e}c\u{61c}\u{7f}";
 
-/// Confirms that the output of a run can be shown on a terminal, and holds no line that a name has made.
+/// Checks that the output of a run is safe for a terminal and has no line made by a name.
 fn check_printable(outcome: &Outcome) {
     let is_evil = |c: char| {
         c != '\n' && (c.is_control() || matches!(c, '\u{61c}' | '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}'))
@@ -199,13 +201,13 @@ fn check_printable(outcome: &Outcome) {
     }
 }
 
-/// Runs the program with words that may hold anything.
+/// Runs the program with words that may contain any characters.
 fn run_words(folder: &Folder, words: &[&str]) -> Outcome {
     folder.attack_with(words.iter().map(OsString::from)).run().ended()
 }
 
 #[test]
-fn names_in_messages_control_no_terminal() {
+fn names_in_messages_cannot_control_a_terminal() {
     let folder = Folder::new();
     let in_folder = format!("{EVIL}/{EVIL}.ply");
     let tiny = tiny_model();
@@ -223,8 +225,8 @@ fn names_in_messages_control_no_terminal() {
         &["compress", "x", "-o", "y", "--keep-ids", EVIL],
         &["evaluate", EVIL, EVIL, "--cameras", EVIL],
         &["view", EVIL, "-o", "x.html"],
-        &["cache", EVIL],
-        // What clap says of arguments.
+        &["work", EVIL],
+        // Messages of the argument parser.
         &[EVIL],
         &["info", "x", EVIL],
         &["recipe", EVIL],
@@ -237,7 +239,7 @@ fn names_in_messages_control_no_terminal() {
 }
 
 #[test]
-fn names_in_results_control_no_terminal() {
+fn names_in_results_cannot_control_a_terminal() {
     let folder = Folder::new();
     let model = folder.path(EVIL);
     copy(&tiny_model(), &model);
@@ -261,7 +263,7 @@ fn names_in_results_control_no_terminal() {
     check_printable(&run_words(&folder, &evaluate).succeeded());
 }
 
-/// Copies a folder with all that is in it.
+/// Copies a folder with its contents.
 fn copy(from: &Path, to: &Path) {
     fs::create_dir_all(to).unwrap();
     for entry in fs::read_dir(from).unwrap() {
@@ -275,10 +277,10 @@ fn copy(from: &Path, to: &Path) {
     }
 }
 
-/// A folder name that no output may hold.
+/// Folder name that no output may contain.
 const SECRET: &str = "secret_client_name";
 
-/// A place below a folder named [`SECRET`], with the tiny model as trained there: its `cfg_args` names that folder, too.
+/// Folder below one named [`SECRET`], with the tiny model as trained there: its `cfg_args` contains that name too.
 struct Secret {
     _top: Folder,
     place: PathBuf,
@@ -298,15 +300,15 @@ impl Secret {
         Secret { _top: top, place }
     }
 
-    /// Runs the program with every name as an absolute path: `{m}` is the model, `{o}` the folder of outputs.
+    /// Runs the program with absolute paths: `{m}` is the model, `{o}` the folder of outputs.
     fn run(&self, arguments: &str) -> Outcome {
         let [model, out] = ["model", "out"].map(|name| self.place.join(name).display().to_string());
         let words = arguments.split(' ').map(|word| word.replace("{m}", &model).replace("{o}", &out));
-        // The working directory tells nothing either.
+        // The working directory does not reveal the folder either.
         self._top.attack_with(words).within(300.0).run().succeeded()
     }
 
-    /// Confirms that no output but the user's own `cfg_args` names the folder, as it is or within what is compressed.
+    /// Checks that no output, except the user's own `cfg_args`, contains the folder name, also inside compressed data.
     fn check(&self, may_hold_config: bool) {
         let mut files = Vec::new();
         list(&self.place.join("out"), &mut files);
@@ -332,7 +334,7 @@ fn list(folder: &Path, files: &mut Vec<PathBuf>) {
     }
 }
 
-/// What every Zstandard frame and zlib stream in `bytes` holds.
+/// Returns the contents of every Zstandard frame and zlib stream in `bytes`.
 fn decompressed(bytes: &[u8]) -> Vec<Vec<u8>> {
     let mut found = Vec::new();
     for at in 0..bytes.len().saturating_sub(4) {
@@ -350,7 +352,7 @@ fn decompressed(bytes: &[u8]) -> Vec<Vec<u8>> {
 }
 
 #[test]
-fn outputs_name_no_folder_of_the_machine() {
+fn outputs_contain_no_folder_names_of_the_machine() {
     let secret = Secret::new();
     secret.run(&format!("compress {{m}} --cameras {{m}} {SHORT} -o {{o}}/small"));
     secret.run("render {m} --cameras {m} --frame 0 --view 0 -o {o}/picture.png");
@@ -365,7 +367,7 @@ fn outputs_name_no_folder_of_the_machine() {
 
 #[test]
 #[ignore = "slow: every command that writes"]
-fn slow_outputs_of_all_commands_name_no_folder() {
+fn slow_outputs_of_all_commands_contain_no_folder_names() {
     let secret = Secret::new();
     for arguments in [
         "compress {m} --cameras {m} SHORT -o {o}/small --view --cache {m}/../work",
@@ -404,7 +406,7 @@ fn slow_outputs_of_all_commands_name_no_folder() {
 
 #[test]
 #[ignore = "slow: archives of the tiny model"]
-fn slow_archives_name_no_folder_of_the_training_machine() {
+fn slow_archives_contain_no_folder_names_of_training() {
     let secret = Secret::new();
     secret.run(&format!("compress {{m}} --cameras {{m}} {SHORT} --archive-psnr 30 -o {{o}}/small.gsz"));
     secret.run("convert {o}/small.gsz {o}/small");
@@ -412,12 +414,12 @@ fn slow_archives_name_no_folder_of_the_training_machine() {
     let config = fs::read_to_string(secret.place.join("out/small/cfg_args")).unwrap();
     assert!(config.contains("source_path='model', model_path='tiny'"), "{config}");
     secret.run("info {o}/small");
-    // What is unpacked loads, and finds the cameras of a folder of that name beside it.
+    // The unpacked folder loads, and finds the cameras of a folder of that name beside it.
     secret.run("render {o}/small --cameras {m} --frame 0 --view 0 -o {o}/picture.png");
 }
 
 #[test]
-fn a_recipe_repeats_its_run_where_all_of_it_was_moved() {
+fn recipe_repeats_its_run_after_moving_all_files() {
     let top = Folder::new();
     let [first, second] = ["first", "second/place"].map(|name| top.path(name));
     copy(&tiny_model(), &first.join("model"));
@@ -433,7 +435,7 @@ fn a_recipe_repeats_its_run_where_all_of_it_was_moved() {
         let [before, after] = ["small", "again"].map(|result| fs::read(second.join(result).join(name)).unwrap());
         assert!(before == after, "{name} differs");
     }
-    // What the recipe names is not there.
+    // The recipe names a file that does not exist.
     fs::create_dir(top.path("third")).unwrap();
     copy(&second.join("model"), &top.path("third/model"));
     fs::copy(second.join("small/recipe.toml"), top.path("recipe.toml")).unwrap();
@@ -476,7 +478,7 @@ fn manual_pages_are_written_all_or_none() {
 }
 
 #[test]
-fn pages_run_nothing_but_their_own_scripts() {
+fn pages_run_only_their_own_scripts() {
     let folder = Folder::new();
     let name = "<script>x=1<img src=x onerror=x()>";
     copy(&tiny_model(), &folder.path(name));
@@ -490,7 +492,7 @@ fn pages_run_nothing_but_their_own_scripts() {
         let policy = rest.split_once('"').unwrap().0;
         assert!(policy.starts_with("default-src 'none'; base-uri 'none'; form-action 'none'"), "{policy}");
         assert!(!policy.contains("unsafe") && !policy.contains("http"), "{policy}");
-        // Every script is one that the policy names, and no element has a handler.
+        // The policy names every script, and no element has an event handler.
         assert_eq!(text.matches("<script>").count(), scripts, "{page}");
         let sources = policy.split_once("script-src ").unwrap().1;
         let named = sources.matches("'sha256-").count();
@@ -501,7 +503,7 @@ fn pages_run_nothing_but_their_own_scripts() {
 }
 
 #[test]
-fn a_full_device_takes_no_bytes() {
+fn full_device_takes_no_bytes() {
     use std::io::Write;
     let mut full: File = full_device();
     assert!(full.write_all(b"x").is_err(), "attacks on full streams would test nothing");

@@ -1,4 +1,4 @@
-//! The rasterizer, its gradients and metrics, and the commands that render.
+//! Tests of the rasterizer, its gradients and metrics, and of the commands that render.
 
 mod metrics_recorded;
 #[path = "../models/mod.rs"]

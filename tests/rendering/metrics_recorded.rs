@@ -1,4 +1,4 @@
-//! PSNR, SSIM and FLIP against independent implementations: `scripts/record_metrics.py` made the fixtures.
+//! PSNR, SSIM and FLIP against independent implementations; `scripts/record_metrics.py` made the fixtures.
 
 use std::fs::{self, File};
 use std::path::Path;
@@ -6,8 +6,8 @@ use std::path::Path;
 use splatsieve::metrics::{flip, psnr, ssim};
 use splatsieve::render::Image;
 
-/// The pictures of one fixture, `[pictures, height, width, 3]`.
-fn pictures(folder: &Path, name: &str) -> Vec<Image> {
+/// Returns the images of one fixture, shape `[images, height, width, 3]`.
+fn fixture_images(folder: &Path, name: &str) -> Vec<Image> {
     let file = npyz::NpyFile::new(File::open(folder.join(name)).unwrap()).unwrap();
     let [count, height, width, 3] = file.shape() else { panic!("{name} has the wrong shape") };
     let (count, height, width) = (*count as usize, *height as u32, *width as u32);
@@ -16,14 +16,15 @@ fn pictures(folder: &Path, name: &str) -> Vec<Image> {
 }
 
 #[test]
-fn metrics_agree_with_what_others_compute() {
+fn metrics_agree_with_reference_implementations() {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/metrics");
     let expected: serde_json::Value =
         serde_json::from_str(&fs::read_to_string(folder.join("expected.json")).unwrap()).unwrap();
-    let (a, b) = (pictures(&folder, "a.npy"), pictures(&folder, "b.npy"));
+    let (a, b) = (fixture_images(&folder, "a.npy"), fixture_images(&folder, "b.npy"));
     assert_eq!(a.len(), 4);
     for (i, (a, b)) in a.iter().zip(&b).enumerate() {
-        // Theirs is a later version, which filters rows and columns in turn where ours takes the plane, both in f32.
+        // The reference FLIP is a later version that filters rows and columns separately; ours filters in two
+        // dimensions, both in f32.
         for (name, got, tolerance) in
             [("psnr", psnr(a, b), 1e-9), ("ssim", ssim(a, b), 1e-9), ("flip", flip(a, b), 1e-4)]
         {

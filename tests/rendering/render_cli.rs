@@ -1,4 +1,4 @@
-//! `render` and `evaluate` as a user runs them.
+//! Tests of `render` and `evaluate` as a user runs them.
 
 #[path = "film/mod.rs"]
 mod film;
@@ -20,8 +20,8 @@ use tempfile::TempDir;
 const FRAMES: usize = 4;
 const SIZE: (usize, usize) = (48, 36);
 
-/// A folder with `scene.gseq`, `smaller.gseq` of fewer Gaussians, and `cameras.json`: views 0 and 2 to test
-/// with, 1 to train with, 3 to test with and looking away.
+/// Returns a folder with `scene.gseq`, `smaller.gseq` of fewer Gaussians, and `cameras.json`: test views 0 and 2,
+/// training view 1, and test view 3, which looks away from the scene.
 fn scene() -> TempDir {
     let folder = tempfile::tempdir().unwrap();
     let made = Scene::new(400, FRAMES);
@@ -45,7 +45,7 @@ fn write_cameras(folder: &Path, background: Value) {
             let camera = &rig.cameras[view as usize];
             let turn = if view == 3 { -1.0 } else { 1.0 };
             let (r, t) = (camera.rotation, camera.translation);
-            // Half a turn about the vertical: the same place, the other direction.
+            // Half a turn about the vertical axis: the same position, the opposite direction.
             let row = |i: usize, s: f64| json!([s * r.row(i).x, s * r.row(i).y, s * r.row(i).z, s * t[i]]);
             let scale = SIZE.0 as f64 / f64::from(camera.width);
             json!({
@@ -65,14 +65,14 @@ fn run(folder: &Path, line: &str) -> Output {
     command.current_dir(folder).args(line.split_whitespace()).output().unwrap()
 }
 
-/// Standard output of a run that must succeed.
+/// Runs the program, checks that it succeeds and returns its standard output.
 fn done(folder: &Path, line: &str) -> String {
     let out = run(folder, line);
     assert!(out.status.success(), "{line}: {}", String::from_utf8_lossy(&out.stderr));
     String::from_utf8(out.stdout).unwrap()
 }
 
-/// Confirms exit code and message of a run that must fail, and that it left nothing.
+/// Checks exit code and message of a run that must fail, and that it left no files.
 fn refused(folder: &Path, line: &str, code: i32, says: &[&str]) {
     let before = files(folder);
     let out = run(folder, line);
@@ -84,7 +84,7 @@ fn refused(folder: &Path, line: &str, code: i32, says: &[&str]) {
     assert!(files(folder) == before, "{line} left something");
 }
 
-/// Every file below a folder, with its bytes.
+/// Returns every file below a folder with its bytes.
 fn files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
     let mut found = BTreeMap::new();
     for entry in fs::read_dir(folder).unwrap() {
@@ -98,14 +98,14 @@ fn files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
     found
 }
 
-/// Values of a `.npy` picture, `[height, width, 3]`.
+/// Returns the values of a `.npy` image, shape `[height, width, 3]`.
 fn array(path: &Path) -> Vec<f32> {
     let file = npyz::NpyFile::new(File::open(path).unwrap()).unwrap();
     assert_eq!(file.shape()[2], 3);
     file.into_vec().unwrap()
 }
 
-/// Bytes of an 8-bit RGB PNG.
+/// Returns the bytes of an 8-bit RGB PNG.
 fn bytes(path: &Path) -> Vec<u8> {
     let mut reader = png::Decoder::new(std::io::BufReader::new(File::open(path).unwrap())).read_info().unwrap();
     assert_eq!(reader.output_color_type(), (png::ColorType::Rgb, png::BitDepth::Eight));
@@ -119,14 +119,14 @@ fn mean_square(values: impl Iterator<Item = f64>) -> f64 {
     squares.iter().sum::<f64>() / squares.len() as f64
 }
 
-fn shown(image: &[f32]) -> impl Iterator<Item = f64> {
+fn as_displayed(image: &[f32]) -> impl Iterator<Item = f64> {
     image.iter().map(|&value| f64::from(value.clamp(0.0, 1.0)))
 }
 
 const TEST_NAMES: [&str; 3] = ["v00", "v02", "v03"];
 
 #[test]
-fn png_is_the_array_clamped_and_rounded_and_one_is_the_same_as_all() {
+fn png_is_the_clamped_rounded_array() {
     let folder = scene();
     let at = |name: &str| folder.path().join(name);
     done(folder.path(), "render scene.gseq --cameras cameras.json --all -o pngs");
@@ -136,7 +136,7 @@ fn png_is_the_array_clamped_and_rounded_and_one_is_the_same_as_all() {
         for view in TEST_NAMES {
             let values = array(&at(&format!("arrays/t{t:03}_{view}.npy")));
             assert_eq!(values.len(), SIZE.0 * SIZE.1 * 3);
-            let expected: Vec<u8> = shown(&values).map(|value| (value * 255.0).round() as u8).collect();
+            let expected: Vec<u8> = as_displayed(&values).map(|value| (value * 255.0).round() as u8).collect();
             let got = bytes(&at(&format!("pngs/t{t:03}_{view}.png")));
             assert_eq!(got.len(), expected.len());
             let wrong = (0..got.len()).find(|&i| got[i] != expected[i]).map(|i| (i, got[i], expected[i]));
@@ -156,7 +156,7 @@ fn png_is_the_array_clamped_and_rounded_and_one_is_the_same_as_all() {
 }
 
 #[test]
-fn background_is_the_asked_one_else_the_cameras_else_that_of_the_model_beside_them_else_black() {
+fn background_comes_from_option_cameras_model_or_black() {
     let folder = scene();
     let corner = |extra: &str| {
         done(
@@ -182,7 +182,7 @@ fn background_is_the_asked_one_else_the_cameras_else_that_of_the_model_beside_th
 }
 
 #[test]
-fn any_number_of_threads_gives_the_same_bytes() {
+fn renders_ignore_thread_count() {
     let folder = scene();
     done(folder.path(), "render scene.gseq --cameras cameras.json --all -o photos");
     let results = ["1", "2", "7"].map(|threads| {
@@ -198,7 +198,7 @@ fn any_number_of_threads_gives_the_same_bytes() {
 }
 
 #[test]
-fn evaluation_is_the_mean_over_the_rendered_pictures() {
+fn evaluation_is_the_mean_over_the_renders() {
     let folder = scene();
     for name in ["scene", "smaller"] {
         done(folder.path(), &format!("render {name}.gseq --cameras cameras.json --all --as npy -o {name}"));
@@ -207,9 +207,9 @@ fn evaluation_is_the_mean_over_the_rendered_pictures() {
     let line = "evaluate scene.gseq smaller.gseq --cameras cameras.json --ground-truth photos --json --csv all.csv";
     let found: Value = serde_json::from_str(&done(folder.path(), line)).unwrap();
     let read = |name: &str, t: usize, view: &str| {
-        shown(&array(&folder.path().join(format!("{name}/t{t:03}_{view}.npy")))).collect::<Vec<f64>>()
+        as_displayed(&array(&folder.path().join(format!("{name}/t{t:03}_{view}.npy")))).collect::<Vec<f64>>()
     };
-    // Pictures hold f32: of an error of half a step, its rounding shows in the fourth decimal of dB.
+    // Renders are f32: its rounding changes the fourth decimal of the PSNR of an error of half a quantization step.
     let photo = |t: usize, view: &str| -> Vec<f64> {
         bytes(&folder.path().join(format!("photos/t{t:03}_{view}.png")))
             .iter()
@@ -243,13 +243,13 @@ fn evaluation_is_the_mean_over_the_rendered_pictures() {
     assert!(mean(&loss) < 90.0 && mean(&temporal) > 1e-4, "the models do not differ");
     assert_eq!(found["count"], json!({ "original": 400, "compressed": 300 }));
     assert_eq!((&found["pairs"], &found["ground_truth"]["pairs"]), (&json!(12), &json!(12)));
-    // 8-bit rounding is all that parts the original from its own pictures: at most 1/510 a channel.
+    // The original differs from its own renders only by 8-bit rounding: at most 1/510 per channel.
     assert!(found["ground_truth"]["original"]["psnr"].as_f64().unwrap() >= 20.0 * 510f64.log10());
     assert_eq!(fs::read_to_string(folder.path().join("all.csv")).unwrap().lines().count(), 13);
 }
 
 #[test]
-fn flip_is_computed_where_it_is_asked_for_and_changes_nothing_else() {
+fn flip_is_computed_on_request_and_changes_nothing_else() {
     let folder = scene();
     let line = "evaluate scene.gseq smaller.gseq --cameras cameras.json --max-frames 2 --json --csv";
     let without: Value = serde_json::from_str(&done(folder.path(), &format!("{line} without.csv"))).unwrap();
@@ -266,13 +266,13 @@ fn flip_is_computed_where_it_is_asked_for_and_changes_nothing_else() {
             sum += if of == "per_view" { value / 3.0 } else { 0.0 };
         }
     }
-    // Every view is seen as often.
+    // Every view has the same number of frames.
     assert!((sum - overall).abs() < 1e-12, "views mean {sum}, overall {overall}");
     assert_eq!(with, without);
 }
 
 #[test]
-fn a_model_loses_nothing_against_itself() {
+fn model_equals_itself() {
     let folder = scene();
     let line = "evaluate scene.gseq scene.gseq --cameras cameras.json --split all --max-frames 2 --json";
     let found: Value = serde_json::from_str(&done(folder.path(), line)).unwrap();
@@ -284,7 +284,7 @@ fn a_model_loses_nothing_against_itself() {
 }
 
 #[test]
-fn photographs_are_found_by_the_names_the_cameras_give() {
+fn photographs_are_found_by_names_in_the_cameras() {
     let folder = scene();
     done(folder.path(), "render scene.gseq --cameras cameras.json --frame 0 --view 0 -o x.png");
     let first = "evaluate scene.gseq scene.gseq --cameras cameras.json --max-frames 1 --json --ground-truth";
@@ -298,7 +298,7 @@ fn photographs_are_found_by_the_names_the_cameras_give() {
         assert!(views[0]["psnr"].as_f64().unwrap() > 50.0, "view 0 is itself");
         assert!(views[2]["psnr"].as_f64().unwrap() < 50.0, "view 3 is not view 0");
     }
-    // In one camera's folder the same name would stand for all of them.
+    // In a single camera folder the file name would match all views.
     refused(
         folder.path(),
         &format!("{first} photos/cam0"),
@@ -316,7 +316,7 @@ fn photographs_are_found_by_the_names_the_cameras_give() {
 }
 
 #[test]
-fn misuse_exits_with_2_and_leaves_nothing() {
+fn misuse_exits_with_2_and_leaves_no_files() {
     let folder = scene();
     let refused = |line: &str, says: &[&str]| refused(folder.path(), line, 2, says);
     let render = "render scene.gseq --cameras cameras.json";
@@ -339,7 +339,7 @@ fn misuse_exits_with_2_and_leaves_nothing() {
 }
 
 #[test]
-fn wrong_inputs_exit_with_1_and_leave_nothing() {
+fn wrong_inputs_exit_with_1_and_leave_no_files() {
     let folder = scene();
     write_sequence(
         &Scene::new(300, FRAMES + 1),
@@ -363,23 +363,23 @@ fn wrong_inputs_exit_with_1_and_leave_nothing() {
     refused(folder.path(), "evaluate scene.gseq none.gseq --cameras cameras.json", 1, &["none.gseq"]);
 }
 
-/// What each model's four pictures were measured to reproduce at, in dB, less 4: the last bits of `exp` and of the
-/// deformation field are the machine's.
-const LEAST_DB: [[f64; 4]; 3] =
+/// Lower bounds of the PSNR of the four renders of each model, in dB: the measured values minus 4, because the last
+/// bits of `exp` and of the deformation field depend on the machine.
+const MIN_PSNR_DB: [[f64; 4]; 3] =
     [[110.5, 102.9, 102.6, 98.9], [119.8, 125.5, 121.5, 119.6], [113.3, 95.9, 110.1, 119.6]];
 
 #[test]
 #[ignore = "needs the trained models"]
-fn models_render_their_reference_pictures_to_rounding_from_their_folders() {
+fn models_render_their_references_to_rounding() {
     let data = models::folder();
     let folder = tempfile::tempdir().unwrap();
-    for (name, least) in models::NAMES.into_iter().zip(LEAST_DB) {
+    for (name, least) in models::NAMES.into_iter().zip(MIN_PSNR_DB) {
         let model = models::Model::open(&data, name);
         let renders = model.renders();
         assert_eq!(renders.len(), least.len());
         for ((frame, view), least) in renders.into_iter().zip(least) {
             let path = data.join(name);
-            // The folder's own transforms: the background comes from cfg_args.
+            // The model's own transforms file; the background comes from cfg_args.
             let line = format!("render . --cameras transforms_test.json --frame {frame} --view {view} -o");
             let output = folder.path().join(format!("{name}_{frame}_{view}.npy"));
             done(&path, &format!("{line} {}", output.display()));
@@ -393,7 +393,7 @@ fn models_render_their_reference_pictures_to_rounding_from_their_folders() {
 
 #[test]
 #[ignore = "needs the trained models"]
-fn unpruned_models_score_as_recorded_against_ground_truth() {
+fn unpruned_models_score_as_recorded() {
     let data = models::folder();
     for name in models::NAMES {
         let path = data.join(name);

@@ -1,4 +1,4 @@
-//! The rasteriser's derivative against differences of the f64 oracle, closed forms, and laws.
+//! Gradients of the rasterizer against differences of the f64 oracle, closed forms, and invariants.
 
 use std::path::Path;
 
@@ -12,30 +12,31 @@ use splatsieve::source::FrameSource;
 
 const BACKGROUND: [f32; 3] = [0.1, 0.9, 0.4];
 
-/// The gradients of a loss whose derivative by the picture is `pull`.
+/// Returns the gradients of a loss whose derivative with respect to the image is `pull`.
 fn gradients(gaussians: &Gaussians, camera: &Camera, pull: impl FnOnce(&Image) -> Image) -> Gradients {
     let mut gradients = Gradients::new(gaussians.len(), Attributes::all(), gaussians.sh_degree());
     Renderer::new().gradient(gaussians, camera, BACKGROUND, |picture| (0.0, pull(picture)), &mut gradients);
     gradients
 }
 
-/// A picture of one value.
+/// Returns an image with the same value in all pixels.
 fn plain_image(camera: &Camera, value: [f32; 3]) -> Image {
     let pixels = camera.width as usize * camera.height as usize;
     Image { width: camera.width, height: camera.height, data: value.repeat(pixels) }
 }
 
-/// `x` changed by about ± `step`, and how far apart both are.
-fn nudged(x: f32, step: f32) -> ([f32; 2], f64) {
+/// Returns `x` minus and plus about `step`, and the difference of the two in f64.
+fn step_both_ways(x: f32, step: f32) -> ([f32; 2], f64) {
     let both = [x - step, x + step];
     (both, f64::from(both[1]) - f64::from(both[0]))
 }
 
 #[test]
-fn derivatives_are_those_of_the_oracle_by_central_differences() {
+fn gradients_match_central_differences_of_the_oracle() {
     for (seed, count, degree, width, height) in [(1, 300, 3, 67, 45), (2, 900, 1, 64, 64), (3, 40, 2, 33, 100)] {
         let (gaussians, camera) = (scene(seed, count, degree), camera(width, height));
-        // Half the squared difference from noise, over pixels in which f32 decides as f64 does.
+        // The loss is half the squared difference from noise, over the pixels in which f32 makes the same decisions as
+        // f64.
         let sure: Vec<f64> = oracle::picture(&gaussians, &camera, BACKGROUND, 1)
             .doubtful
             .iter()
@@ -60,15 +61,16 @@ fn derivatives_are_those_of_the_oracle_by_central_differences() {
             largest.sort_by(|&a, &b| got[b].abs().total_cmp(&got[a].abs()));
             for &at in largest.iter().take(60) {
                 let mut changed = gaussians.clone();
-                let (both, apart) = nudged(gaussians.column(column).planes()[at], 3e-5);
+                let (both, apart) = step_both_ways(gaussians.column(column).planes()[at], 3e-5);
                 let losses = both.map(|x| {
                     changed.column_mut(column).planes_mut()[at] = x;
                     loss(&changed)
                 });
                 let expected = (losses[1] - losses[0]) / apart;
                 let got = f64::from(got[at]);
-                // What is blended is decided beforehand, so the loss has kinks (an alpha of 0.99, a channel at 0) but
-                // no steps. What is left is f32: sums of terms of both signs, and the picture they start from.
+                // The set of blended Gaussians is fixed beforehand, so the loss has kinks (an alpha of 0.99, a channel
+                // at 0) but no steps. The rest is the error of f32: sums of terms of both signs, and the render they
+                // start from.
                 let tolerance = 5e-4 * expected.abs();
                 assert!(
                     (got - expected).abs() <= tolerance,
@@ -83,13 +85,13 @@ fn derivatives_are_those_of_the_oracle_by_central_differences() {
 }
 
 #[test]
-fn one_gaussian_is_its_closed_form() {
-    // Isotropic, on the axis: a variance of (f·s/z)² + 0.3 about the picture's middle.
+fn gradient_of_one_gaussian_is_its_closed_form() {
+    // An isotropic Gaussian on the axis has variance (f·s/z)² + 0.3 about the center of the image.
     let (size, depth, scale, opacity) = (48u32, 2.0f64, 0.08f64, 0.7f64);
     let (gaussians, camera) = (single(depth as f32, scale as f32, opacity as f32), plain_camera(size));
     let seen = (50.0 * scale / depth).powi(2);
     let (variance, middle) = (seen + 0.3, f64::from(size) / 2.0 - 0.5);
-    // The loss is the total of a channel; its color before a background makes the contrast.
+    // The loss is the sum of a channel; the contrast is the color minus the background.
     for (channel, contrast) in [(0, 1.0 - 0.1), (1, 0.5 - 0.9), (2, 0.0 - 0.4)] {
         let mut weights: [f32; 3] = [0.0; 3];
         weights[channel] = 1.0;
@@ -113,14 +115,14 @@ fn one_gaussian_is_its_closed_form() {
         };
         let row = |column| found.column(column);
         close("logit", row(Attributes::OPACITY).plane(0)[0], (1.0 - opacity) * contrast * alphas);
-        // Blue is cut off at 0.
+        // Blue is clamped at 0.
         let color = if channel == 2 { 0.0 } else { splatsieve::model::SH_C0 * alphas };
         (0..3).for_each(|c| close("sh", row(Attributes::SH).plane(c)[0], if c == channel { color } else { 0.0 }));
         let widths = squares.map(|square| contrast * square * seen / variance.powi(2));
         close("scale x", row(Attributes::LOG_SCALE).plane(0)[0], widths[0]);
         close("scale y", row(Attributes::LOG_SCALE).plane(1)[0], widths[1]);
-        // Along the line of sight it has no extent; a ball looks the same however it is turned; and to either side
-        // of the middle pixels are alike.
+        // The Gaussian has no extent along the line of sight, a ball looks the same in every rotation, and the pixels
+        // on both sides of the center are equal.
         close("scale z", row(Attributes::LOG_SCALE).plane(2)[0], 0.0);
         (0..4).for_each(|c| close("rotation", row(Attributes::ROTATION).plane(c)[0], 0.0));
         (0..2).for_each(|c| close("position", row(Attributes::POSITION).plane(c)[0], 0.0));
@@ -130,8 +132,8 @@ fn one_gaussian_is_its_closed_form() {
 }
 
 #[test]
-fn moving_a_picture_whole_moves_it_by_focal_over_depth() {
-    // The first moment of the picture along u: its derivative by x is alphas · f/z.
+fn image_moves_by_focal_length_over_depth() {
+    // The loss is the first moment of the image along u; its derivative by x is alphas · f/z.
     let (gaussians, camera) = (single(2.0, 0.05, 0.6), plain_camera(48));
     let found = gradients(&gaussians, &camera, |picture| {
         let mut moment = plain_image(&camera, [0.0; 3]);
@@ -139,17 +141,17 @@ fn moving_a_picture_whole_moves_it_by_focal_over_depth() {
         moment
     });
     let picture = render(&gaussians, &camera, [0.0; 3]);
-    // By parts: what stands above the edge, where alpha drops from 1/255 to 0.
+    // Integration by parts counts the values above the edge, where alpha drops from 1/255 to 0.
     let above = |red: f32| (f64::from(red) - 1.0 / 255.0).max(0.0);
     let red: f64 = picture.data.chunks_exact(3).map(|pixel| above(pixel[0])).sum();
     let expected = red * (1.0 - 0.1) * 50.0 / 2.0;
     let got = f64::from(found.column(Attributes::POSITION).plane(0)[0]);
-    // The sum over whole pixels is the integral, but for pixels on the edge.
+    // The sum over whole pixels is the integral, except for pixels on the edge.
     assert!((got / expected - 1.0).abs() < 0.005, "got {got}, expected {expected}");
 }
 
 #[test]
-fn threads_kept_buffers_and_frozen_columns_do_not_change_a_bit() {
+fn gradients_ignore_threads_buffers_frozen_attributes() {
     let camera = camera(131, 77);
     let noise = |picture: &Image| {
         let mut random = Random(7);
@@ -185,7 +187,7 @@ fn threads_kept_buffers_and_frozen_columns_do_not_change_a_bit() {
 }
 
 #[test]
-fn pictures_add_up() {
+fn gradients_of_several_renders_add_up() {
     let (scene, views) = (scene(51, 200, 1), [camera(40, 40), camera(50, 30)]);
     let mut both = Gradients::new(200, Attributes::all(), 1);
     let mut renderer = Renderer::new();
@@ -196,7 +198,7 @@ fn pictures_add_up() {
     for column in Attributes::all().iter() {
         let [first, second] = [0, 1].map(|k: usize| apart[k].column(column).planes());
         let sums = first.iter().zip(second).map(|(a, b)| a + b);
-        // A position takes two parts of each picture.
+        // A position gets two contributions from each render.
         let close = |(&got, expected): (&f32, f32)| (got - expected).abs() <= 1e-6 * (1.0 + expected.abs());
         assert!(both.column(column).planes().iter().zip(sums).all(close), "{}", column.name());
     }
@@ -205,7 +207,7 @@ fn pictures_add_up() {
 }
 
 #[test]
-fn extremes_give_finite_gradients_and_what_is_not_drawn_none() {
+fn extremes_give_finite_gradients_and_undrawn_ones_zero() {
     let camera = plain_camera(40);
     let extremes: [fn(&mut Gaussians); 16] = [
         |g| g.log_scale.set_row(0, [40.0f32; 3]),
@@ -227,7 +229,7 @@ fn extremes_give_finite_gradients_and_what_is_not_drawn_none() {
     ];
     for (k, extreme) in extremes.into_iter().enumerate() {
         let mut scene = scene(61, 50, 1);
-        // The one that is extreme stands before the camera.
+        // The extreme Gaussian is in front of the camera.
         scene.position.set_row(0, [0.02, -0.03, 2.0]);
         scene.rotation.set_row(0, [1.0, 0.3, -0.2, 0.5]);
         extreme(&mut scene);
@@ -235,16 +237,16 @@ fn extremes_give_finite_gradients_and_what_is_not_drawn_none() {
         for column in Attributes::all().iter() {
             let planes = found.column(column).planes();
             assert!(planes.iter().all(|x| x.is_finite()), "extreme {k}, {}: not finite", column.name());
-            // The last three and what is too faint are not drawn.
-            let of_it = (0..found.column(column).width()).all(|c| found.column(column).plane(c)[0] == 0.0);
-            assert!(of_it || (k < 13 && k != 5), "extreme {k}, {}: {planes:?}", column.name());
+            // The last three extremes and the one that is too faint are not drawn.
+            let is_zero = (0..found.column(column).width()).all(|c| found.column(column).plane(c)[0] == 0.0);
+            assert!(is_zero || (k < 13 && k != 5), "extreme {k}, {}: {planes:?}", column.name());
         }
         assert!(found.column(Attributes::SH).planes().iter().any(|&x| x != 0.0), "extreme {k}: nothing is left");
     }
 }
 
 #[test]
-fn one_gaussian_over_the_whole_picture_is_its_alpha() {
+fn gradient_of_an_image_filling_gaussian_is_its_alpha() {
     let mut wall = single(2.0, 1.0, 0.6);
     wall.log_scale.set_row(0, [40.0f32; 3]);
     let camera = plain_camera(40);
@@ -256,7 +258,7 @@ fn one_gaussian_over_the_whole_picture_is_its_alpha() {
 }
 
 #[test]
-fn an_alpha_that_is_cut_moves_nothing_but_color() {
+fn clamped_alpha_has_gradients_only_for_color() {
     let mut wall = single(2.0, 1.0, 0.999);
     wall.log_scale.set_row(0, [5.0f32; 3]);
     let camera = plain_camera(40);
@@ -266,11 +268,11 @@ fn an_alpha_that_is_cut_moves_nothing_but_color() {
     }
     let got = f64::from(found.column(Attributes::SH).plane(0)[0]);
     let expected = splatsieve::model::SH_C0 * 0.99 * 1600.0;
-    assert!((got / expected - 1.0).abs() < 1e-5, "colour: got {got}, expected {expected}");
+    assert!((got / expected - 1.0).abs() < 1e-5, "color: got {got}, expected {expected}");
 }
 
 #[test]
-fn pixels_that_are_not_finite_count_as_ones_the_loss_does_not_depend_on() {
+fn nonfinite_pixels_have_no_gradient() {
     let (scene, camera) = (scene(71, 300, 1), camera(50, 40));
     let spoiled = |value: f32| {
         gradients(&scene, &camera, |picture| {
@@ -287,7 +289,7 @@ fn pixels_that_are_not_finite_count_as_ones_the_loss_does_not_depend_on() {
 }
 
 #[test]
-fn positions_that_are_stored_take_what_the_picture_of_a_deformed_state_takes_of_them() {
+fn stored_positions_get_gradients_through_the_field() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/tiny_model");
     let model = ModelFolder::open(&root, None).unwrap().with_times(vec![0.0, 0.4, 1.0]).unwrap();
     let (deformation, frame) = (model.deformation().unwrap(), 1);
@@ -315,7 +317,8 @@ fn positions_that_are_stored_take_what_the_picture_of_a_deformed_state_takes_of_
     deformation.jacobian(frame, stored, Attributes::all()).unwrap().pull_back(&mut found);
 
     let loss = |stored: &StoredParams| -> f64 {
-        // A step of the position moves other columns too, which a derivative by the position's head alone leaves out.
+        // A step of the position changes other attributes through the field, which the derivative by the position head
+        // does not include.
         let moved = Gaussians { position: state_of(stored).position, ..state.clone() };
         let pixels = oracle::render_blended(&moved, &camera, BACKGROUND, &blended);
         let square = |at: usize| (pixels[at / 3][at % 3] - f64::from(target[at])).powi(2);
@@ -327,13 +330,13 @@ fn positions_that_are_stored_take_what_the_picture_of_a_deformed_state_takes_of_
     let (mut off, mut through_field) = (0, 0);
     for &at in largest.iter().take(60) {
         let mut changed = stored.clone();
-        let (both, apart) = nudged(stored.gaussians.position.planes()[at], 2e-4);
+        let (both, apart) = step_both_ways(stored.gaussians.position.planes()[at], 2e-4);
         let losses = both.map(|x| {
             changed.gaussians.position.planes_mut()[at] = x;
             loss(&changed)
         });
         let expected = (losses[1] - losses[0]) / apart;
-        // States are f32, and within a step some cross the edge of a texel or a ReLU.
+        // States are f32, and some steps cross the edge of a texel or a ReLU.
         off += usize::from((f64::from(got[at]) - expected).abs() > 0.01 * expected.abs());
         let alone = direct.column(Attributes::POSITION).planes()[at];
         through_field += usize::from((alone - got[at]).abs() > 0.03 * got[at].abs());
@@ -343,7 +346,7 @@ fn positions_that_are_stored_take_what_the_picture_of_a_deformed_state_takes_of_
 }
 
 #[test]
-fn empty_scenes_and_empty_pictures_are_valid() {
+fn empty_scenes_and_images_have_valid_gradients() {
     assert!(gradients(&Gaussians::zeros(0, 1), &plain_camera(17), Image::clone).is_empty());
     let nothing = Camera { width: 0, height: 0, ..plain_camera(16) };
     let found = gradients(&single(2.0, 0.1, 0.5), &nothing, Image::clone);

@@ -1,10 +1,11 @@
 #!/usr/bin/env python3
-"""scripts/slurm against a real Slurm, which it starts and stops itself: same bytes, requeues, failures that are told.
+"""Tests scripts/slurm with a real Slurm, which it starts and stops: same bytes, requeued tasks, reported failures.
 
     python3 tests/slurm/check.py target/release/splatsieve [MODEL] [--only NAME ...]
 
-MODEL is room2_big; without it, scenes of `splatsieve demo` do. Needs Slurm and MUNGE (Debian: slurm-wlm, munge) and
-nothing but Python. Exits 1 if a claim fails. `--start` says whether a Slurm of one's own can be started here at all.
+MODEL is room2_big; without it, scenes of `splatsieve demo` are used. Needs Slurm and MUNGE (Debian: slurm-wlm, munge)
+and the Python standard library. Exits 1 if a test fails. `--start` only checks whether a private Slurm can be started
+here.
 """
 
 import argparse
@@ -24,7 +25,7 @@ SCRIPTS = Path(__file__).resolve().parents[2] / "scripts/slurm"
 
 
 class Bench:
-    """A folder with scenes, a program, and a Slurm to give them to."""
+    """Folder with scenes, a program, and a Slurm that runs them."""
 
     def __init__(self, folder, program, model, cluster):
         self.folder, self.program, self.cluster = folder, program, cluster
@@ -41,14 +42,14 @@ class Bench:
         assert done.returncode == 0, done.stderr
 
     def one_process(self, name, words):
-        """What one process writes."""
+        """Returns what one process writes."""
         if name not in self.plain:
             self.here("compress", *words, "-o", self.folder / name, "--threads", 1, "--quiet")
             self.plain[name] = contents(self.folder / name)
         return self.plain[name]
 
     def submit(self, script, *words):
-        """Submits, from a folder of its own; gives the number of the last job."""
+        """Submits from a separate folder. Returns the number of the last job."""
         return self.cluster.run(SCRIPTS / script, "--submit", *words, cwd=self.folder).split()[-1]
 
     def long(self, work, output, words, *options):
@@ -56,7 +57,7 @@ class Bench:
         return self.submit("long_scene.py", *options, "--", *words, "-o", output)
 
     def meet(self, job_name, act, which=lambda _: True, once=False):
-        """Does something to a task of an array while it works, until one is put back into the queue by it."""
+        """Acts on a running task of an array until one of them has been requeued."""
         for _ in range(12):
             found = []
 
@@ -64,7 +65,7 @@ class Bench:
                 for pid, name, variables in self.cluster.processes():
                     if name == "splatsieve" and variables.get("SLURM_JOB_NAME") == job_name and which(variables):
                         found[:] = [pid, variables["SLURM_JOB_ID"], variables["SLURMD_NODENAME"]]
-                        # It does not end before it is met, however fast the machine is.
+                        # The stopped process cannot end before the action, however fast the machine is.
                         end(pid, signal.SIGSTOP)
                         return True
                 return False
@@ -78,7 +79,7 @@ class Bench:
                 end(pid, signal.SIGCONT)
                 wait(f"the end of {number}", 60, lambda: self.one(number)["JobState"] != "RUNNING")
             except RuntimeError as error:
-                # Slurm's words for one that has just ended.
+                # Messages of Slurm for a job that has just ended.
                 assert "now" in str(error) or "completing" in str(error) or "Invalid job" in str(error), error
                 end(pid, signal.SIGCONT)
             if int(self.one(number)["Restarts"]) > before or once:
@@ -86,7 +87,7 @@ class Bench:
         raise AssertionError(f"no task of {job_name} was met at work")
 
     def one(self, number):
-        """A task by its own number, which that of its array may be."""
+        """Returns a task by its own job number, which may equal that of its array."""
         return next(task for task in self.cluster.state(number) if task["JobId"] == number)
 
     def logs(self, folder):
@@ -94,7 +95,7 @@ class Bench:
 
 
 def told(pid):
-    """Whether a stopped process has been told to end, or has."""
+    """Returns whether a stopped process has a pending SIGTERM, or has ended."""
     try:
         status = dict(line.split(":\t") for line in Path(f"/proc/{pid}/status").read_text().splitlines())
     except OSError:
@@ -103,7 +104,7 @@ def told(pid):
 
 
 def contents(path):
-    """Bytes of a result by their names, but of what tells its times."""
+    """Returns the bytes of a result by name, without files that contain times."""
     files = path.rglob("*") if path.is_dir() else path.parent.glob(path.name + "*")
     names = {file.relative_to(path) if path.is_dir() else file.name[len(path.name) :]: file for file in files if file.is_file()}
     return {str(name): file.read_bytes() for name, file in names.items() if not str(name).endswith("summary.json")}
@@ -116,7 +117,7 @@ def same(bench, output, name, words, job):
 
 def arrays_of_eight_give_the_bytes_of_one_process(bench):
     work, output = bench.folder / "work of 8", bench.folder / "small of 8"
-    # What there is to divide of it: scan, visible, four rounds, pairs; the listed further rounds would find nothing.
+    # Stages to divide: scan, visible, four rounds, pairs; the further listed rounds would find nothing to do.
     job = bench.long(work, output, bench.scene, "--parts", 8, "--arrays", 7)
     states = bench.cluster.ended(job, 240)
     logs = bench.logs(Path(f"{work}.logs"))
@@ -143,12 +144,12 @@ def a_lost_node_is_replaced(bench):
     same(bench, output, "plain", bench.scene, job)
 
 
-def what_is_told_to_end_goes_back_into_the_queue(bench):
+def terminated_tasks_are_requeued(bench):
     work, output = bench.folder / "work of told", bench.folder / "small of told"
     job = bench.long(work, output, bench.scene, "--parts", 4, "--arrays", 2, "--name", "told")
     run = bench.cluster.run
-    # As a time limit tells it; put back by an administrator; turned out by what is more urgent. First the task that has
-    # the array's own number, by which Slurm's commands mean all of them.
+    # Three ways to requeue: a time limit, an administrator, preemption. The first is applied to the task that has the
+    # number of the array, by which Slurm's commands mean all tasks.
     tell = lambda number, node: run("scancel", "--signal=TERM", "--batch", f"{number}_4")  # noqa: E731
     bench.meet("told-visible", tell, which=lambda variables: variables["SLURM_JOB_ID"] == variables["SLURM_ARRAY_JOB_ID"])
     bench.meet("told-visible", lambda number, node: run("scontrol", "requeue", number))
@@ -161,7 +162,7 @@ def what_is_told_to_end_goes_back_into_the_queue(bench):
     same(bench, output, "plain", bench.scene, job)
 
 
-def what_is_cancelled_stays_so(bench):
+def cancelled_jobs_are_not_requeued(bench):
     work, output = bench.folder / "work of cancelled", bench.folder / "small of cancelled"
     job = bench.long(work, output, bench.scene, "--parts", 1, "--arrays", 1, "--name", "cancelled")
     number = bench.meet("cancelled-scan", lambda number, node: bench.cluster.run("scancel", number), once=True)
@@ -171,7 +172,7 @@ def what_is_cancelled_stays_so(bench):
     assert not output.exists()
 
 
-def one_broken_scene_of_four_is_told(bench):
+def one_broken_scene_of_four_is_reported(bench):
     broken = bench.folder / "broken scene.gseq"
     broken.write_bytes((bench.demo / "scene.gseq").read_bytes()[:5000])
     listed = bench.folder / "list of four"
@@ -201,7 +202,7 @@ def one_broken_scene_of_four_is_told(bench):
     one = bench.folder / "one.gseq"
     bench.here("compress", *(bench.folder / word if "/" in word else word for word in words), "-o", one, "--quiet")
     assert (bench.folder / "small 1.gseq").read_bytes() == one.read_bytes()
-    # The command that repeats it says the same; then the scene is there, and only it is done.
+    # The command that repeats the scene gives the same message; after the repair only this scene is computed.
     again = subprocess.run(failed["command"], shell=True, capture_output=True, text=True, check=False)
     assert again.returncode == 1 and failed["message"] in again.stderr, again.stderr
     shutil.copy(bench.demo / "scene.gseq", broken)
@@ -213,9 +214,9 @@ def one_broken_scene_of_four_is_told(bench):
 CASES = [
     arrays_of_eight_give_the_bytes_of_one_process,
     a_lost_node_is_replaced,
-    what_is_told_to_end_goes_back_into_the_queue,
-    what_is_cancelled_stays_so,
-    one_broken_scene_of_four_is_told,
+    terminated_tasks_are_requeued,
+    cancelled_jobs_are_not_requeued,
+    one_broken_scene_of_four_is_reported,
 ]
 
 
@@ -223,7 +224,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("program")
     parser.add_argument("model", nargs="?", type=Path)
-    parser.add_argument("--start", action="store_true", help="start a Slurm, stop it, and do nothing else")
+    parser.add_argument("--start", action="store_true", help="only start and stop a Slurm")
     parser.add_argument("--only", nargs="+", choices=[case.__name__ for case in CASES])
     args = parser.parse_args()
     if lacks := missing():

@@ -1,4 +1,4 @@
-"""A Slurm of one's own: munged, slurmctld and several slurmd of one machine in a folder, stopped with everything in them."""
+"""Private Slurm: munged, slurmctld and several slurmd on one machine in one folder, stopped with all their jobs."""
 
 import os
 import pwd
@@ -11,10 +11,10 @@ import time
 from pathlib import Path
 
 PROGRAMS = ("munged", "slurmctld", "slurmd", "sbatch", "squeue", "scontrol", "scancel", "sinfo")
-# Where Debian has the daemons, which a user's PATH may lack.
+# Folders of the daemons in Debian, which may be missing in a user's PATH.
 PATH = os.pathsep.join([os.environ.get("PATH", ""), "/usr/sbin", "/sbin"])
 
-# Short times, as tests wait for them: a node that is silent for 10 s is down; a requeued job starts after cred_expire.
+# Short times for tests: a node that is silent for 10 s is down; a requeued job starts after cred_expire.
 CONF = """
 ClusterName=splatsieve
 SlurmctldHost={host}(127.0.0.1)
@@ -55,12 +55,12 @@ PartitionName=urgent Nodes=ALL MaxTime=INFINITE State=UP PriorityTier=9 PreemptM
 
 
 def missing():
-    """Programs of Slurm and MUNGE that this machine lacks."""
+    """Returns the programs of Slurm and MUNGE that this machine lacks."""
     return [name for name in PROGRAMS if shutil.which(name, path=PATH) is None]
 
 
 def free_ports(count):
-    """Ports that nobody listens on now."""
+    """Returns ports on which nothing listens now."""
     sockets = [socket.create_server(("127.0.0.1", 0)) for _ in range(count)]
     ports = [one.getsockname()[1] for one in sockets]
     for one in sockets:
@@ -69,7 +69,7 @@ def free_ports(count):
 
 
 class Cluster:
-    """`with Cluster(4) as cluster:` runs one of four nodes with a processor each."""
+    """Cluster of `nodes` nodes with one processor each, used as `with Cluster(4) as cluster:`."""
 
     def __init__(self, nodes):
         self.names = [f"n{k + 1}" for k in range(nodes)]
@@ -125,7 +125,7 @@ class Cluster:
 
     def daemon(self, name, command):
         with open(self.folder / "log" / f"{name}.out", "ab") as log:
-            # In a session of its own: what ends a test by its keyboard leaves it to __exit__.
+            # In a separate session: Ctrl-C in a test leaves the daemons to __exit__.
             self.daemons[name] = subprocess.Popen(
                 command, env=self.environment, stdout=log, stderr=log, stdin=subprocess.DEVNULL, start_new_session=True
             )
@@ -140,13 +140,13 @@ class Cluster:
             process.wait()
 
     def lose(self, name):
-        """A node dies: its daemon, and all that runs there, without a word."""
+        """Kills a node: its daemon and all processes on it, without notice to the controller."""
         self.stop(name, signal.SIGKILL)
         for pid in self.of_jobs(name):
             end(pid, signal.SIGKILL)
 
     def processes(self):
-        """Everything that runs by this Slurm: number, name, environment."""
+        """Yields all processes of this Slurm: number, name, environment."""
         for entry in Path("/proc").iterdir():
             if not entry.name.isdigit():
                 continue
@@ -155,11 +155,13 @@ class Cluster:
                 if variables.get("SLURM_CONF") == str(self.folder / "slurm.conf"):
                     yield int(entry.name), read(entry / "comm").strip(), variables
             except OSError:
-                # It has ended meanwhile.
+                # The process has ended meanwhile.
                 continue
 
     def of_jobs(self, node=None):
-        """Processes of jobs on one node or on all; first those that watch over them, who would tell."""
+        """Returns the processes of jobs on one node or on all; first the watching processes, which would report the
+        loss.
+        """
         watchers, jobs = [], []
         for pid, name, variables in self.processes():
             if "SLURMD_NODENAME" in variables and node in (None, variables["SLURMD_NODENAME"]):
@@ -169,7 +171,7 @@ class Cluster:
         return watchers + jobs
 
     def node_of(self, watcher):
-        """The node of a slurmstepd, by one of its children."""
+        """Returns the node of a slurmstepd, found through one of its children."""
         for pid, _, variables in self.processes():
             try:
                 parent = int(read(Path(f"/proc/{pid}/stat")).rsplit(")", 1)[1].split()[1])
@@ -180,7 +182,7 @@ class Cluster:
         return None
 
     def run(self, *command, check=True, **options):
-        """What a command prints with this Slurm as its own."""
+        """Runs a command with this Slurm. Returns its output."""
         done = subprocess.run(
             [str(word) for word in command], env=self.environment, capture_output=True, text=True, check=False, **options
         )
@@ -189,12 +191,12 @@ class Cluster:
         return done.stdout if check else done
 
     def clear(self):
-        """Cancels what is left, and waits for its end."""
+        """Cancels all remaining jobs and waits for their end."""
         self.run("scancel", f"--user={os.geteuid()}")
         wait("the end of all jobs", 60, lambda: not self.run("squeue", "-h"))
 
     def state(self, job):
-        """State, reason, restarts, exit code of every task of a job."""
+        """Returns state, reason, restarts and exit code of every task of a job."""
         found = []
         for line in self.run("scontrol", "-o", "show", "job", job).splitlines():
             fields = dict(word.partition("=")[::2] for word in line.split())
@@ -203,7 +205,7 @@ class Cluster:
         return found
 
     def ended(self, job, seconds):
-        """Waits for the end of a job with all its tasks; gives its states."""
+        """Waits for the end of a job with all its tasks. Returns their states."""
         over = {"COMPLETED", "FAILED", "CANCELLED", "TIMEOUT", "OUT_OF_MEMORY"}
         wait(f"job {job}", seconds, lambda: all(task["JobState"] in over for task in self.state(job)))
         return self.state(job)
@@ -221,7 +223,7 @@ def end(pid, how):
 
 
 def wait(what, seconds, condition, every=0.2):
-    """Until a condition holds."""
+    """Waits until a condition holds."""
     until = time.monotonic() + seconds
     while not condition():
         if time.monotonic() > until:

@@ -1,4 +1,4 @@
-//! `render --video` as a user runs it: films against the stills of the same pictures.
+//! Tests of `render --video`: films against single renders of the same frames.
 
 use std::env;
 use std::fs::{self, File};
@@ -9,12 +9,12 @@ use assert_cmd::Command;
 
 use super::{FRAMES, SIZE, done, files, refused, run, scene};
 
-/// An animated PNG.
+/// Animated PNG.
 struct Apng {
-    /// RGB of every frame.
+    /// RGB bytes of every frame.
     frames: Vec<Vec<u8>>,
     size: (usize, usize),
-    /// Fractions of a second.
+    /// Delay of each frame as a fraction of a second: numerator, denominator.
     delays: Vec<(u16, u16)>,
 }
 
@@ -34,12 +34,9 @@ fn apng(path: &Path) -> Apng {
     Apng { frames, size, delays }
 }
 
-/// RGB of the still of `input` at `frame`, from `view`.
-fn still(folder: &Path, input: &str, frame: usize, view: u32) -> Vec<u8> {
-    done(
-        folder,
-        &format!("render {input} --cameras cameras.json --frame {frame} --view {view} --overwrite -o still.png"),
-    );
+/// Returns the RGB bytes of the render of `input` at `frame` from `view`.
+fn single_render(folder: &Path, input: &str, frame: usize, view: u32) -> Vec<u8> {
+    done(folder, &format!("render {input} --cameras cameras.json --frame {frame} --view {view} --overwrite -o still.png"));
     let mut reader =
         png::Decoder::new(BufReader::new(File::open(folder.join("still.png")).unwrap())).read_info().unwrap();
     let mut pixels = vec![0; reader.output_buffer_size().unwrap()];
@@ -47,13 +44,13 @@ fn still(folder: &Path, input: &str, frame: usize, view: u32) -> Vec<u8> {
     pixels
 }
 
-/// Rows of two pictures, one behind the other.
+/// Joins the rows of two images side by side.
 fn side_by_side(left: &[u8], right: &[u8]) -> Vec<u8> {
     left.chunks(3 * SIZE.0).zip(right.chunks(3 * SIZE.0)).flat_map(|rows| [rows.0, rows.1].concat()).collect()
 }
 
 #[test]
-fn frames_of_an_animated_png_are_the_stills_to_the_bit() {
+fn animated_png_frames_equal_single_renders() {
     let folder = scene();
     let at = folder.path();
     done(at, "render scene.gseq --cameras cameras.json --view 2 --video one.png --fps 12");
@@ -65,32 +62,32 @@ fn frames_of_an_animated_png_are_the_stills_to_the_bit() {
     let Apng { frames: pairs, size, .. } = apng(&at.join("two.apng"));
     assert_eq!((pairs.len(), size), (FRAMES, (2 * SIZE.0, SIZE.1)));
     for (frame, (one, pair)) in frames.iter().zip(&pairs).enumerate() {
-        assert!(*one == still(at, "scene.gseq", frame, 2), "frame {frame}");
-        let [left, right] = ["scene.gseq", "smaller.gseq"].map(|input| still(at, input, frame, 0));
+        assert!(*one == single_render(at, "scene.gseq", frame, 2), "frame {frame}");
+        let [left, right] = ["scene.gseq", "smaller.gseq"].map(|input| single_render(at, input, frame, 0));
         assert!(*pair == side_by_side(&left, &right), "frame {frame}: the first view, both models");
     }
     assert!(frames[0] != frames[3], "nothing moves");
 }
 
 #[test]
-fn a_way_through_cameras_begins_and_ends_at_their_stills_while_time_goes_on() {
+fn camera_path_begins_and_ends_at_single_renders() {
     let folder = scene();
     let at = folder.path();
     done(at, "render scene.gseq --cameras cameras.json --path 0,1,2 --split all --video way.png");
     let frames = apng(&at.join("way.png")).frames;
     assert_eq!(frames.len(), FRAMES);
-    assert!(frames[0] == still(at, "scene.gseq", 0, 0) && frames[3] == still(at, "scene.gseq", 3, 2));
+    assert!(frames[0] == single_render(at, "scene.gseq", 0, 0) && frames[3] == single_render(at, "scene.gseq", 3, 2));
     for (frame, view) in (1..3).flat_map(|frame| (0..3).map(move |view| (frame, view))) {
-        assert!(frames[frame] != still(at, "scene.gseq", frame, view), "frame {frame} is on the way");
+        assert!(frames[frame] != single_render(at, "scene.gseq", frame, view), "frame {frame} is on the way");
     }
-    // All that are held out, in order: 0, 2, 3.
+    // All test views in order: 0, 2, 3.
     done(at, "render scene.gseq --cameras cameras.json --path --video all.png");
     let all = apng(&at.join("all.png")).frames;
-    assert!(all[0] == frames[0] && all[3] == still(at, "scene.gseq", 3, 3));
+    assert!(all[0] == frames[0] && all[3] == single_render(at, "scene.gseq", 3, 3));
 }
 
 #[test]
-fn films_are_the_same_bytes_for_any_number_of_threads() {
+fn film_bytes_ignore_thread_count() {
     let folder = scene();
     let at = folder.path();
     for kind in ["png", "gif"] {
@@ -111,7 +108,7 @@ fn films_are_the_same_bytes_for_any_number_of_threads() {
 }
 
 #[test]
-fn a_model_between_its_cameras_times_is_filmed_at_as_many_frames_as_asked_for() {
+fn film_of_a_continuous_model_has_the_asked_frames() {
     let folder = tempfile::tempdir().unwrap();
     let tiny = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/tiny_model");
     let tiny = tiny.to_str().unwrap();
@@ -125,7 +122,7 @@ fn a_model_between_its_cameras_times_is_filmed_at_as_many_frames_as_asked_for() 
 }
 
 #[test]
-fn what_cannot_be_filmed_is_said_and_leaves_nothing() {
+fn impossible_films_are_refused_and_leave_no_files() {
     let folder = scene();
     let at = folder.path();
     let line = "render scene.gseq --cameras cameras.json";
@@ -150,7 +147,7 @@ fn what_cannot_be_filmed_is_said_and_leaves_nothing() {
     }
 }
 
-/// A folder with a program `ffmpeg` that runs `script`.
+/// Returns a folder with a program `ffmpeg` that runs `script`.
 #[cfg(unix)]
 fn encoder(script: &str) -> tempfile::TempDir {
     use std::os::unix::fs::PermissionsExt;
@@ -162,9 +159,9 @@ fn encoder(script: &str) -> tempfile::TempDir {
     folder
 }
 
-/// Films `line` with what `programs` holds before all others, or alone; gives the exit code and what was said on stderr.
+/// Runs `line` with the folder `programs` first in PATH, or alone in it. Returns the exit code and the standard error.
 #[cfg(unix)]
-fn with(programs: &Path, alone: bool, at: &Path, line: &str) -> (i32, String) {
+fn run_with_programs(programs: &Path, alone: bool, at: &Path, line: &str) -> (i32, String) {
     let others = env::var_os("PATH").filter(|_| !alone).unwrap_or_default();
     let path = env::join_paths([programs.to_owned()].into_iter().chain(env::split_paths(&others))).unwrap();
     let mut command = Command::cargo_bin("splatsieve").unwrap();
@@ -174,41 +171,44 @@ fn with(programs: &Path, alone: bool, at: &Path, line: &str) -> (i32, String) {
 
 #[test]
 #[cfg(unix)]
-fn an_encoder_gets_every_frame_and_what_it_fails_at_is_told() {
+fn encoder_gets_every_frame_and_its_errors_are_shown() {
     let folder = scene();
     let at = folder.path();
     let line = "--quiet render scene.gseq --cameras cameras.json --view 2";
-    // Its last argument is the file to write.
+    // The last argument is the file to write.
     let keeps = encoder("for last; do :; done; cat > \"$last\"; echo \"$@\" > asked");
-    assert_eq!(with(keeps.path(), false, at, &format!("{line} --video x.mp4 --fps 20")), (0, String::new()));
+    assert_eq!(
+        run_with_programs(keeps.path(), false, at, &format!("{line} --video x.mp4 --fps 20")),
+        (0, String::new())
+    );
     let asked = fs::read_to_string(at.join("asked")).unwrap();
     assert!(asked.contains("-s 48x36 -r 20") && asked.contains("libx264"), "{asked}");
     fs::remove_file(at.join("asked")).unwrap();
     let frames = fs::read(at.join("x.mp4")).unwrap();
     fs::remove_file(at.join("x.mp4")).unwrap();
-    let stills: Vec<u8> = (0..FRAMES).flat_map(|frame| still(at, "scene.gseq", frame, 2)).collect();
+    let stills: Vec<u8> = (0..FRAMES).flat_map(|frame| single_render(at, "scene.gseq", frame, 2)).collect();
     assert!(frames == stills);
 
     let before = files(at);
     for (script, says) in [
-        // At once, so that frames find no reader; and only after all of them.
+        // The encoder fails at once, while frames are written, or only after all frames.
         ("echo no such codec >&2; exit 3", &["x.webm", "ffmpeg", "3", "no such codec"][..]),
         ("cat > /dev/null; echo disk on fire >&2; exit 7", &["ffmpeg", "7", "disk on fire"]),
         ("kill -9 $$", &["ffmpeg", "9"]),
     ] {
         let fails = encoder(script);
-        let (code, said) = with(fails.path(), false, at, &format!("{line} --video x.webm"));
+        let (code, said) = run_with_programs(fails.path(), false, at, &format!("{line} --video x.webm"));
         assert_eq!(code, 1, "{script}: {said}");
         assert!(says.iter().all(|part| said.contains(part)), "{script}: {said}");
     }
     let nothing = tempfile::tempdir().unwrap();
-    let (code, said) = with(nothing.path(), true, at, &format!("{line} --video x.mp4"));
+    let (code, said) = run_with_programs(nothing.path(), true, at, &format!("{line} --video x.mp4"));
     assert!(code == 2 && ["ffmpeg", "PATH", "install", ".gif"].iter().all(|part| said.contains(part)), "{said}");
     assert!(files(at) == before, "something was left: {:?}", files(at).keys());
 }
 
 #[test]
-fn a_film_by_ffmpeg_shows_every_frame() {
+fn film_by_ffmpeg_shows_every_frame() {
     let folder = scene();
     let at = folder.path();
     if run(at, "render scene.gseq --cameras cameras.json --view 2 --video film.mp4").status.code() == Some(2) {
@@ -218,7 +218,7 @@ fn a_film_by_ffmpeg_shows_every_frame() {
     let mut ffmpeg = std::process::Command::new("ffmpeg");
     ffmpeg.args(["-v", "error", "-i", "film.mp4", "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]).current_dir(at);
     let found = ffmpeg.output().unwrap().stdout;
-    let stills: Vec<u8> = (0..FRAMES).flat_map(|frame| still(at, "scene.gseq", frame, 2)).collect();
+    let stills: Vec<u8> = (0..FRAMES).flat_map(|frame| single_render(at, "scene.gseq", frame, 2)).collect();
     assert_eq!(found.len(), stills.len(), "{FRAMES} frames");
     let square = |(a, b): (&u8, &u8)| (f64::from(*a) - f64::from(*b)).powi(2);
     let mean = found.iter().zip(&stills).map(square).sum::<f64>() / stills.len() as f64;

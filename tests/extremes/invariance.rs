@@ -1,9 +1,10 @@
-//! Row 40, and the unit of time: what measures and selects must not notice where a scene lies, how it is turned, in which
-//! unit its lengths and its times are. Scenes are made of near-equal, subnormal, huge, missing and repeated values.
+//! Invariance properties (case 40 and the unit of time): statistics and selection do not depend on position,
+//! orientation, unit of length or unit of time of a scene. Scenes contain near-equal, subnormal, huge, missing and
+//! repeated values.
 //!
-//! Half turns, powers of two and steps on a grid are exact in floats: the kept set is the same, and so is every bit of
-//! motion. What rounds (the logarithm of a scale, a unit of time that is no power of two) holds within the tolerance
-//! that stands beside it, and the kept set but for what lies that near the border.
+//! Half turns, powers of two and steps on a grid are exact in floats: the set of survivors and every bit of motion are
+//! the same. Operations that round (the logarithm of a scale, a unit of time that is no power of two) hold within the
+//! tolerance stated beside them, and the set of survivors except for Gaussians within that tolerance of the threshold.
 
 use std::collections::BTreeMap;
 
@@ -20,25 +21,25 @@ use splatsieve::scene::Scene;
 
 use super::scene::by_formula;
 
-/// A made-up sequence and the cameras around it.
+/// Generated sequence with cameras around it.
 #[derive(Debug, Clone)]
-struct World {
+struct GeneratedScene {
     frames: Vec<Gaussians>,
     times: Vec<f64>,
     cameras: Vec<Camera>,
 }
 
-/// What is measured of a [`World`], and who stays.
-struct Found {
+/// Statistics of a [`GeneratedScene`], and its survivors.
+struct Measured {
     rows: Rows,
     keep: Vec<bool>,
 }
 
-impl World {
-    fn found(&self, motion: MotionParams) -> Found {
+impl GeneratedScene {
+    fn measure(&self, motion: MotionParams) -> Measured {
         let mut recipe: Recipe = by_formula("default");
         recipe.scan.motion = motion;
-        // Of any unit of length there is as much room for motion as the paper gives it.
+        // Thresholds that do not depend on the unit of length, unlike the preset of the paper.
         recipe.select.tau_dynamic = 0.5;
         recipe.select.tau_static = 0.3;
         let folder = tempfile::tempdir().unwrap();
@@ -56,11 +57,11 @@ impl World {
         };
         let scene = Scene::new(path.clone(), Box::new(Container::open(&path).unwrap()), rig, None).unwrap();
         let scored = score_scene(&scene, &recipe, &UserOverrides::default()).unwrap();
-        Found { rows: scored.rows().unwrap().into_owned(), keep: scored.selection.keep.clone() }
+        Measured { rows: scored.rows().unwrap().into_owned(), keep: scored.selection.keep.clone() }
     }
 
-    /// Every state of every Gaussian through `edit`.
-    fn edited(&self, edit: impl Fn(&mut Gaussians, usize)) -> World {
+    /// Returns a copy with `edit` applied to every Gaussian in every frame.
+    fn map_states(&self, edit: impl Fn(&mut Gaussians, usize)) -> GeneratedScene {
         let mut world = self.clone();
         for frame in &mut world.frames {
             (0..frame.len()).for_each(|i| edit(frame, i));
@@ -69,7 +70,7 @@ impl World {
     }
 }
 
-/// A coordinate: on a grid, a neighbor of 1, subnormal, huge either way, or a zero of either sign.
+/// Generates a coordinate: on a grid, next to 1, subnormal, huge of either sign, or a zero of either sign.
 fn coordinate() -> impl Strategy<Value = f32> {
     prop_oneof![
         8 => (-2048i32..2048).prop_map(|k| k as f32 / 1024.0),
@@ -81,11 +82,11 @@ fn coordinate() -> impl Strategy<Value = f32> {
 }
 
 fn logit() -> impl Strategy<Value = f32> {
-    // Some never live, some are solid, and some lie at the threshold of life.
+    // Some Gaussians are never alive, some are solid, and some lie at the threshold of being alive.
     prop_oneof![6 => -6.0f32..6.0, 1 => Just(-100.0f32), 1 => Just(100.0f32), 1 => -4.596f32..-4.594]
 }
 
-/// Scales from points to what fills the picture.
+/// Generates log scales from points to sizes that fill the image.
 fn log_scale() -> impl Strategy<Value = [f32; 3]> {
     prop_oneof![6 => prop::array::uniform3(-5.0f32..-1.0), 1 => prop::array::uniform3(-28.0f32..3.0), 1 => Just([-3.0; 3])]
 }
@@ -94,7 +95,8 @@ fn rotation() -> impl Strategy<Value = [f32; 4]> {
     prop_oneof![6 => prop::array::uniform4(-1.0f32..1.0), 1 => Just([0.0; 4]), 1 => Just([1e-20, 0.0, 0.0, 1e-20])]
 }
 
-/// Time stamps with steps that differ by up to a million, and even ones, from some start on in some unit.
+/// Generates time stamps, evenly spaced or with steps that differ by up to a factor of a million, from some start in
+/// some unit.
 fn times(frames: usize) -> impl Strategy<Value = Vec<f64>> {
     let steps = prop_oneof![
         Just(vec![1.0; frames]),
@@ -103,29 +105,29 @@ fn times(frames: usize) -> impl Strategy<Value = Vec<f64>> {
     steps.prop_map(|steps| steps.iter().scan(0.0, |time, step| Some(std::mem::replace(time, *time + step))).collect())
 }
 
-fn world() -> impl Strategy<Value = World> {
+fn world() -> impl Strategy<Value = GeneratedScene> {
     (20usize..60, 1usize..7).prop_flat_map(|(count, frames)| {
         let gaussian = (prop::array::uniform3(coordinate()), rotation(), log_scale(), -1.5f32..1.5);
-        // (who moves by how much, who is a copy of whom)
+        // (step, whether the Gaussian moves, index of the Gaussian that it copies)
         let motion = (prop::array::uniform3(-4i32..5), any::<bool>(), prop::option::weighted(0.15, 0usize..20));
         let all = prop::collection::vec((gaussian, motion), count);
         let logits = prop::collection::vec(prop::collection::vec(logit(), count), frames);
         (all, logits, times(frames)).prop_map(move |(all, logits, times)| {
             let mut states = vec![Gaussians::zeros(count, 0); frames];
             for i in 0..count {
-                let of = all[i].1.2.unwrap_or(i);
-                let ((place, turn, size, gray), (step, moves, _)) = all[of];
+                let source = all[i].1.2.unwrap_or(i);
+                let ((place, turn, size, gray), (step, moves, _)) = all[source];
                 for (t, state) in states.iter_mut().enumerate() {
                     // On the grid, so that most steps are exact.
                     let by = |c: usize| if moves { (step[c] * (t * t % 5) as i32) as f32 / 256.0 } else { 0.0 };
                     state.position.set_row(i, std::array::from_fn::<f32, 3, _>(|c| place[c] + by(c)));
                     state.rotation.set_row(i, turn);
                     state.log_scale.set_row(i, size);
-                    state.opacity_logit.set_row(i, [logits[t][if moves { of } else { 0 }.min(of)]]);
+                    state.opacity_logit.set_row(i, [logits[t][if moves { source } else { 0 }.min(source)]]);
                     state.sh.set_row(i, [gray; 3]);
                 }
             }
-            // Something is in view of every camera.
+            // Gaussian 0 is in view of every camera.
             for state in &mut states {
                 state.position.set_row(0, [0.25, -0.5, 0.125]);
                 state.opacity_logit.set_row(0, [1.0]);
@@ -133,7 +135,7 @@ fn world() -> impl Strategy<Value = World> {
             }
             let eye = |eye: [f64; 3]| Camera::look_at(DVec3::from(eye), DVec3::ZERO, 1.2, (96, 64));
             let cameras = vec![eye([4.0, 1.0, 2.0]), eye([-1.0, -5.0, 0.5]), eye([0.5, 3.0, -3.0])];
-            World { frames: states, times, cameras }
+            GeneratedScene { frames: states, times, cameras }
         })
     })
 }
@@ -142,8 +144,8 @@ fn motion() -> impl Strategy<Value = MotionParams> {
     prop_oneof![Just(MotionParams::Runs), Just(MotionParams::Literal)]
 }
 
-/// Whether `found` is `expected` within `relative` of itself or `absolute`.
-fn near(what: &str, found: &[f64], expected: &[f64], relative: f64, absolute: f64) -> Result<(), TestCaseError> {
+/// Checks that `found` is `expected` within `relative` of its value or `absolute`.
+fn check_near(what: &str, found: &[f64], expected: &[f64], relative: f64, absolute: f64) -> Result<(), TestCaseError> {
     for (i, (a, b)) in found.iter().zip(expected).enumerate() {
         let tolerance = relative * b.abs() + absolute;
         prop_assert!(
@@ -167,20 +169,20 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(48))]
 
     #[test]
-    fn half_turns_change_no_bit_of_motion_and_nobody_who_stays(world in world(), axis in 0usize..3, motion in motion()) {
-        // Multiplied by i, j or k from the left a quaternion's components change places and signs.
+    fn half_turns_change_no_bit_of_motion_and_no_survivor(world in world(), axis in 0usize..3, motion in motion()) {
+        // Multiplication by i, j or k from the left exchanges the components of a quaternion and some signs.
         const TURNS: [[(usize, f32); 4]; 3] = [
             [(1, -1.0), (0, 1.0), (3, -1.0), (2, 1.0)],
             [(2, -1.0), (3, 1.0), (0, 1.0), (1, -1.0)],
             [(3, -1.0), (2, -1.0), (1, 1.0), (0, 1.0)],
         ];
-        let mut turned = world.edited(|state, i| {
+        let mut turned = world.map_states(|state, i| {
             let (place, q) = (state.position.row::<3>(i), state.rotation.row::<4>(i));
             state.position.set_row(i, std::array::from_fn::<f32, 3, _>(|c| if c == axis { place[c] } else { -place[c] }));
             if q != [0.0; 4] {
-                state.rotation.set_row(i, TURNS[axis].map(|(of, sign)| sign * q[of]));
+                state.rotation.set_row(i, TURNS[axis].map(|(component, sign)| sign * q[component]));
             } else {
-                // A zero quaternion is the identity, which turns too.
+                // A zero quaternion means the identity, which turns too.
                 state.rotation.set_row(i, std::array::from_fn::<f32, 4, _>(|c| if c == axis + 1 { 1.0 } else { 0.0 }));
             }
         });
@@ -188,31 +190,31 @@ proptest! {
         for camera in &mut turned.cameras {
             camera.rotation *= turn;
         }
-        let (expected, found) = (world.found(motion), turned.found(motion));
+        let (expected, found) = (world.measure(motion), turned.measure(motion));
         prop_assert_eq!(&found.rows.d, &expected.rows.d);
         prop_assert_eq!(&found.rows.kappa, &expected.rows.kappa);
         prop_assert_eq!((&found.rows.v, &found.rows.life), (&expected.rows.v, &expected.rows.life));
-        // Sums of a rotation's products come in another order.
-        near("C", &found.rows.c, &expected.rows.c, 1e-11, 1e-9)?;
+        // The sums of products in the rotation have another order.
+        check_near("C", &found.rows.c, &expected.rows.c, 1e-11, 1e-9)?;
         prop_assert_eq!(&found.rows.vis, &expected.rows.vis);
         prop_assert_eq!(found.keep, expected.keep);
     }
 
     #[test]
-    fn units_of_length_that_are_powers_of_two_scale_motion_exactly_and_keep_the_same_points(
+    fn power_of_two_length_units_scale_motion_exactly(
         world in world(), power in 0i32..20, motion in motion(),
     ) {
         let by = 2f64.powi(power);
-        // Points: the logarithm of any other scale rounds.
-        let points = world.edited(|state, i| state.log_scale.set_row(i, [-90.0; 3]));
-        let mut larger = points.edited(|state, i| {
+        // Scales of points, because the logarithm of any other scale rounds.
+        let points = world.map_states(|state, i| state.log_scale.set_row(i, [-90.0; 3]));
+        let mut larger = points.map_states(|state, i| {
             let place = state.position.row::<3>(i);
             state.position.set_row(i, place.map(|x| x * by as f32));
         });
         for camera in &mut larger.cameras {
             (camera.translation, camera.near) = (camera.translation * by, camera.near * by);
         }
-        let (expected, found) = (points.found(motion), larger.found(motion));
+        let (expected, found) = (points.measure(motion), larger.measure(motion));
         prop_assert_eq!(&found.rows.d, &scaled(&expected.rows.d, by));
         prop_assert_eq!(&found.rows.kappa, &scaled(&expected.rows.kappa, by));
         prop_assert_eq!((&found.rows.c, &found.rows.vis), (&expected.rows.c, &expected.rows.vis));
@@ -220,12 +222,12 @@ proptest! {
         prop_assert_eq!(found.keep, expected.keep);
     }
 
-    /// The logarithm of a scale is rounded to f32, by up to 2^-21 at 28 and 2^-22 in sum with ln of the unit: areas by four
-    /// times as much.
+    /// The logarithm of a scale is rounded to f32, by up to 2^-21 at 28, and by 2^-22 when ln of the unit is added;
+    /// areas differ by four times as much.
     #[test]
-    fn units_of_length_change_areas_by_the_rounding_of_scales_alone(world in world(), power in 0i32..20) {
+    fn length_units_change_areas_only_by_rounding_of_scales(world in world(), power in 0i32..20) {
         let by = 2f64.powi(power);
-        let mut larger = world.edited(|state, i| {
+        let mut larger = world.map_states(|state, i| {
             let (place, size) = (state.position.row::<3>(i), state.log_scale.row::<3>(i));
             state.position.set_row(i, place.map(|x| x * by as f32));
             state.log_scale.set_row(i, size.map(|s| (f64::from(s) + by.ln()) as f32));
@@ -233,65 +235,66 @@ proptest! {
         for camera in &mut larger.cameras {
             (camera.translation, camera.near) = (camera.translation * by, camera.near * by);
         }
-        let (expected, found) = (world.found(MotionParams::Runs), larger.found(MotionParams::Runs));
-        near("C", &found.rows.c, &expected.rows.c, 4e-6, 1e-9)?;
-        near("E", &found.rows.e, &expected.rows.e, 0.0, 4e-6)?;
+        let (expected, found) = (world.measure(MotionParams::Runs), larger.measure(MotionParams::Runs));
+        check_near("C", &found.rows.c, &expected.rows.c, 4e-6, 1e-9)?;
+        check_near("E", &found.rows.e, &expected.rows.e, 0.0, 4e-6)?;
         prop_assert_eq!(found.rows.vis, expected.rows.vis);
     }
 
     #[test]
-    fn steps_on_the_grid_move_a_scene_without_changing_who_stays(
+    fn grid_translations_change_no_survivor(
         world in world(), steps in prop::array::uniform3(-512i32..512), motion in motion(),
     ) {
-        // Onto the grid, within 4 of the middle: sums with whole numbers to 512 are exact, and noise is that of 512.
+        // Moves positions to the grid, within 4 of the center: sums with integers up to 512 are exact, and the noise is
+        // that of 512.
         let by = steps.map(f64::from);
-        let on_grid = world.edited(|state, i| {
+        let on_grid = world.map_states(|state, i| {
             let place = state.position.row::<3>(i).map(|x| (x.clamp(-4.0, 4.0) * 1024.0).round() / 1024.0);
             state.position.set_row(i, place);
         });
-        let mut moved = on_grid.edited(|state, i| {
+        let mut moved = on_grid.map_states(|state, i| {
             let place = state.position.row::<3>(i);
             state.position.set_row(i, std::array::from_fn::<f32, 3, _>(|c| place[c] + by[c] as f32));
         });
         for camera in &mut moved.cameras {
             camera.translation -= camera.rotation * DVec3::from(by);
         }
-        let (expected, found) = (on_grid.found(motion), moved.found(motion));
+        let (expected, found) = (on_grid.measure(motion), moved.measure(motion));
         prop_assert_eq!((&found.rows.d, &found.rows.kappa), (&expected.rows.d, &expected.rows.kappa));
         prop_assert_eq!((&found.rows.v, &found.rows.life), (&expected.rows.v, &expected.rows.life));
-        // Cameras 900 away in f64: depths of 0.2 and more are off by 1e-12 of themselves.
-        near("C", &found.rows.c, &expected.rows.c, 1e-9, 1e-9)?;
-        let border = |of: &Found| {
-            let kept = of.keep.iter().zip(&of.rows.c).filter(|(keep, _)| **keep).map(|(_, c)| *c);
+        // The cameras are 900 units away in f64: depths of 0.2 and more have a relative error of 1e-12.
+        check_near("C", &found.rows.c, &expected.rows.c, 1e-9, 1e-9)?;
+        let threshold = |measured: &Measured| {
+            let kept = measured.keep.iter().zip(&measured.rows.c).filter(|(keep, _)| **keep).map(|(_, c)| *c);
             kept.fold(f64::INFINITY, f64::min)
         };
         for i in 0..found.keep.len() {
-            let near_border = (expected.rows.c[i] - border(&expected)).abs() <= 1e-8 * expected.rows.c[i].abs() + 1e-8;
+            let near_border = (expected.rows.c[i] - threshold(&expected)).abs() <= 1e-8 * expected.rows.c[i].abs() + 1e-8;
             prop_assert!(found.keep[i] == expected.keep[i] || near_border, "Gaussian {} of C {}", i, expected.rows.c[i]);
         }
     }
 
     #[test]
-    fn units_of_time_change_nothing(world in world(), power in -60i32..60, motion in motion()) {
+    fn power_of_two_time_units_change_nothing(world in world(), power in -60i32..60, motion in motion()) {
         let mut other = world.clone();
         other.times.iter_mut().for_each(|time| *time *= 2f64.powi(power));
-        let (expected, found) = (world.found(motion), other.found(motion));
+        let (expected, found) = (world.measure(motion), other.measure(motion));
         prop_assert!(found.rows == expected.rows, "{:?}, expected {:?}", found.rows, expected.rows);
         prop_assert_eq!(found.keep, expected.keep);
     }
 
-    /// Stamps round by 1e-16 of their distance from 0, and a step by 2e-16 of that in parts of itself: with steps of down to
-    /// 1e-6 of the whole 1e-9 is left.
+    /// Stamps are rounded by 1e-16 of their distance from 0, and a step by 2e-16 of that distance; with steps down to
+    /// 1e-6 of the duration a relative error of 1e-9 remains.
     #[test]
-    fn any_start_and_unit_of_time_change_motion_by_the_rounding_of_stamps_alone(
+    fn time_units_change_motion_only_by_rounding_of_stamps(
         world in world(), unit in -12f64..12.0, start in -3f64..3.0,
     ) {
         let mut other = world.clone();
         let span = (world.times[world.times.len() - 1] - world.times[0]).max(1.0);
         other.times.iter_mut().for_each(|time| *time = 10f64.powf(unit) * (*time + start * span));
-        let (expected, found) = (world.found(MotionParams::Runs), other.found(MotionParams::Runs));
-        near("D", &found.rows.d, &expected.rows.d, 1e-9, 0.0)?;
-        near("kappa", &found.rows.kappa, &expected.rows.kappa, 1e-8, 1e-12 * expected.rows.d.iter().fold(0.0, |a: f64, b| a.max(*b)))?;
+        let (expected, found) = (world.measure(MotionParams::Runs), other.measure(MotionParams::Runs));
+        check_near("D", &found.rows.d, &expected.rows.d, 1e-9, 0.0)?;
+        check_near("kappa", &found.rows.kappa, &expected.rows.kappa, 1e-8, 1e-12 * expected.rows.d.iter().fold(0.0, |a: f64, b| a.max(*b)))?;
         prop_assert_eq!((found.rows.v, found.rows.life), (expected.rows.v, expected.rows.life));
         prop_assert_eq!((found.rows.c, found.rows.vis), (expected.rows.c, expected.rows.vis));
     }
