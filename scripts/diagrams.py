@@ -4,7 +4,7 @@
     target/release/splatsieve precision MODEL --cameras MODEL -o FOLDER
     python3 scripts/diagrams.py FOLDER/precision.html "CAPTION" PICTURE.svg ["CAPTION" PICTURE.svg ...]
 
-Each CAPTION selects the first diagram whose caption begins with it. The two diagrams of the README are made from
+Each CAPTION selects the first diagram whose caption begins with it. The two diagrams of docs/benchmarks.md are made from
 deform2: "look: relative L2 error of C" scripts/precision_look.svg, "rounds: error added" scripts/precision_rounds.svg.
 Needs only the standard library.
 """

@@ -3,7 +3,7 @@
 memory.
 
     cargo build --release
-    python3 scripts/scale.py target/release/splatsieve FOLDER                   # README's table, and FOLDER/scale.json
+    python3 scripts/scale.py target/release/splatsieve FOLDER                   # the table of docs/benchmarks.md, and FOLDER/scale.json
     python3 scripts/scale.py target/release/splatsieve FOLDER --sizes 200000x600 --budgets 256MiB 1GiB none
 
 Without `--sizes` the series varies one quantity at a time: frames, Gaussians, memory limit (`--memory`). Requirements

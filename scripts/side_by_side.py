@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Makes the image of the README: a model, a fraction of it after pruning only, and as many Gaussians refined, side by
+"""Makes an image of docs/benchmarks.md: a model, a fraction of it after pruning only, and as many Gaussians refined, side by
 side.
 
     python3 scripts/side_by_side.py target/release/splatsieve MODEL OUTPUT.png [--ratio 0.05] [--frame 30] [--view V]

@@ -3,8 +3,8 @@
 views of 1352x1014.
 
     python3 scripts/split_model.py MODEL FOLDER [--side 3] [--frames 30] [--views 18] [--size 1352x1014]
-    python3 scripts/split_model.py MODEL FOLDER --compare target/release/splatsieve   # README's figures of refining it
-    python3 scripts/split_model.py MODEL FOLDER --row target/release/splatsieve [OPTION ...]   # a row of README's table
+    python3 scripts/split_model.py MODEL FOLDER --compare target/release/splatsieve   # figures of docs/benchmarks.md
+    python3 scripts/split_model.py MODEL FOLDER --row target/release/splatsieve [OPTION ...]   # a row of docs/benchmarks.md
     python3 scripts/split_model.py MODEL FOLDER --row target/release/splatsieve --set look_pictures=0   # having looked at all
 
 The children of a Gaussian form a grid of SIDE x SIDE along its two longest axes (for nine: one standard deviation
