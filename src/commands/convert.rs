@@ -16,7 +16,7 @@ use crate::files::atomic::{Kind, MARKER, Replace, StagedFile, StagedFolder, chec
 use crate::limits::Limits;
 use crate::memory_plan::{Plan, ResourceEstimate, Workload};
 use crate::model::Attributes;
-use crate::outputs::kind::OutputKind;
+use crate::outputs::kind::{OutputKind, check_folder_name};
 use crate::passes::TRACK_BLOCK;
 use crate::pipeline::stages::write::SECONDS_TO_ENCODE;
 use crate::pipeline::summary::InputSummary;
@@ -67,16 +67,12 @@ pub fn convert(
     asked: Option<OutputKind>,
     overwrite: Replace,
 ) -> Result<Converted> {
-    if input.is_stream() {
-        return Err(Error::usage(
-            "a frame stream can be converted to a container only: splatsieve convert - NAME.gseq\n  then convert that file",
-        ));
-    }
     if asked.is_none() {
         OutputKind::check_name(output)?;
     }
     let is_own = |kind| matches!(kind, OutputKind::Model | OutputKind::Ply);
-    if is_own(OutputKind::from_path(output, asked, OutputKind::Model)) && is_archive(&input.path)? {
+    let is_model = is_own(OutputKind::from_path(output, asked, OutputKind::Model));
+    if is_model && !input.is_stream() && is_archive(&input.path)? {
         return unpack_archive(&input.path, output, overwrite, input.memory.read_limit());
     }
     let opened = open_input(input)?;
@@ -88,6 +84,9 @@ pub fn convert(
     let kind = OutputKind::from_path(output, asked, own);
     if kind == OutputKind::Archive {
         return Err(Error::usage("archives are written by compress: splatsieve compress INPUT -o NAME.gsz"));
+    }
+    if kind.is_folder() {
+        check_folder_name(output, "convert")?;
     }
     let target = if kind.is_folder() { Kind::Folder } else { Kind::File };
     check_target(output, target, &[&input.path], overwrite)?;

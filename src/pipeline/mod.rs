@@ -156,7 +156,7 @@ fn nothing_left(scene: &Scene, scored: &Scored) -> Error {
     let dropped = scored.selection.counts.forced_drop;
     let found = match dropped {
         0 => format!("none of {all}"),
-        _ => format!("none of {all}, {dropped} of which --drop-ids or --non-finite drops"),
+        _ => format!("none of {all}, {dropped} of which --drop-ids or --set non_finite=drops"),
     };
     Error::input(&scene.path, "", "at least one Gaussian that stays", found)
         .hint("nothing was written: drop fewer, or ask for a size with --ratio")

@@ -410,7 +410,7 @@ mod tests {
         let request = request(recipe);
         let plan = RunPlan::new(&request, INPUT).unwrap();
         let needs = plan.estimates(&work(1000), &Limits::NONE);
-        assert_eq!(needs.iter().map(|need| need.stage).collect::<Vec<_>>(), ["scan", "score", "emit"]);
+        assert_eq!(needs.iter().map(|need| need.stage).collect::<Vec<_>>(), ["scan", "score", "quality", "emit"]);
         let mut journal = Journal::default();
         plan.stages.record_left_out(&work(1000), &Limits::NONE, &mut journal);
         assert_eq!(journal.left_out.len(), 1);

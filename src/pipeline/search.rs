@@ -163,7 +163,7 @@ impl SearchStage {
                 return Err(Error::usage(format!(
                     "--{}: the PSNR of renders cannot be measured: expected numbers in every pixel, found NaN in \
                      some\n  \
-                     --non-finite drop removes the Gaussians that are not finite",
+                     --set non_finite=drop removes the Gaussians that are not finite",
                     self.name().replace('_', "-")
                 )));
             }

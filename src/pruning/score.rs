@@ -219,7 +219,7 @@ fn refuse_non_finite(scene: &Scene, rows: &Rows) -> Result<()> {
     let place = format!("Gaussian {}{more}", some.join(", "));
     let found = format!("NaN or infinity in {} of {} Gaussians", ids.len(), rows.len());
     Err(Error::input(&scene.path, place, "finite values in every frame", found)
-        .hint("--non-finite drop removes them, --non-finite keep leaves them as they are"))
+        .hint("--set non_finite=drop removes them, --set non_finite=keep leaves them as they are"))
 }
 
 /// Counts Gaussians with unusual values.

@@ -239,25 +239,24 @@ fn killed_run_leaves_old_or_new_output_and_foreign_files() {
 }
 
 #[test]
-fn unknown_files_are_replaced_only_with_force() {
+fn existing_files_are_replaced_only_with_overwrite() {
     let workplace = Workplace::new();
     workplace.done("convert {tiny} scene.gseq");
     for (verb, name) in [
-        ("pack {tiny} -o", "a.gseq"),
+        ("convert {tiny} -o", "a.gseq"),
         ("compress {tiny} --as ply -o", "a.ply"),
         ("score {tiny} -o", "a.csv"),
         ("score {tiny} -o", "a.npz"),
         ("render {tiny} --cameras {tiny} --frame 0 --view 0 -o", "a.png"),
         ("evaluate {tiny} scene.gseq --cameras {tiny} --max-frames 1 --csv", "b.csv"),
-        ("recover scene.gseq -o", "b.gseq"),
+        ("info scene.gseq --repair", "b.gseq"),
     ] {
         fs::write(workplace.path(name), "precious").unwrap();
-        workplace.refused(2, &format!("{verb} {name}"), &[name, "exists already", "--overwrite", "--overwrite"]);
-        workplace.refused(2, &format!("{verb} {name} --overwrite"), &[name, "nothing says", "--overwrite"]);
+        workplace.refused(2, &format!("{verb} {name}"), &[name, "exists already", "--overwrite"]);
         workplace.done(&format!("{verb} {name} --overwrite"));
         assert_ne!(fs::read(workplace.path(name)).unwrap(), b"precious");
     }
-    // Files that identify themselves as results of the program, or that a summary beside them names.
+    // Results and the files beside them are replaced too; other files stay.
     workplace.done("convert {tiny} a.gseq --overwrite");
     workplace.done("compress {tiny} --as ply -o a.ply --overwrite --count 100");
     fs::write(workplace.path("a.ply.mine"), "precious").unwrap();

@@ -76,7 +76,7 @@ fn help_describes_the_tool_and_shows_examples() {
         assert!(help.contains("--cache <FOLDER>") && help.contains("--shard <I/N>"), "{verb}: {help}");
     }
     let [short, long] = ["-h", "--help"].map(|flag| workplace.done(&format!("compress {flag}")));
-    assert!(short.lines().count() < 90 && 2 * short.len() < long.len(), "{short}");
+    assert!(short.lines().count() < 90 && short.len() < long.len(), "{short}");
     for group in ["\nCameras:\n", "\nHow small:\n", "\nMachine:\n", "\nRecipe:\n"] {
         assert!(short.contains(group), "{group:?}: {short}");
     }
@@ -91,7 +91,7 @@ fn manual_pages_cover_every_command_with_examples() {
     assert!(said.contains(&format!("{} pages", pages.len())), "{said}");
     let page = |name: &str| fs::read_to_string(workplace.path(&format!("pages/{name}.1"))).unwrap();
     let compress = page("splatsieve-compress");
-    for part in [".TH ", "target\\-ratio", "splatsieve compress model", "round\\-pictures"] {
+    for part in [".TH ", "\\-\\-ratio", "splatsieve compress model", "no\\-refine"] {
         assert!(compress.contains(part), "{part} is not in {compress}");
     }
     assert!(page("splatsieve").contains("splatsieve demo"));
@@ -103,17 +103,19 @@ fn final_report_has_count_size_quality_time_and_path() {
     let workplace = Workplace::new();
     let options = "compress {tiny} --cameras {tiny} --ratio 0.5";
     let most = workplace.done(&format!("{options} -o out"));
-    let starts: Vec<&str> = most.lines().map(|line| line.split(' ').next().unwrap_or_default()).collect();
-    assert_eq!(starts[..5], ["kept", "size", "quality", "took", "output"], "{most}");
-    assert!(starts.len() <= 9 && most.contains("kept    150 of 300 Gaussians (50.0%)\n"), "{most}");
-    assert!(most.contains("\noutput  out\n"), "{most}");
-    assert!(
-        ["dB against the original", "no difference from the original in "].iter().any(|quality| most.contains(quality)),
-        "{most}"
-    );
+    let title = most.lines().next().unwrap_or_default();
+    assert!(title.contains("tiny_model → out") && title.ends_with(" MiB peak"), "{most}");
+    for row in ["Gaussians              300         150    2.0× fewer", "Size ", "Render time ", "Quality "] {
+        assert!(most.lines().any(|line| line.starts_with(row)), "{row:?} is not in {most}");
+    }
+    assert!(most.contains("dB PSNR, 0.") && most.contains("vs. original (20 test views)"), "{most}");
+    assert!(most.contains("\nSee it:   splatsieve view "), "{most}");
     assert!(!most.contains("left out") && !most.contains(" -> "), "{most}");
     let all = workplace.done(&format!("{options} -o again --verbose"));
-    assert!(all.contains("left out: ") && all.contains(" -> ") && all.contains("\nkept    150"), "{all}");
+    assert!(
+        all.contains("left out: ") && all.contains(" -> ") && all.contains("\nGaussians              300         150"),
+        "{all}"
+    );
 }
 
 #[test]
@@ -125,7 +127,7 @@ fn misuse_exits_with_2() {
         ("compress {tiny}", "--output"),
         ("compress {tiny} -o out --no-such-flag", "--no-such-flag"),
         ("compress {tiny} -o out --preset reckless", "reckless"),
-        ("compress {tiny} -o out --set mu=many", "--mu"),
+        ("compress {tiny} -o out --set mu=many", "mu"),
         ("compress {tiny} -o out --set keep_fraction=1.5", "keep_fraction"),
         ("compress {tiny} -o out --keep-box 0,0,0,1,1", "six numbers"),
         ("compress {tiny} -o out --keep-ids 300", "below 300"),
@@ -325,7 +327,7 @@ fn times_that_do_not_match_are_refused() {
     let workplace = Workplace::new();
     let model = tiny().display().to_string();
     // `--frames 4` puts frames at 0, 1/4, 1/2 and 3/4; the images were taken at multiples of 1/9.
-    workplace.refused(2, "compress {tiny} --frames 4 -o out", &["no frame of the sequence", "--frames"]);
+    workplace.refused(2, "compress {tiny} --frames 4 -o out", &["no frame at this time", "--frames"]);
     workplace.done("convert {tiny} frames --as ply-sequence");
     fs::remove_file(workplace.path("frames/frame_00009.ply")).unwrap();
     workplace.refused(2, &format!("compress frames --cameras {model} -o out"), &["9 frames", "10 distinct times"]);
@@ -335,7 +337,7 @@ fn times_that_do_not_match_are_refused() {
 #[test]
 fn overwrite_is_needed_and_spares_foreign_outputs() {
     let workplace = with_model();
-    for verb in ["compress model -o", "pack model -o", "score model -o"] {
+    for verb in ["compress model -o", "convert model -o", "score model -o"] {
         let name = if verb.starts_with("score") { "precious.npz" } else { "precious.gseq" };
         fs::write(workplace.path(name), "precious").unwrap();
         workplace.refused(2, &format!("{verb} {name}"), &[name, "--overwrite"]);
@@ -419,12 +421,12 @@ fn damaged_containers_are_refused_cut_ones_recovered() {
 fn results_go_to_stdout_and_quiet_silences_stderr() {
     let workplace = Workplace::new();
     for (arguments, part) in [
-        ("compress {tiny} -o out", "of 300 Gaussians"),
+        ("compress {tiny} -o out", "Gaussians              300"),
         ("convert {tiny} scene.gseq", "300 Gaussians x 10 frames"),
         ("info scene.gseq", "300"),
         ("info {tiny}", "300"),
-        ("info scene.gseq --check", "sound; 10 frames"),
-        ("convert scene.gseq frames --as ply-sequence", "10 PLY files"),
+        ("info scene.gseq --check", "no damage; 10 frames"),
+        ("convert scene.gseq frames --as ply-sequence", "10 frames"),
         ("score scene.gseq -o rows.csv --cameras {tiny}", "300 Gaussians"),
         ("recipe", "[merge]"),
         ("recipe --preset paper", "[merge]"),

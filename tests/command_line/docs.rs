@@ -184,7 +184,8 @@ fn every_user_page_has_a_command() {
 fn shell_lines_are_cut_into_commands() {
     let cut = shell_commands("a 'b c' --d=\"e f\" | splatsieve x - > out # rest | y");
     assert_eq!(cut, [vec!["a", "b c", "--d=e f"], vec!["splatsieve", "x", "-"]]);
-    let text = "```sh\nsplatsieve a \\\n    b && splatsieve c  # d\n```\n`splatsieve d e` and `splatsieve COMMAND -h`\n";
+    let text =
+        "```sh\nsplatsieve a \\\n    b && splatsieve c  # d\n```\n`splatsieve d e` and `splatsieve COMMAND -h`\n";
     assert_eq!(calls(text), [vec!["a", "b"], vec!["c"], vec!["d", "e"]]);
 }
 

@@ -66,18 +66,6 @@ fn output_folder_may_exist_only_if_empty() {
 }
 
 #[test]
-fn boolean_parameters_take_a_value_and_flags_take_none() {
-    let workplace = Workplace::new();
-    for value in [" false", " no", "=off"] {
-        workplace.done(&format!("compress {{tiny}} -o out --dry-run --no-refine --quiet --choose-by-views{value}"));
-    }
-    assert!(workplace.done("info {tiny} --json").starts_with('{'));
-    assert!(!workplace.done("info {tiny}").starts_with('{'));
-    workplace.refused(2, "info {tiny} --json no", &["unexpected argument", "no"]);
-    workplace.refused(2, "info {tiny} --json=no", &["unexpected value", "--json"]);
-}
-
-#[test]
 fn lists_are_separated_by_commas() {
     let workplace = Workplace::new();
     let sweep = "sweep {tiny} -o curves --quiet --max-frames 2 --methods opacity,scale";
@@ -213,8 +201,14 @@ fn folder_inside_a_model_is_refused_naming_the_model() {
 #[test]
 fn frames_take_camera_times_if_the_counts_match() {
     let workplace = Workplace::new();
-    let with = workplace.done("evaluate {tiny} {tiny} --cameras {tiny} --frames 10 --json");
-    assert_eq!(with, workplace.done("evaluate {tiny} {tiny} --cameras {tiny} --json"));
+    let scores = |arguments: &str| {
+        let text = workplace.done(&format!("evaluate {{tiny}} {{tiny}} --cameras {{tiny}} {arguments} --json"));
+        let mut found: serde_json::Value = serde_json::from_str(&text).unwrap();
+        assert!(found["render_ms"]["before"].as_f64().unwrap() > 0.0);
+        found["render_ms"].take();
+        found
+    };
+    assert_eq!(scores("--frames 10"), scores(""));
 }
 
 #[test]
@@ -455,4 +449,13 @@ fn named_minimum_memory_is_small_and_kept() {
         assert_eq!(run.code, 0, "{}", run.stderr);
         assert!(crate::scene::taken(&run.stderr).is_none_or(|taken| taken <= least as f64), "{}", run.stderr);
     }
+}
+
+#[test]
+fn json_flag_takes_no_value() {
+    let workplace = Workplace::new();
+    assert!(workplace.done("info {tiny} --json").starts_with('{'));
+    assert!(!workplace.done("info {tiny}").starts_with('{'));
+    workplace.refused(2, "info {tiny} --json no", &["unexpected argument", "no"]);
+    workplace.refused(2, "info {tiny} --json=no", &["unexpected value", "--json"]);
 }

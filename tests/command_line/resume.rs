@@ -126,7 +126,7 @@ fn terminated_run_leaves_a_valid_cache_and_exits_143() {
     Command::new("kill").args(["-TERM", &child.id().to_string()]).status().unwrap();
     let output = child.wait_with_output().unwrap();
     assert_eq!(output.status.code(), Some(143), "{}", stderr_text(&output));
-    let listed = run_program(&workplace, "work work --json");
+    let listed = run_program(&workplace, "cache work --json");
     let listed: serde_json::Value = serde_json::from_slice(&listed.stdout).unwrap();
     let listed = listed.as_array().unwrap();
     assert!(listed.len() >= 4 && listed.iter().all(|of| of["damaged"].as_array().unwrap().is_empty()), "{listed:?}");
@@ -191,7 +191,7 @@ fn streams_cannot_resume_and_shards_need_a_cache() {
     let workplace = Workplace::new();
     let output = run_program(&workplace, "compress - -o out.gseq --cache work");
     assert_eq!(output.status.code(), Some(2));
-    assert!(stderr_text(&output).contains("splatsieve pack -"), "{}", stderr_text(&output));
+    assert!(stderr_text(&output).contains("splatsieve convert -"), "{}", stderr_text(&output));
     for (arguments, part) in [
         ("compress in.gseq -o out.gseq --shard 1/2", "--cache"),
         ("compress in.gseq -o out.gseq --cache work --shard 3/2", "3/8"),

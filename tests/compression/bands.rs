@@ -254,7 +254,7 @@ fn impossible_degree_is_refused_by_name() {
     assert_eq!(PlyRows::read(&point_cloud(&workplace.path("small"))).names.len(), 62);
     for wrong in ["4", "-1", "some"] {
         let arguments = format!("compress {{tiny}} --set bands={wrong} -o none");
-        workplace.refused(2, &arguments, &["--bands", wrong, "expected all, needed, or a degree from 0 to 3"]);
+        workplace.refused(2, &arguments, &["bands", wrong, "expected all, needed, or a degree from 0 to 3"]);
     }
 }
 

@@ -185,7 +185,7 @@ fn unused_settings_of_a_recipe_are_left_out_by_name() {
     let names: Vec<&Value> = found["knobs"].as_array().unwrap().iter().map(|knob| &knob["name"]).collect();
     assert_eq!(names, ["percentiles"]);
     let notes = found["notes"].to_string();
-    for words in ["look: left out", "rounds: left out", "refining: left out"] {
+    for words in ["look: not run", "rounds: not run", "refining: not run"] {
         assert!(notes.contains(words), "{notes}");
     }
 }

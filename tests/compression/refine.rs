@@ -79,9 +79,9 @@ fn refinement_changes_only_named_unprotected_values() {
     };
     let before = cloud(&tiny());
     for (groups, mut moves) in [
-        ("colour,opacity,scale,rotation,position", vec!["f_dc_0", "f_rest_3", "opacity", "scale_1", "rot_2", "x"]),
+        ("color,opacity,scale,rotation,position", vec!["f_dc_0", "f_rest_3", "opacity", "scale_1", "rot_2", "x"]),
         ("scale", vec!["scale_1"]),
-        ("colour,position", vec!["f_dc_0", "f_rest_3", "x"]),
+        ("color,position", vec!["f_dc_0", "f_rest_3", "x"]),
     ] {
         workplace.done(&format!(
             "compress {{tiny}} --cameras {{tiny}} --ratio 0.3 --set refine={groups} --keep-ids 3,200-209 \

@@ -131,8 +131,8 @@ fn default_is_no_worse_than_other_methods() {
 fn invalid_sweeps_are_refused_and_leave_no_files() {
     let workplace = Workplace::new();
     for (flags, expected) in [
-        ("--fractions 0.5,0", "--fractions: expected numbers above 0 and at most 1, found 0"),
-        ("--fractions nan", "found NaN"),
+        ("--fractions 0.5,0", "expected a fraction above 0 and at most 1, such as 0.1, 10% or 10x, found \"0\""),
+        ("--fractions nan", "found \"nan\""),
         ("--steps 5 --steps-at 1.5", "--steps-at: expected numbers above 0 and at most 1, found 1.5"),
         ("--steps-at 0.5", "--steps"),
         ("--repeat 0", "--repeat"),

@@ -64,7 +64,8 @@ fn identical_gaussians_are_pruned_to_exact_count_by_hash() {
     workplace.ply("same.ply", &one);
     for preset in ["paper", "default"] {
         // Projected coverage, because visible contribution would differ by drawing order.
-        let request = format!("same.ply --overwrite -o out.ply --prune-only --preset {preset} --set coverage=projected");
+        let request =
+            format!("same.ply --overwrite -o out.ply --prune-only --preset {preset} --set coverage=projected");
         let summary = workplace.summary(&format!("{request} --count 37"));
         assert_eq!(summary["gaussians"], 37);
         assert!(list_contains(&summary, "left_out", "grading by coverage"), "{}", summary["left_out"]);

@@ -105,7 +105,8 @@ fn recipe_values_that_make_a_run_endless_are_refused() {
     };
     refused("--ratio 0.5 --set round_fraction=0.9999999999", &["select.round_fraction", "0.1 to 0.99"]);
     let folder = folder_with(&cloud(7));
-    let outcome = folder.attack("compress in.ply -o out.ply --cameras cameras.json --set refine_steps=4000000000").run();
+    let outcome =
+        folder.attack("compress in.ply -o out.ply --cameras cameras.json --set refine_steps=4000000000").run();
     outcome.refused(2, &["refine.refine_steps", "0 to 1000000"]);
 }
 
@@ -117,8 +118,7 @@ fn dropped_gaussians_change_no_byte_of_the_others() {
     odd.sh.plane_mut(0)[40] = f32::INFINITY;
     odd.sh.plane_mut(1)[40] = f32::NAN;
     let [odd, whole] = [odd, whole].map(|cloud| folder_with(&cloud));
-    for (output, size) in [("a.ply", "--count 25"), ("b.ply", "--min-psnr 25dB"), ("c.gsz", "--count 30")]
-    {
+    for (output, size) in [("a.ply", "--count 25"), ("b.ply", "--min-psnr 25dB"), ("c.gsz", "--count 30")] {
         let options = format!("{size} --no-refine");
         compress(&odd, output, &format!("{options} --set non_finite=drop")).run().succeeded();
         compress(&whole, output, &options).run().succeeded();

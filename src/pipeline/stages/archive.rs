@@ -28,6 +28,7 @@ use crate::pipeline::stages::reference_views::{
     step_change,
 };
 use crate::pipeline::summary::ArchiveSummary;
+use crate::progress::Progress;
 use crate::render;
 use crate::scene::Scene;
 
@@ -178,10 +179,17 @@ impl ArchiveStage {
         let asked = quality_target.required_psnr(level);
         let mut grids = Grids::from_content(&content);
         let mut measured = Vec::new();
+        let halvings =
+            if matches!(quality_target, QualityTarget::Bytes(_)) { BYTES_OCTAVE_HALVINGS } else { OCTAVE_HALVINGS };
+        let measurements = BALANCING_ROUNDS * grids.groups.len() + halvings;
+        let progress = scene.events.task(NAME, "measurements", measurements as u64);
         for _ in 0..BALANCING_ROUNDS {
-            measured = grids.balance(scene, &reference_views, &mut content, 10f64.powf(-0.1 * asked))?;
+            measured = grids.balance(scene, &reference_views, &mut content, 10f64.powf(-0.1 * asked), &progress)?;
         }
-        let encoded = |added: f64| archive::encode(&content, &grids.steps(added));
+        let encoded = |added: f64| {
+            progress.advance(1);
+            archive::encode(&content, &grids.steps(added))
+        };
         let measure_views = |encoded: Encoded| -> Result<(Encoded, [f64; 2])> {
             let (decoded, _) = archive::decode(&encoded.bytes, &scene.path, ReadLimit::NONE)?;
             let shown = scene.input.decode_frames(&decoded)?;
@@ -281,8 +289,9 @@ impl Grids {
         reference_views: &ReferenceViews<'_>,
         content: &mut Content,
         error: f64,
+        progress: &Progress,
     ) -> Result<Vec<(String, f64, f64, f64)>> {
-        let errors = self.errors(scene, reference_views, content)?;
+        let errors = self.errors(scene, reference_views, content, progress)?;
         let fine = archive::encode(content, &self.steps(0.0))?.bits;
         let coarse = archive::encode(content, &self.steps(0.5))?.bits;
         let bits =
@@ -304,9 +313,16 @@ impl Grids {
     }
 
     /// Returns the squared errors of renders with one group quantized and all others exact. Leaves `content` unchanged.
-    fn errors(&self, scene: &Scene, reference_views: &ReferenceViews<'_>, content: &mut Content) -> Result<Vec<f64>> {
+    fn errors(
+        &self,
+        scene: &Scene,
+        reference_views: &ReferenceViews<'_>,
+        content: &mut Content,
+        progress: &Progress,
+    ) -> Result<Vec<f64>> {
         let space = archive::space(content);
         let one = |(group, &octave): (&ValueGroup, &f64)| -> Result<f64> {
+            progress.advance(1);
             match group {
                 ValueGroup::Attribute(k) => {
                     let before = content.cloud.clone();

@@ -67,7 +67,9 @@ pub(crate) fn find(
     let initial_bounds = initial_bounds(source)?;
     let mut widths = initial_bounds;
     let mut measured = Vec::new();
+    let progress = scene.events.task("archive", "measurements", (BALANCING_ROUNDS + OCTAVE_HALVINGS) as u64);
     for _ in 0..BALANCING_ROUNDS {
+        progress.advance(1);
         let error = 10f64.powf(-0.1 * asked);
         let errors = errors(&reference_views, source, &widths)?;
         let [fine, wide] = [0.0, 0.5].map(|octaves| bits(source, widened(&widths, octaves)));
@@ -82,6 +84,7 @@ pub(crate) fn find(
         }
     }
     let measure_views = |widths: [f64; 5]| -> Result<([f64; 5], [f64; 2])> {
+        progress.advance(1);
         let shown = Rounded { source, bounds: Bounds::new(widths) };
         Ok((widths, [reference_views.psnr(&shown)?, level - original.psnr(&shown)?]))
     };

@@ -17,17 +17,14 @@ use crate::files::atomic::ScratchFolder;
 use crate::journal::Journal;
 use crate::journal::records::{QualitySummary, RenderTime, ViewKind};
 use crate::limits::Limits;
-use crate::memory_plan::{
-    RENDER, ResourceEstimate, SHARED_VIEW_BYTES_PER_GAUSSIAN, Throughput, Workload, bytes_of_survivors,
-};
+use crate::memory_plan::{RENDER, ResourceEstimate, Throughput, Workload, bytes_of_survivors};
 use crate::metrics::{BYTES_PER_PIXEL, psnr, ssim};
-use crate::model::{Attributes, FrameView};
+use crate::model::FrameView;
 use crate::passes::{Batch, RenderedSource, ViewStates, show};
 use crate::pipeline::planning::Planning;
 use crate::pipeline::stage::{Archived, EstimateInput, MeasuredOnArrival, Phase, RunState, Stage, StageList};
 use crate::pruning::score::scored_memory;
-use crate::render;
-use crate::scene::pictures::{ViewSet, pictures, spread_views};
+use crate::scene::pictures::{self, ViewSet, spread_views};
 use crate::scene::{InputOptions, Scene, open_compressed};
 use crate::source::FrameSource;
 
@@ -76,28 +73,19 @@ impl Stage for QualityStage {
 }
 
 impl QualityStage {
-    /// Returns the estimate for rendering [`MOST_VIEWS`] views of both models; a fraction `left` of the Gaussians is in the result.
+    /// Returns the estimate for rendering views of both models; a fraction `left` of the Gaussians is in the result.
     fn need(&self, work: &Workload, limits: &Limits, left: f64) -> ResourceEstimate {
-        let whole = work.state(Attributes::all());
-        let together = work.threads.min(limits.pictures_together as u64);
         let views = (MOST_VIEWS as u64).min(work.pictures.max(1));
-        let per_gaussian = vec![
-            ("kept", bytes_of_survivors(left, 24)),
-            ("states", whole + bytes_of_survivors(left, whole)),
-            ("result", bytes_of_survivors(left, 2 * work.input.reduced)),
-            ("readers", work.input.reader + bytes_of_survivors(left, work.input.reader)),
-            ("pictures", together * SHARED_VIEW_BYTES_PER_GAUSSIAN),
-        ];
+        let of_views = pictures::need(work, limits, NAME, 2, 24 + BYTES_PER_PIXEL as u64);
+        let result =
+            vec![("kept", bytes_of_survivors(left, 24)), ("result", bytes_of_survivors(left, 2 * work.input.reduced))];
         ResourceEstimate {
-            stage: NAME,
+            // The number of views follows from the time of all other stages; see `view_count`.
             seconds: 0.0,
             reads: work.reads(views, limits),
-            per_gaussian: [scored_memory(limits), per_gaussian].concat(),
-            fixed: vec![
-                work.arriving(),
-                ("field", work.input.fixed),
-                ("pictures", together * (render::STRIP_BYTES as u64 + (24 + BYTES_PER_PIXEL as u64) * work.pixels)),
-            ],
+            per_gaussian: [scored_memory(limits), of_views.per_gaussian, result].concat(),
+            fixed: [of_views.fixed, vec![("field", work.input.fixed)]].concat(),
+            ..of_views
         }
     }
 
@@ -111,7 +99,7 @@ impl QualityStage {
             None if scene.has_cameras => ViewKind::Training,
             None => ViewKind::Virtual,
         };
-        let all = pictures(&scene.rig, times, ViewSet::HeldOut)?;
+        let all = pictures::pictures(&scene.rig, times, ViewSet::HeldOut)?;
         let views = spread_views(all, self.view_count(run));
         let folder;
         let (opened, reduced);

@@ -157,7 +157,7 @@ pub(crate) fn check_measurable(psnr: f64) -> Result<f64> {
         return Err(Error::usage(
             "the quantization of an archive is chosen by renders: expected numbers in every pixel, found NaN in \
              some\n  \
-             --non-finite drop removes the Gaussians that are not finite; a .gseq holds them as they are",
+             --set non_finite=drop removes the Gaussians that are not finite; a .gseq holds them as they are",
         ));
     }
     Ok(psnr)

@@ -25,7 +25,7 @@ use crate::outputs::kind::OutputKind;
 use crate::pipeline::planning::Planning;
 use crate::pipeline::stage::{Archived, EstimateInput, Phase, RunState, Stage, StageList};
 use crate::pipeline::summary::{self, CameraSummary, Summary};
-use crate::progress::Events;
+use crate::progress::{Events, Progress};
 use crate::pruning::score::scored_memory;
 use crate::scene::Scene;
 use crate::source::FrameSource;
@@ -256,6 +256,13 @@ impl WriteStage {
     ) -> Result<Summary> {
         let mut write = |path: &Path| -> Result<Size> {
             journal.stage(NAME, compressed.len(), scene.source(), |journal| {
+                let count = compressed.len() as u64;
+                // Outputs of frames report their own progress.
+                let has_frames = self.kind.holds_frames() || matches!(archive, Some(Archived::Frames(_)));
+                let progress = match has_frames {
+                    true => Progress::IGNORED,
+                    false => scene.events.task(NAME, "Gaussians", count),
+                };
                 let size = match archive {
                     Some(Archived::Content(encoded)) => {
                         fs::write(path, &encoded.bytes).map_err(Error::io("write", path))?;
@@ -276,6 +283,7 @@ impl WriteStage {
                         scene.input.size_written(self.kind, path)?
                     }
                 };
+                progress.advance(count);
                 journal.notes.extend(size.why_larger_than(&scene.input.size()?));
                 Ok((size, compressed.len()))
             })

@@ -36,7 +36,10 @@ fn apng(path: &Path) -> Apng {
 
 /// Returns the RGB bytes of the render of `input` at `frame` from `view`.
 fn single_render(folder: &Path, input: &str, frame: usize, view: u32) -> Vec<u8> {
-    done(folder, &format!("render {input} --cameras cameras.json --frame {frame} --view {view} --overwrite -o still.png"));
+    done(
+        folder,
+        &format!("render {input} --cameras cameras.json --frame {frame} --view {view} --overwrite -o still.png"),
+    );
     let mut reader =
         png::Decoder::new(BufReader::new(File::open(folder.join("still.png")).unwrap())).read_info().unwrap();
     let mut pixels = vec![0; reader.output_buffer_size().unwrap()];
