@@ -6,7 +6,7 @@ use std::path::Path;
 
 use crate::TOOL;
 use crate::archive::MAGIC;
-use crate::commands::convert::Converted;
+use crate::commands::converted::Converted;
 use crate::error::{Error, Result};
 use crate::files::atomic::{Kind, MARKER, Replace, StagedFile, StagedFolder, check_target};
 use crate::files::names::name_of;

@@ -11,7 +11,7 @@ use serde::Serialize;
 
 use crate::cache::{Completion, SpillWriter};
 use crate::commands::archive::is_archive;
-use crate::commands::convert::Converted;
+use crate::commands::converted::Converted;
 use crate::error::{Error, Result, ShowPath};
 use crate::files::atomic::{Kind, Replace, StagedFile, check_target};
 use crate::files::container::Container;

@@ -4,14 +4,13 @@
 //! [`unpack_archive`].
 
 use std::fs;
-use std::path::{Path, PathBuf};
-
-use serde::Serialize;
+use std::path::Path;
 
 use crate::TOOL;
 use crate::commands::archive::{is_archive, unpack_archive};
+use crate::commands::converted::Converted;
 use crate::compressed_model::CompressedModel;
-use crate::error::{Error, Result, ShowPath};
+use crate::error::{Error, Result};
 use crate::files::atomic::{Kind, MARKER, Replace, StagedFile, StagedFolder, check_target};
 use crate::limits::Limits;
 use crate::memory_plan::{Plan, ResourceEstimate, Workload};
@@ -25,31 +24,6 @@ use crate::scene::{InputOptions, open_input};
 
 /// Bytes that a Gaussian takes while formats are fitted to it and encoded, about: a few pieces of it.
 const FITTED: u64 = 4 * 600;
-
-/// Result of `convert`.
-#[derive(Debug, Serialize)]
-pub struct Converted {
-    /// Path of the output.
-    pub path: PathBuf,
-    /// Format of the output.
-    pub kind: OutputKind,
-    /// Number of Gaussians N of the input.
-    pub gaussians: usize,
-    /// Number of frames T of the input; `None` for a model without frames of its own.
-    pub frames: Option<usize>,
-    /// Bytes of all files that were written.
-    pub bytes: u64,
-    /// Notes for the user.
-    pub notes: Vec<String>,
-}
-
-impl Converted {
-    /// Returns one line for the terminal.
-    pub fn text(&self) -> String {
-        let frames = self.frames.map_or(String::new(), |frames| format!(" x {frames} frames"));
-        format!("{}: {} Gaussians{frames}, {} bytes\n", self.path.shown(), self.gaussians, self.bytes)
-    }
-}
 
 /// Returns whether `convert` writes a container to `output`.
 pub fn is_container(output: &Path, asked: Option<OutputKind>) -> bool {

@@ -233,7 +233,7 @@ fn without_cameras_a_virtual_rig_is_used_and_noted() {
     let workplace = Workplace::new();
     workplace.ply("some.ply", &balls(20));
     let summary = workplace.summary("some.ply -o out.ply");
-    assert!(list_contains(&summary, "notes", "no cameras given or found: virtual rig"), "{}", summary["notes"]);
+    assert!(list_contains(&summary, "notes", "no cameras were given or found: virtual rig"), "{}", summary["notes"]);
     assert!(summary["cameras"]["origin"].as_str().unwrap().contains("virtual rig"));
     assert!(summary["cameras"]["pairs"].as_u64().unwrap() > 1);
     assert_eq!(summary["flags"]["never_in_view"], 0);

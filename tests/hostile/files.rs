@@ -415,7 +415,7 @@ fn pipe_as_a_frame_or_an_image_is_not_waited_for() {
     folder.write("transforms.json", frames);
     let outcome =
         folder.attack("render {tiny} --frames 2 --frame 0 --view 0 --cameras transforms.json -o out.png").run();
-    outcome.refused(1, &["transforms.json", "--size"]);
+    outcome.refused(1, &["transforms.json", "--resolution"]);
 }
 
 #[test]

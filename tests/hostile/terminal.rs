@@ -451,7 +451,7 @@ fn manual_pages_are_written_all_or_none() {
             // SAFETY: setrlimit and signal may be called between fork and exec; the limit lives on the stack.
             unsafe {
                 command.pre_exec(|| {
-                    let limit = libc::rlimit { rlim_cur: 8000, rlim_max: 8000 };
+                    let limit = libc::rlimit { rlim_cur: 4000, rlim_max: 4000 };
                     libc::setrlimit(libc::RLIMIT_FSIZE, &limit);
                     libc::signal(libc::SIGXFSZ, libc::SIG_IGN);
                     Ok(())

@@ -2,14 +2,14 @@
 //! statistics.
 //!
 //! ```
-//! use splat_core::{Columns, Gaussians, logit, opacity};
+//! use splat_core::{Attributes, Gaussians, logit, opacity};
 //!
 //! let mut gaussians = Gaussians::zeros(2, 0);
 //! gaussians.position.set_row(1, [0.5, 0.0, 2.0]);
 //! gaussians.opacity_logit.set_row(1, [logit(0.8) as f32]);
 //! assert_eq!(gaussians.position.plane(0), [0.0, 0.5]);
 //! assert!((opacity(gaussians.opacity_logit.plane(0)[1]) - 0.8).abs() < 1e-6);
-//! assert_eq!(Columns::all().width(gaussians.sh_degree()), 3 + 4 + 3 + 1 + 3);
+//! assert_eq!(Attributes::all().width(gaussians.sh_degree()), 3 + 4 + 3 + 1 + 3);
 //! ```
 
 #![cfg_attr(not(test), deny(clippy::print_stderr, clippy::print_stdout))]

@@ -8,7 +8,7 @@
 //!
 //! ```
 //! use std::path::Path;
-//! use splat_core::{Columns, Gaussians};
+//! use splat_core::{Attributes, Gaussians};
 //! use splat_fields::{Deltas, Field, Scratch, synthetic};
 //!
 //! let config = synthetic::plain();
@@ -17,9 +17,9 @@
 //! let prepared = field.prepare(&canonical.position);
 //!
 //! let (mut deltas, mut scratch) = (Deltas::new(3), Scratch::default());
-//! field.deltas(&prepared, 0.25, Columns::all(), &mut scratch, &mut deltas)?;
+//! field.deltas(&prepared, 0.25, Attributes::all(), &mut scratch, &mut deltas)?;
 //! let mut state = Gaussians::zeros(0, 3);
-//! deltas.apply(&canonical, Columns::all(), &mut state);
+//! deltas.apply(&canonical, Attributes::all(), &mut state);
 //! assert_eq!(state.len(), 100);
 //! # splat_core::error::Result::Ok(())
 //! ```

@@ -1,0 +1,33 @@
+//! Result of the command `convert`.
+
+use std::path::PathBuf;
+
+use serde::Serialize;
+
+use crate::error::ShowPath;
+use crate::outputs::kind::OutputKind;
+
+/// Result of `convert`.
+#[derive(Debug, Serialize)]
+pub struct Converted {
+    /// Path of the output.
+    pub path: PathBuf,
+    /// Format of the output.
+    pub kind: OutputKind,
+    /// Number of Gaussians N of the input.
+    pub gaussians: usize,
+    /// Number of frames T of the input; `None` for a model without frames of its own.
+    pub frames: Option<usize>,
+    /// Bytes of all files that were written.
+    pub bytes: u64,
+    /// Notes for the user.
+    pub notes: Vec<String>,
+}
+
+impl Converted {
+    /// Returns one line for the terminal.
+    pub fn text(&self) -> String {
+        let frames = self.frames.map_or(String::new(), |frames| format!(" x {frames} frames"));
+        format!("{}: {} Gaussians{frames}, {} bytes\n", self.path.shown(), self.gaussians, self.bytes)
+    }
+}
