@@ -83,7 +83,7 @@ def work_precision(binary, models, steps):
             cameras = model if model.is_dir() else orbit(model, Path(folder) / f"{model.stem}.json")
             for count in ["0", *steps]:
                 output = Path(folder) / f"{model.stem}{count}{'' if model.is_dir() else '.ply'}"
-                how = ["--refine-steps", count, "--refine-cut-steps", max(1, int(count) * 8 // 100)]
+                how = ["--set", f"refine_steps={count}", "--set", f"refine_cut_steps={max(1, int(count) * 8 // 100)}"]
                 found = point(binary, model, cameras, "0.1", output, *(how if count != "0" else ["--no-refine", "--prune-only"]))
                 photos = f"{found['photos'][1]:.2f}" if found["photos"] else "–"
                 print(
@@ -107,7 +107,7 @@ def degrees(binary, models, ratios):
                         row.append("–")
                         continue
                     output = Path(folder) / f"{model.stem}{ratio}{degree}{'' if model.is_dir() else '.ply'}"
-                    found = point(binary, model, cameras, f"{kept:.4f}", output, "--bands", degree)
+                    found = point(binary, model, cameras, f"{kept:.4f}", output, "--set", f"bands={degree}")
                     row.append(f"{100 * kept:.1f}%: {found['psnr']:.1f}")
                 print(f"| {model.stem} | {100 * float(ratio):.0f}% | {' | '.join(row)} |", flush=True)
 
