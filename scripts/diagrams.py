@@ -4,7 +4,7 @@
     target/release/splatsieve precision MODEL --cameras MODEL -o FOLDER
     python3 scripts/diagrams.py FOLDER/precision.html "CAPTION" PICTURE.svg ["CAPTION" PICTURE.svg ...]
 
-Each is the first whose caption begins so. README's two are made from deform2:
+Each is the first whose caption begins so. The two of docs/benchmarks.md are made from deform2:
 "look: relative L2 error of C" scripts/precision_look.svg, "rounds: error added" scripts/precision_rounds.svg.
 Needs nothing but Python.
 """

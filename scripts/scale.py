@@ -2,7 +2,7 @@
 """Compresses made-up sequences of several sizes in given memory and prints a Markdown table of time and peak.
 
     cargo build --release
-    python3 scripts/scale.py target/release/splatsieve FOLDER                   # README's table, and FOLDER/scale.json
+    python3 scripts/scale.py target/release/splatsieve FOLDER                   # the table of docs/benchmarks.md, and FOLDER/scale.json
     python3 scripts/scale.py target/release/splatsieve FOLDER --sizes 200000x600 --budgets 256MiB 1GiB none
 
 Without `--sizes` the series varies one thing at a time: the frames, the Gaussians, the budget (`--memory`). Below its

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Makes README's picture: a model, a part of it pruned alone, and as many Gaussians refined, side by side.
+"""Makes a picture of docs/benchmarks.md: a model, a part of it pruned alone, and as many Gaussians refined, side by side.
 
     python3 scripts/side_by_side.py target/release/splatsieve MODEL OUTPUT.png [--ratio 0.05] [--frame 30] [--view V]
 

@@ -2,8 +2,8 @@
 """Makes a large model of a small one: every Gaussian of a 4DGaussians model folder split in nine or more, seen at 1352x1014.
 
     python3 scripts/split_model.py MODEL FOLDER [--side 3] [--frames 30] [--views 18] [--size 1352x1014]
-    python3 scripts/split_model.py MODEL FOLDER --compare target/release/splatsieve   # README's figures of refining it
-    python3 scripts/split_model.py MODEL FOLDER --row target/release/splatsieve [OPTION ...]   # a row of README's table
+    python3 scripts/split_model.py MODEL FOLDER --compare target/release/splatsieve   # figures of docs/benchmarks.md
+    python3 scripts/split_model.py MODEL FOLDER --row target/release/splatsieve [OPTION ...]   # a row of docs/benchmarks.md
     python3 scripts/split_model.py MODEL FOLDER --row target/release/splatsieve --set look_pictures=0   # having looked at all
 
 They stand in a grid of SIDE x SIDE along a Gaussian's two longest axes (of nine a standard deviation apart, √⅓ as wide along

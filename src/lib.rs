@@ -51,7 +51,7 @@ pub mod refinement;
 pub mod statistics;
 pub mod tracking;
 /// Derivation of the implemented formulas. Comments in the code cite the sections of this text.
-#[doc = include_str!("method.md")]
+#[doc = include_str!("../docs/method.md")]
 pub mod method {}
 pub mod limits;
 pub mod player;
