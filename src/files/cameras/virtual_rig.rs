@@ -5,7 +5,7 @@ use glam::DVec3;
 
 use crate::model::{Camera, Rig, Shot, Split};
 
-/// Number of cameras of the rig: as many views as are used to score the static models of the README.
+/// Number of cameras of the rig: as many views as are used to score the static models of docs/benchmarks.md.
 const CAMERAS: u32 = 12;
 /// Distance of the cameras from the center, in extents. At 60° the image then spans 2.3 extents, so that a scene with
 /// equal sides is seen whole from every corner.
