@@ -225,7 +225,7 @@ fn every_page_is_in_the_table_of_contents() {
     let contents = fs::read_to_string(root().join("docs/SUMMARY.md")).unwrap();
     for (path, _) in pages() {
         let name = path.file_name().unwrap().to_str().unwrap();
-        if path.parent().unwrap().ends_with("docs") && name != "SUMMARY.md" {
+        if path.parent() == Some(root().join("docs").as_path()) && name != "SUMMARY.md" {
             assert!(contents.contains(&format!("]({name})")), "{name} is not in docs/SUMMARY.md");
         }
     }
