@@ -82,7 +82,8 @@ impl QualityStage {
         ResourceEstimate {
             // The number of views follows from the time of all other stages; see `view_count`.
             seconds: 0.0,
-            reads: work.reads(views, limits),
+            // Views of the original and of the result, which may be computed from the same input, and the timed views.
+            reads: 2.5 * work.reads(views, limits),
             per_gaussian: [scored_memory(limits), of_views.per_gaussian, result].concat(),
             fixed: [of_views.fixed, vec![("field", work.input.fixed)]].concat(),
             ..of_views
