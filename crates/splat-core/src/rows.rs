@@ -1,4 +1,4 @@
-//! Statistics of every Gaussian, as arrays over Gaussians (src/method.md, section 1).
+//! Statistics of every Gaussian, as arrays over Gaussians (docs/method.md, section 1).
 //!
 //! A new statistic is a field of [`Rows`] and a variant of [`Statistic`]. Tables, histograms, temporary files and
 //! memory plans then include it.

@@ -4,7 +4,7 @@
 //! is computed for each of the three components by a backward pass through head and trunk, with the masks of their
 //! ReLUs, and then through the planes. Derivatives through the deltas of other attributes are neglected: they are worth
 //! less than 0.1 dB of a refinement and cost most of the time of the field. Input: raw positions and rotations. Output:
-//! a [`Jacobian`]. Memory: the Jacobian and one group of [`LANES`] Gaussians. Derived in src/method.md, section 8.2.
+//! a [`Jacobian`]. Memory: the Jacobian and one group of [`LANES`] Gaussians. Derived in docs/method.md, section 8.2.
 
 use super::deltas::{Deltas, finite};
 use super::field::{Field, Head, Mask, Scratch, add_frequencies, position_time_features};

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-/// Visible contribution of N Gaussians over any number of views (src/method.md, section 1: C `visible`, and W).
+/// Visible contribution of N Gaussians over any number of views (docs/method.md, section 1: C `visible`, and W).
 ///
 /// Both figures do not depend on the order of views or the number of threads. Memory: 12 bytes per Gaussian.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]

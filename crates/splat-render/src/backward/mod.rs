@@ -5,7 +5,7 @@
 //! Output: [`Gradients`]. Memory beside that of the render: 72 bytes per visible Gaussian
 //! ([`GRADIENT_BYTES_PER_VISIBLE`]) and 36 bytes per pair of a strip ([`GRADIENT_STRIP_BYTES`]). Sources of the forward
 //! model: Kerbl et al., "3D Gaussian Splatting", 2023, and Ye et al., "gsplat", 2024. The gradients are derived in
-//! src/method.md, section 8.1.
+//! docs/method.md, section 8.1.
 //!
 //! Discontinuities have no derivative: an alpha that crosses 1/255, an order that changes, a tile that is newly
 //! touched. An alpha clamped at 0.99, a channel clamped at 0 and a scale beyond e^±80 have derivative 0.

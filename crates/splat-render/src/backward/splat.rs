@@ -1,7 +1,7 @@
 //! Derivative of the projection: from splat gradients to gradients of the stored attributes.
 //!
 //! Blocks are processed like in the projection, in f64 where the projection uses f64. A footprint enters only through
-//! its whitened axes, so very thin and very large Gaussians lose no digits that the projection kept (src/method.md,
+//! its whitened axes, so very thin and very large Gaussians lose no digits that the projection kept (docs/method.md,
 //! section 8.1). Input: sums per splat. Output: sums per Gaussian. Memory: stack arrays of [`BLOCK`] entries. Source of
 //! the projection: Zwicker et al., "EWA Splatting", 2002. Names that begin with `by_` hold derivatives of the loss with
 //! respect to the rest of the name.

@@ -1,7 +1,7 @@
 //! Backward pass over a tile: from pixel gradients to splat gradients.
 //!
 //! The pass runs front to back again, so that no list of blended splats has to be kept. Each splat subtracts its own
-//! contribution from the remaining color of a pixel; the remainder is the color behind the splat (src/method.md,
+//! contribution from the remaining color of a pixel; the remainder is the color behind the splat (docs/method.md,
 //! section 8.1). Input: the splats of the tile, ∂L/∂pixel, and the pixels. Output: nine sums per pair of a splat and
 //! the tile. Names that begin with `by_` hold derivatives of the loss with respect to the rest of the name.
 
