@@ -44,6 +44,7 @@ pub fn unpack_archive(path: &Path, output: &Path, overwrite: Replace, memory: Re
         gaussians: content.cloud.len(),
         frames: None,
         bytes: 4 * (values + attributes) as u64,
+        larger: None,
         notes: vec![format!(
             "{} bytes of values from an archive of {} bytes",
             4 * (values + attributes),

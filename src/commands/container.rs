@@ -110,8 +110,8 @@ fn pack_whole(input: &InputOptions, output: &Path, storing: &Storing, overwrite:
     staged.commit()?;
     let info = opened.input.source().info();
     let larger = Size::of_frames(bytes).why_larger_than(&opened.input.size()?);
-    let notes = opened.notes.into_iter().chain(work.take_notes()).chain(larger).collect();
-    Ok(packed(output, info.count, info.times.len(), bytes, notes))
+    let notes = opened.notes.into_iter().chain(work.take_notes()).collect();
+    Ok(packed(output, info.count, info.times.len(), bytes, larger, notes))
 }
 
 /// Packs a stream of numbered Gaussians as it arrives.
@@ -134,12 +134,19 @@ fn pack_arriving(
     let bytes = fs::metadata(staged.path()).map_err(Error::io("read", staged.path()))?.len();
     staged.commit()?;
     let larger = Size::of_frames(bytes).why_larger_than(&Size::of_frames(received));
-    Ok(packed(output, gaussians, frames, bytes, larger.into_iter().collect()))
+    Ok(packed(output, gaussians, frames, bytes, larger, Vec::new()))
 }
 
 /// Returns the result of packing a container.
-fn packed(output: &Path, gaussians: usize, frames: usize, bytes: u64, notes: Vec<String>) -> Converted {
-    Converted { path: output.to_owned(), kind: OutputKind::Gseq, gaussians, frames: Some(frames), bytes, notes }
+fn packed(
+    output: &Path,
+    gaussians: usize,
+    frames: usize,
+    bytes: u64,
+    larger: Option<String>,
+    notes: Vec<String>,
+) -> Converted {
+    Converted { path: output.to_owned(), kind: OutputKind::Gseq, gaussians, frames: Some(frames), bytes, larger, notes }
 }
 
 /// Writes any input as a frame stream; gives the input.

@@ -93,7 +93,7 @@ pub fn convert(
         staged.commit()?;
         bytes
     };
-    Ok(Converted { path: output.to_owned(), kind, gaussians, frames: Some(frames), bytes, notes })
+    Ok(Converted { path: output.to_owned(), kind, gaussians, frames: Some(frames), bytes, larger: None, notes })
 }
 
 /// All states once, and what is fitted to them.

@@ -20,14 +20,18 @@ pub struct Converted {
     pub frames: Option<usize>,
     /// Bytes of all files that were written.
     pub bytes: u64,
+    /// Reason why the output has more bytes than the input; `None` if it has not.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub larger: Option<String>,
     /// Notes for the user.
     pub notes: Vec<String>,
 }
 
 impl Converted {
-    /// Returns one line for the terminal.
+    /// Returns one line for the terminal, and a second one if the output is larger than the input.
     pub fn text(&self) -> String {
         let frames = self.frames.map_or(String::new(), |frames| format!(" x {frames} frames"));
-        format!("{}: {} Gaussians{frames}, {} bytes\n", self.path.shown(), self.gaussians, self.bytes)
+        let larger = self.larger.as_ref().map_or(String::new(), |why| format!("  {why}\n"));
+        format!("{}: {} Gaussians{frames}, {} bytes\n{larger}", self.path.shown(), self.gaussians, self.bytes)
     }
 }

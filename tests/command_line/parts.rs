@@ -253,7 +253,7 @@ fn damaged_shards_are_computed_again() {
     let workplace = workplace(300);
     for (line, output) in [
         ("evaluate scene.gseq smaller.gseq --cameras cameras.json --csv out", "out"),
-        ("convert scene.gseq out", "out"),
+        ("convert scene.gseq out.gseq", "out.gseq"),
         ("render scene.gseq --cameras cameras.json --all -o out", "out"),
         ("compress scene.gseq --cameras cameras.json -o out.gseq --preset paper", "out.gseq"),
     ] {

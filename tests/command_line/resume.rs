@@ -195,7 +195,7 @@ fn streams_cannot_resume_and_shards_need_a_cache() {
     for (arguments, part) in [
         ("compress in.gseq -o out.gseq --shard 1/2", "--cache"),
         ("compress in.gseq -o out.gseq --cache work --shard 3/2", "3/8"),
-        ("work nowhere", "nowhere"),
+        ("cache nowhere", "nowhere"),
     ] {
         let output = run_program(&workplace, arguments);
         assert!(

@@ -88,9 +88,11 @@ fn stream_packs_within_bounds_like_a_file() {
         assert_eq!(stream_of.tile_info(at).unwrap().checksum, file.tile_info(at).unwrap().checksum, "{at:?}");
     }
     // Raw tiles, and the table of their positions.
-    let output = workplace.piped("convert - raw.gseq --raw", &stream);
-    let larger = String::from_utf8_lossy(&output.stderr).into_owned();
-    assert!(larger.contains(&format!("bytes of {}: the input holds its values in fewer", stream.len())), "{larger}");
+    let larger = String::from_utf8(done(workplace.piped("convert - raw.gseq --raw", &stream))).unwrap();
+    assert!(
+        larger.contains(&format!("bytes instead of {}: the input stores its values in fewer", stream.len())),
+        "{larger}"
+    );
     let refused = workplace.piped("convert - x.gseq --max-error position=1%", &stream);
     let message = String::from_utf8_lossy(&refused.stderr);
     assert!(refused.status.code() == Some(2) && message.contains("expected scene units"), "{message}");
