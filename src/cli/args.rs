@@ -6,6 +6,7 @@ use clap::{Args, Parser, Subcommand, ValueEnum};
 
 use super::recipe_flags::{RecipeFlags, numbers};
 use splatsieve::cache::Shard;
+use splatsieve::diagnostics::demo_scene::Playground;
 use splatsieve::diagnostics::precision::Turned;
 use splatsieve::error::quoted;
 use splatsieve::evaluation::method::Method;
@@ -69,8 +70,11 @@ pub(super) enum Verb {
     Recover(Recover),
     /// Say what is in a work folder, or remove it
     Work(WorkArgs),
-    /// Generate a small dynamic scene, compress it, say what happened
+    /// Generate a scene with moving objects, compress it to a tenth and a twentieth, and write pages to look at
     Demo(Demo),
+    /// Generate the scene that tests use, and compress it
+    #[command(hide = true)]
+    TestScene(TestScene),
     /// Check the numbers of this program on this machine; takes no files
     Selfcheck(Selfcheck),
     /// Print a recipe file with every parameter documented
@@ -94,7 +98,7 @@ impl Verb {
             | Verb::Info(InfoArgs { input, .. })
             | Verb::Unpack(Unpack { input, .. }) => input.memory.explain,
             Verb::Evaluate(Evaluate { models, .. }) | Verb::Report(ReportArgs { models, .. }) => models.memory.explain,
-            Verb::Demo(Demo { memory, .. }) => memory.explain,
+            Verb::Demo(Demo { memory, .. }) | Verb::TestScene(TestScene { memory, .. }) => memory.explain,
             Verb::Sweep(_)
             | Verb::Precision(_)
             | Verb::Verify(_)
@@ -541,12 +545,18 @@ pub(super) struct CompareArgs {
 pub(super) struct ReportArgs {
     #[command(flatten)]
     pub(super) models: CompareArgs,
+    /// More models after compression, to show beside the first
+    #[arg(value_name = "MORE", conflicts_with_all = ["work", "part"])]
+    pub(super) more: Vec<PathBuf>,
     /// The sweep.json that `sweep` wrote, for its curves
     #[arg(long, value_name = "FILE")]
     pub(super) sweep: Option<PathBuf>,
     /// The precision.json that `precision` wrote, for its diagrams
     #[arg(long, value_name = "FILE")]
     pub(super) precision: Option<PathBuf>,
+    /// Measure how long a render takes before and after; these times differ from run to run
+    #[arg(long)]
+    pub(super) render_time: bool,
     /// Folder to write report.html into, and all it shows as JSON and CSV
     #[arg(short, long, value_name = "FOLDER")]
     pub(super) output: PathBuf,
@@ -799,7 +809,28 @@ pub(super) struct Recover {
 /// `demo`
 #[derive(Debug, Args)]
 pub(super) struct Demo {
-    /// Keep the scene and the results in this folder [default: a temporary one]
+    /// Folder to write the scene, its compressed models, the pages and the film into
+    #[arg(short, long, value_name = "FOLDER", default_value = "splatsieve-demo")]
+    pub(super) output: PathBuf,
+    /// Gaussians of the scene
+    #[arg(long, value_name = "N", default_value_t = Playground::COUNT as u32, value_parser = clap::value_parser!(u32).range(1000..=1_000_000))]
+    pub(super) gaussians: u32,
+    /// Frames of the scene
+    #[arg(long, value_name = "T", default_value_t = Playground::FRAMES as u32, value_parser = clap::value_parser!(u32).range(2..=10_000))]
+    pub(super) frames: u32,
+    /// Optimization steps of each refinement [default: enough for the usual scene]
+    #[arg(long, value_name = "N")]
+    pub(super) refine_steps: Option<u32>,
+    #[command(flatten)]
+    pub(super) memory: Memory,
+    #[command(flatten)]
+    pub(super) earlier: Earlier,
+}
+
+/// `test-scene`
+#[derive(Debug, Args)]
+pub(super) struct TestScene {
+    /// Keep the scene and the result in this folder [default: a temporary one]
     #[arg(short, long, value_name = "FOLDER")]
     pub(super) output: Option<PathBuf>,
     /// Gaussians of the scene

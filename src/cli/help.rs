@@ -78,7 +78,13 @@ const OF_VERBS: &[(&str, &[&str])] = &[
             "splatsieve precision model -o page --knobs look,rounds",
         ],
     ),
-    ("report", &["splatsieve report model small -o page                 open page/report.html"]),
+    (
+        "report",
+        &[
+            "splatsieve report model small -o page                 open page/report.html",
+            "splatsieve report model small smaller -o page         several results",
+        ],
+    ),
     (
         "view",
         &[
@@ -115,7 +121,8 @@ const OF_VERBS: &[(&str, &[&str])] = &[
     ),
     ("recover", &["splatsieve recover cut.gseq -o saved.gseq"]),
     ("work", &["splatsieve work folder                               what is in it", "splatsieve work folder --clean"]),
-    ("demo", &["splatsieve demo", "splatsieve demo -o folder --gaussians 20000          keep what it makes"]),
+    ("demo", &["splatsieve demo -o folder                            pages to look at"]),
+    ("test-scene", &["splatsieve test-scene -o folder --gaussians 2000     a scene for tests"]),
     ("selfcheck", &["splatsieve selfcheck                                 are the numbers right?"]),
     ("recipe", &["splatsieve recipe > recipe.toml                      every parameter"]),
     ("completions", &["splatsieve completions bash > splatsieve.bash"]),

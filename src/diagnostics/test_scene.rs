@@ -1,16 +1,17 @@
-//! The built-in demo: a generated scene, compressed, and what happened to each kind of Gaussian in it.
+//! `splatsieve test-scene`: generates the test scene, compresses it and counts what happened to each kind of Gaussian.
+//!
+//! Tests and `scripts/digests.py` make their inputs with it.
 
 use std::fmt::Write as _;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use crate::diagnostics::demo_scene;
-use crate::diagnostics::demo_scene::DemoBody;
+use crate::diagnostics::demo_scene::{self, DemoBody, cameras_json};
 use crate::error::{Error, Result};
 use crate::files::atomic::{Kind, MARKER, Replace, ScratchFolder, StagedFolder, check_target};
 use crate::files::container::Container;
 use crate::memory_plan::Budget;
-use crate::model::{Camera, Rig, Split};
+use crate::model::Split;
 use crate::models::trajectories::write_sequence;
 use crate::outputs::kind::OutputKind;
 use crate::outputs::kind::check_folder_name;
@@ -21,46 +22,46 @@ use crate::progress::Events;
 use crate::recipe::Recipe;
 use crate::scene::{InputOptions, Scene};
 
-/// What the demo is asked for.
+/// Options of [`run`].
 #[derive(Debug)]
-pub struct DemoOptions {
-    /// Gaussians of the scene.
+pub struct TestSceneOptions {
+    /// Number of Gaussians of the scene.
     pub gaussians: usize,
-    /// Frames of the scene.
+    /// Number of frames of the scene.
     pub frames: usize,
-    /// How many of the Gaussians stay.
+    /// Number of Gaussians that stay.
     pub kept: Target,
-    /// How the scene is compressed.
+    /// Recipe of the compression.
     pub recipe: Recipe,
-    /// Folder that keeps `scene.gseq`, `cameras.json` and `compressed.gseq`; without one everything is gone afterwards.
+    /// Folder for `scene.gseq`, `cameras.json` and `compressed.gseq`; `None`: a temporary one, which is removed.
     pub output: Option<PathBuf>,
-    /// What may be replaced there.
+    /// Policy for an existing output.
     pub overwrite: Replace,
-    /// Memory to keep to.
+    /// Memory limit.
     pub memory: Budget,
-    /// Where the events of the run go.
+    /// Receiver of the events of the run.
     pub events: Events,
 }
 
-/// What the demo did.
+/// Result of [`run`].
 #[derive(Debug)]
-pub struct DemoReport {
-    /// The compression.
+pub struct TestSceneReport {
+    /// Summary of the compression.
     pub summary: Summary,
-    /// For every body its Gaussians: all, kept as they were or as leaders, merged away.
+    /// Gaussians of every body: all, kept as they were or as leaders, merged away.
     pub bodies: Vec<(DemoBody, usize, usize, usize)>,
 }
 
-/// Generates the scene, packs it, compresses it.
+/// Generates the scene, packs it and compresses it.
 ///
 /// # Errors
-/// A number to keep that cannot be; those of compressing; a failed write.
-pub fn run(options: &DemoOptions) -> Result<DemoReport> {
+/// A number of survivors that is impossible; errors of the compression; a failed write.
+pub fn run(options: &TestSceneOptions) -> Result<TestSceneReport> {
     options.kept.count(options.gaussians)?;
     let Some(output) = &options.output else {
         return run_in(ScratchFolder::new(&std::env::temp_dir())?.path(), options);
     };
-    check_folder_name(output, "demo")?;
+    check_folder_name(output, "test-scene")?;
     check_target(output, Kind::Folder, &[], options.overwrite)?;
     let staged = StagedFolder::new(output, options.overwrite)?;
     let report = run_in(staged.path(), options)?;
@@ -68,7 +69,7 @@ pub fn run(options: &DemoOptions) -> Result<DemoReport> {
     Ok(report)
 }
 
-fn run_in(folder: &Path, options: &DemoOptions) -> Result<DemoReport> {
+fn run_in(folder: &Path, options: &TestSceneOptions) -> Result<TestSceneReport> {
     let made = demo_scene::Scene::new(options.gaussians, options.frames);
     let packed = folder.join("scene.gseq");
     write_sequence(&made, OutputKind::Gseq, &packed, 1, &options.events)?;
@@ -86,7 +87,7 @@ fn run_in(folder: &Path, options: &DemoOptions) -> Result<DemoReport> {
     };
     keep_to_budget(&mut scene, &request)?;
     let (mut summary, map) = compress_scene(&scene, &request)?;
-    // Where it lies now it does not stay.
+    // The folder is still under its temporary name.
     summary.output.clear();
     let marker = folder.join(MARKER);
     fs::write(&marker, summary.json()).map_err(Error::io("write", &marker))?;
@@ -96,7 +97,7 @@ fn run_in(folder: &Path, options: &DemoOptions) -> Result<DemoReport> {
         .iter()
         .map(|&body| {
             let members = made.members(body);
-            // The first Gaussian to reach a place of the output stands for it here.
+            // The first Gaussian with a place of the output counts as kept, others with the same place as merged.
             let kept = members
                 .clone()
                 .filter(|&id| map[id].is_some_and(|new| !std::mem::replace(&mut leaders[new as usize], true)));
@@ -105,31 +106,11 @@ fn run_in(folder: &Path, options: &DemoOptions) -> Result<DemoReport> {
             (body, members.len(), kept, merged)
         })
         .collect();
-    Ok(DemoReport { summary, bodies })
+    Ok(TestSceneReport { summary, bodies })
 }
 
-/// The cameras as 3DGS writes them: camera-to-world rotations, every camera at every frame.
-fn cameras_json(rig: &Rig) -> String {
-    let camera = |(id, camera): (usize, &Camera)| {
-        let to_world = camera.rotation.transpose();
-        let rows = [0, 1, 2].map(|row| to_world.row(row).to_array());
-        serde_json::json!({
-            "id": id,
-            "img_name": format!("view_{id:02}"),
-            "width": camera.width,
-            "height": camera.height,
-            "position": camera.center().to_array(),
-            "rotation": rows,
-            "fx": camera.fx,
-            "fy": camera.fy,
-        })
-    };
-    let all: Vec<serde_json::Value> = rig.cameras.iter().enumerate().map(camera).collect();
-    format!("{:#}\n", serde_json::Value::from(all))
-}
-
-impl DemoReport {
-    /// A table for a person.
+impl TestSceneReport {
+    /// Returns the summary and a table of the bodies, for a person.
     pub fn text(&self) -> String {
         let mut out = self.summary.text(Detail::Most);
         // Writing to a String cannot fail.

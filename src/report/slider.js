@@ -1,10 +1,11 @@
 "use strict";
-{
-  const stage = document.getElementById("stage");
-  const range = document.getElementById("cut");
-  const buttons = [...document.querySelectorAll("[data-show]")];
-  const pictures = [...document.querySelectorAll("[data-picture]")];
-  const sides = [...document.querySelectorAll("[data-side]")];
+for (const root of document.querySelectorAll(".slider")) {
+  const stage = root.querySelector(".stage");
+  const range = root.querySelector(".cut");
+  const images = [...stage.querySelectorAll("img")];
+  const sides = [...root.querySelectorAll("[data-side]")];
+  const caption = root.querySelector(".caption");
+  const size = caption.textContent.split(";")[1] ?? "";
 
   const cut = (percent) => {
     const value = Math.min(100, Math.max(0, percent));
@@ -12,21 +13,16 @@
     stage.style.setProperty("--cut", value + "%");
   };
 
-  const show = (number) => {
-    pictures.forEach((picture, i) => picture.classList.toggle("active", i === number));
-    buttons.forEach((button, i) => button.setAttribute("aria-pressed", i === number));
-    document.getElementById("caption").textContent = pictures[number].querySelector(".caption").textContent;
-  };
-
   const choose = ({ dataset: { side }, value }) => {
-    for (const image of document.querySelectorAll(".picture img")) {
-      image.classList.toggle(side, image.dataset.kind === value);
-    }
-    stage.querySelector(".tag-" + side).textContent = value;
+    images.forEach((image) => image.classList.toggle(side, image.dataset.layer === value));
+    const notes = sides.map((own) => images[own.value]).filter((image) => image.dataset.note);
+    const several = notes.length > 1;
+    caption.textContent =
+      notes.map((image) => (several ? image.alt + ": " : "") + image.dataset.note).join("; ") + (size && ";" + size);
   };
 
   const follow = (event) => {
-    const box = stage.getBoundingClientRect();
+    const box = images[0].getBoundingClientRect();
     cut((100 * (event.clientX - box.left)) / box.width);
   };
 
@@ -38,11 +34,9 @@
     if (stage.hasPointerCapture(event.pointerId)) follow(event);
   });
   range.addEventListener("input", () => cut(range.valueAsNumber));
-  buttons.forEach((button, i) => button.addEventListener("click", () => show(i)));
   sides.forEach((side) => side.addEventListener("change", () => choose(side)));
 
   // A browser that goes back restores what was chosen.
   sides.forEach(choose);
   cut(range.valueAsNumber);
-  if (pictures.length > 0) show(0);
 }

@@ -120,7 +120,7 @@ fn a_signal_takes_away_what_the_run_has_begun_and_ends_it_with_its_own_status() 
         for (arguments, input) in [
             ("compress - -o out --scratch-dir scratch", half),
             ("pack - -o out.gseq", half),
-            ("demo --gaussians 100000 --frames 400 -o demo", &[]),
+            ("test-scene --gaussians 100000 --frames 400 -o demo", &[]),
         ] {
             fs::create_dir(workplace.path("scratch")).unwrap();
             let mut child = waiting(&workplace, arguments);
@@ -185,7 +185,7 @@ fn overwriting_leaves_every_file_that_the_earlier_result_does_not_name() {
     // Of frames that the new result does not have nothing stays.
     workplace.done("unpack {tiny} -o frames");
     fs::write(workplace.path("frames/notes.txt"), "precious").unwrap();
-    workplace.done("demo --gaussians 400 --frames 3 -o shorter");
+    workplace.done("test-scene --gaussians 400 --frames 3 -o shorter");
     workplace.done("unpack shorter/scene.gseq -o frames --overwrite");
     let plys = fs::read_dir(workplace.path("frames")).unwrap().map(|entry| entry.unwrap().path());
     assert_eq!(plys.filter(|path| path.extension().is_some_and(|e| e == "ply")).count(), 3);
@@ -200,7 +200,7 @@ fn overwriting_leaves_every_file_that_the_earlier_result_does_not_name() {
 #[ignore = "needs time"]
 fn whenever_a_run_is_ended_its_output_is_the_old_or_the_new_one_whole_and_no_foreign_file_is_lost() {
     let workplace = Workplace::new();
-    workplace.done("demo --gaussians 400 --frames 3 -o shorter");
+    workplace.done("test-scene --gaussians 400 --frames 3 -o shorter");
     workplace.done("unpack shorter/scene.gseq -o old");
     let start = Instant::now();
     workplace.done("unpack {tiny} -o new");

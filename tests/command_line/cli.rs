@@ -408,7 +408,7 @@ fn every_verb_answers_on_stdout_and_keeps_quiet_elsewhere_when_asked_to() {
         ("recipe --preset paper", "[merge]"),
         ("completions bash", "splatsieve"),
         ("completions zsh", "splatsieve"),
-        ("demo --gaussians 400 --frames 4", "body"),
+        ("test-scene --gaussians 400 --frames 4", "body"),
     ] {
         let run = workplace.run(&format!("{arguments} --quiet"));
         assert_eq!(run.code, 0, "{arguments}: {}", run.stderr);
@@ -434,9 +434,9 @@ fn every_verb_answers_on_stdout_and_keeps_quiet_elsewhere_when_asked_to() {
 #[test]
 fn a_demo_without_an_output_names_no_place() {
     let workplace = Workplace::new();
-    let text = workplace.done("demo --gaussians 400 --frames 4 --quiet");
+    let text = workplace.done("test-scene --gaussians 400 --frames 4 --quiet");
     assert!(!text.contains("lies in"), "{text}");
-    workplace.done("demo --gaussians 400 --frames 4 --quiet -o demo");
+    workplace.done("test-scene --gaussians 400 --frames 4 --quiet -o demo");
     let summary = fs::read_to_string(workplace.path("demo/summary.json")).unwrap();
     let summary: serde_json::Value = serde_json::from_str(&summary).unwrap();
     assert_eq!(summary.get("output"), None, "{summary}");
@@ -503,7 +503,7 @@ fn reader_that_has_seen_enough_is_no_failure() {
 #[ignore = "needs time"]
 fn no_stage_is_told_of_twice_and_what_is_undone_as_left_out() {
     let workplace = Workplace::new();
-    workplace.done("demo -o demo");
+    workplace.done("test-scene -o demo");
     let compress = |rest: &str| {
         let run = workplace.run(&format!(
             "compress demo/scene.gseq --cameras demo/cameras.json --target-ratio {rest} -o out.gseq --overwrite"

@@ -161,7 +161,7 @@ fn every_verb_that_touches_frames_keeps_to_a_budget() {
 #[test]
 fn a_plan_is_explained_before_it_is_refused_and_nonsense_is_no_size() {
     let workplace = Workplace::new();
-    workplace.done("demo --gaussians 1000 --frames 2 -o demo");
+    workplace.done("test-scene --gaussians 1000 --frames 2 -o demo");
     workplace.refused(
         2,
         "compress demo/scene.gseq -o x.gseq --memory 2MiB --explain",

@@ -294,7 +294,7 @@ fn compressing_in_parts_gives_what_one_run_gives() {
 #[ignore = "needs time"]
 fn pairs_measured_in_parts_merge_as_in_one_run() {
     let workplace = Workplace::new();
-    workplace.done("--quiet demo -o demo --gaussians 40000 --frames 6 --no-refine");
+    workplace.done("--quiet test-scene -o demo --gaussians 40000 --frames 6 --no-refine");
     for name in ["scene.gseq", "cameras.json"] {
         fs::rename(workplace.path("demo").join(name), workplace.path(name)).unwrap();
     }

@@ -33,7 +33,8 @@ fn told(output: &Output) -> String {
 
 fn made(gaussians: usize) -> Workplace {
     let workplace = Workplace::new();
-    let output = ran(&workplace, &format!("demo --gaussians {gaussians} --frames 8 -o scene --quiet --no-refine"));
+    let output =
+        ran(&workplace, &format!("test-scene --gaussians {gaussians} --frames 8 -o scene --quiet --no-refine"));
     assert!(output.status.success(), "{}", told(&output));
     workplace
 }

@@ -48,7 +48,7 @@ fn the_recipe_beside_a_result_repeats_its_run() {
 fn a_recipe_of_another_input_is_noted_and_flags_go_before_it() {
     let workplace = Workplace::new();
     workplace.done("compress {tiny} --cameras {tiny} --target-ratio 0.5 -o half");
-    workplace.done("demo --gaussians 600 --frames 4 -o demo");
+    workplace.done("test-scene --gaussians 600 --frames 4 -o demo");
     let demo = "demo/scene.gseq --cameras demo/cameras.json --recipe half/recipe.toml";
     let summary = workplace.summary(&format!("{demo} -o other.gseq"));
     assert_eq!(summary["gaussians"], 300);
@@ -61,7 +61,7 @@ fn a_recipe_of_another_input_is_noted_and_flags_go_before_it() {
 #[test]
 fn a_summary_reads_back_as_it_was_written_and_says_its_schema() {
     let workplace = Workplace::new();
-    workplace.done("demo --gaussians 900 --frames 6 -o demo");
+    workplace.done("test-scene --gaussians 900 --frames 6 -o demo");
     for (k, options) in ["", "--preset strong", "--preset paper", "--prune-only"].iter().enumerate() {
         workplace.done(&format!("compress demo/scene.gseq --cameras demo/cameras.json {options} -o out{k}.gseq"));
         let text = std::fs::read_to_string(workplace.path(&format!("out{k}.gseq.summary.json"))).unwrap();
@@ -139,7 +139,7 @@ fn reads_as_planned(workplace: &Workplace, arguments: &str) -> f64 {
 #[ignore = "needs time"]
 fn no_preset_reads_more_than_its_plan_named_however_little_memory_there_is() {
     let workplace = Workplace::new();
-    workplace.done("demo --gaussians 3000 --frames 64 -o demo");
+    workplace.done("test-scene --gaussians 3000 --frames 64 -o demo");
     for preset in ["default", "paper", "gentle", "strong"] {
         for (k, options) in ["", "--memory 48MiB", "--merge-only --memory 48MiB", "--target-ratio 0.2 --memory 48MiB"]
             .iter()

@@ -156,7 +156,7 @@ fn the_container_reader_gives_every_bit_of_every_column() {
     let workplace = Workplace::new();
     workplace.done("pack {tiny} -o zstd.gseq");
     workplace.done("pack {tiny} -o raw.gseq --raw");
-    workplace.done("demo --gaussians 2500 --frames 70 -o demo");
+    workplace.done("test-scene --gaussians 2500 --frames 70 -o demo");
     workplace.done("pack {tiny} -o tiny.gseq --max-error position=1e-2,rotation=1e-2,log_scale=1e-2,sh=1e-2");
     workplace.done("pack demo/scene.gseq -o demo.gseq --max-error position=0.05%,rotation=1e-3,opacity_logit=0.1");
     for (path, frames) in [
@@ -307,7 +307,7 @@ fn the_scale_script_compresses_every_size_and_says_what_it_took() {
 #[ignore = "needs Python"]
 fn bars_fit_terminals_of_60_to_120_columns_and_leave_nothing_behind() {
     let workplace = Workplace::new();
-    workplace.done("demo --gaussians 2000 --frames 16 -o demo --no-refine");
+    workplace.done("test-scene --gaussians 2000 --frames 16 -o demo --no-refine");
     let program = assert_cmd::cargo::cargo_bin("splatsieve");
     let mut terminal = Command::new(python("pty"));
     terminal.arg(script("terminal.py")).args(["--columns", "60,100,120"]).arg(program);

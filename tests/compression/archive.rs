@@ -201,7 +201,7 @@ fn damaged_archives_and_what_no_archive_holds_are_refused_in_words() {
     workplace.refused(1, "unpack cut.gsz -o out", &["cut.gsz", "section blobs", "bytes", "copy it again"]);
     workplace.refused(1, "unpack flipped.gsz -o out", &["flipped.gsz", "checksum"]);
     workplace.refused(1, "info other.gsz", &["other.gsz", "archive"]);
-    workplace.done("demo --gaussians 200 --frames 3 -o demo");
+    workplace.done("test-scene --gaussians 200 --frames 3 -o demo");
     workplace.done("convert demo/scene.gseq curves.splatv");
     workplace.refused(2, "compress curves.splatv --cameras demo/cameras.json -o a.gsz", &["archive", ".gseq"]);
     workplace.refused(

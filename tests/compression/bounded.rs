@@ -32,7 +32,7 @@ fn furthest(workplace: &Workplace, column: Columns) -> (f64, bool) {
 #[ignore = "needs time"]
 fn every_column_keeps_its_bound_and_the_file_says_it() {
     let workplace = Workplace::new();
-    workplace.done("demo --gaussians 3000 --frames 48 -o demo");
+    workplace.done("test-scene --gaussians 3000 --frames 48 -o demo");
     workplace.done("pack demo/scene.gseq -o exact.gseq");
     workplace.done(&format!("pack demo/scene.gseq -o within.gseq --max-error {BOUNDS}"));
     workplace.done("verify within.gseq");

@@ -251,7 +251,7 @@ fn explicit_trajectories_keep_the_bits_of_whoever_stays() {
 fn threads_change_no_byte() {
     let workplace = Workplace::new();
     // More Gaussians than one block of work holds.
-    workplace.done("demo --gaussians 3000 --frames 6 -o demo");
+    workplace.done("test-scene --gaussians 3000 --frames 6 -o demo");
     let mut seen = BTreeSet::new();
     for request in [
         "{tiny} --preset paper -o out",

@@ -73,7 +73,7 @@ fn both(
 #[test]
 fn frames_of_a_reduction_are_those_of_what_is_written_whatever_column_was_changed() {
     let workplace = Workplace::new();
-    workplace.done("demo --gaussians 300 --frames 3 -o demo");
+    workplace.done("test-scene --gaussians 300 --frames 3 -o demo");
     workplace.done("unpack demo/scene.gseq -o frames");
     without_sh_head(&tiny(), &workplace.path("free"));
     for (path, kinds) in [

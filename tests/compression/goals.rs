@@ -9,7 +9,7 @@ use serde_json::Value;
 /// A made-up scene, `demo/scene.gseq`, with its cameras.
 fn with_demo() -> Workplace {
     let workplace = Workplace::new();
-    workplace.done("demo --gaussians 800 --frames 4 -o demo");
+    workplace.done("test-scene --gaussians 800 --frames 4 -o demo");
     workplace
 }
 

@@ -46,7 +46,7 @@ fn observed(curve: &Value, of: &str) -> f64 {
 #[test]
 fn what_is_exact_has_no_error_and_what_converges_does_so_as_it_should() {
     let place = Workplace::new();
-    let demo = "demo -o d --gaussians 1000 --frames 5";
+    let demo = "test-scene -o d --gaussians 1000 --frames 5";
     place.done(demo);
     let cameras = read(&fs::read_to_string(place.path("d/cameras.json")).unwrap());
     fs::write(place.path("d/cameras.json"), held_out(&cameras).to_string()).unwrap();
@@ -122,7 +122,7 @@ fn what_is_exact_has_no_error_and_what_converges_does_so_as_it_should() {
 #[ignore = "needs time"]
 fn threads_and_memory_change_no_byte_and_runs_are_those_of_compress() {
     let place = Workplace::new();
-    place.done("demo -o d --gaussians 1500 --frames 4");
+    place.done("test-scene -o d --gaussians 1500 --frames 4");
     let found = read(&place.done(
         "precision d/scene.gseq --cameras d/cameras.json -o diagrams --knobs machine,merging --target-ratio 0.4 --repeat 1 --json",
     ));
@@ -152,7 +152,7 @@ fn threads_and_memory_change_no_byte_and_runs_are_those_of_compress() {
 #[test]
 fn what_cannot_be_turned_is_refused_before_anything_is_written() {
     let place = Workplace::new();
-    place.done("demo -o d --gaussians 300 --frames 3");
+    place.done("test-scene -o d --gaussians 300 --frames 3");
     let before = files(&place.path(""));
     for (words, expected) in [
         ("precision d/scene.gseq -o diagrams", "give --cameras"),
@@ -169,7 +169,7 @@ fn what_cannot_be_turned_is_refused_before_anything_is_written() {
 #[test]
 fn a_recipe_that_looks_at_nothing_and_refines_nothing_has_less_to_turn_and_says_so() {
     let place = Workplace::new();
-    place.done("demo -o d --gaussians 300 --frames 3");
+    place.done("test-scene -o d --gaussians 300 --frames 3");
     let found = read(&place.done(
         "precision d/scene.gseq --cameras d/cameras.json -o diagrams --preset paper --knobs look,rounds,percentiles,refining \
          --repeat 1 --json",

@@ -14,7 +14,7 @@ fn quality(workplace: &Workplace, original: &str, result: &str, cameras: &str) -
 #[ignore = "needs time"]
 fn every_kind_of_input_comes_closer_to_the_original_at_the_same_count() {
     let workplace = Workplace::new();
-    workplace.done("demo --gaussians 1500 --frames 6 -o demo");
+    workplace.done("test-scene --gaussians 1500 --frames 6 -o demo");
     workplace.done("unpack demo/scene.gseq -o frames");
     let tiny = tiny().display().to_string();
     let first = files(&workplace.path("frames")).into_keys().min().unwrap();
@@ -39,7 +39,7 @@ fn every_kind_of_input_comes_closer_to_the_original_at_the_same_count() {
 #[test]
 fn a_static_model_without_cameras_is_refined_by_virtual_ones() {
     let workplace = Workplace::new();
-    workplace.done("demo --gaussians 1200 --frames 2 -o demo");
+    workplace.done("test-scene --gaussians 1200 --frames 2 -o demo");
     workplace.done("unpack demo/scene.gseq -o frames");
     let first = files(&workplace.path("frames")).into_keys().min().unwrap();
     let first = format!("frames/{}", first.display());
@@ -56,7 +56,7 @@ fn a_static_model_without_cameras_is_refined_by_virtual_ones() {
 #[ignore = "needs time"]
 fn who_asks_for_similarity_gets_it_for_decibels() {
     let workplace = Workplace::new();
-    workplace.done("demo --gaussians 1500 --frames 6 -o demo");
+    workplace.done("test-scene --gaussians 1500 --frames 6 -o demo");
     let found = ["0", "0.5"].map(|part| {
         workplace.done(&format!(
             "compress demo/scene.gseq --cameras demo/cameras.json --target-ratio 0.1 --refine-steps 600 \

@@ -174,7 +174,7 @@ fn slow_every_command_survives_broken_streams() {
         "unpack scene.gseq -o out --force".to_owned(),
         "unpack scene.gseq --stream".to_owned(),
         "recover scene.gseq -o out.gseq --force".to_owned(),
-        "demo --gaussians 100 --frames 1 --no-refine".to_owned(),
+        "test-scene --gaussians 100 --frames 1 --no-refine".to_owned(),
         "selfcheck --json".to_owned(),
         "man pages".to_owned(),
     ];
@@ -373,7 +373,7 @@ fn slow_outputs_of_all_commands_name_no_folder() {
         "compress {m} --cameras {m} SHORT -o {o}/small.splatv",
         "compress {m} --cameras {m} SHORT -o {o}/small.4dgs",
         "compress {m} --cameras {m} SHORT -o {o}/few --as ply-sequence",
-        "demo -o {o}/demo --gaussians 100 --frames 2 --no-refine",
+        "test-scene -o {o}/demo --gaussians 100 --frames 2 --no-refine",
         "convert {m} {o}/scene.splatv --cameras {m}",
         "convert {m} {o}/scene.4dgs --cameras {m}",
         "unpack {m} --cameras {m} -o {o}/frames",

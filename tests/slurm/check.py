@@ -3,7 +3,7 @@
 
     python3 tests/slurm/check.py target/release/splatsieve [MODEL] [--only NAME ...]
 
-MODEL is room2_big; without it, scenes of `splatsieve demo` do. Needs Slurm and MUNGE (Debian: slurm-wlm, munge) and
+MODEL is room2_big; without it, scenes of `splatsieve test-scene` do. Needs Slurm and MUNGE (Debian: slurm-wlm, munge) and
 nothing but Python. Exits 1 if a claim fails. `--start` says whether a Slurm of one's own can be started here at all.
 """
 
@@ -29,10 +29,10 @@ class Bench:
     def __init__(self, folder, program, model, cluster):
         self.folder, self.program, self.cluster = folder, program, cluster
         self.demo = folder / "demo scene"
-        self.here("demo", "-o", self.demo, "--gaussians", 2000, "--frames", 24, "--quiet")
+        self.here("test-scene", "-o", self.demo, "--gaussians", 2000, "--frames", 24, "--quiet")
         self.scene = [model, "--cameras", model, "--no-refine"]
         if model is None:
-            self.here("demo", "-o", folder / "large", "--gaussians", 20000, "--frames", 100, "--quiet")
+            self.here("test-scene", "-o", folder / "large", "--gaussians", 20000, "--frames", 100, "--quiet")
             self.scene = [folder / "large/scene.gseq", "--cameras", folder / "large/cameras.json", "--no-refine"]
         self.plain = {}
 

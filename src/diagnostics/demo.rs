@@ -1,0 +1,346 @@
+//! `splatsieve demo`: generates a scene, compresses it to a tenth and a twentieth, and writes pages and a film to look
+//! at.
+
+use std::fmt::Write as _;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use rayon::prelude::*;
+
+use crate::diagnostics::demo_scene::Playground;
+use crate::error::{Error, Result, ShowPath};
+use crate::evaluation::EvaluateOptions;
+use crate::files::atomic::{Kind, MARKER, Replace, StagedFolder, check_target};
+use crate::files::container::Container;
+use crate::limits::Limits;
+use crate::memory_plan::Budget;
+use crate::model::{Camera, Picture, Rig, Split};
+use crate::models::trajectories::write_sequence;
+use crate::outputs::film::{FilmFormat, FilmOutput};
+use crate::outputs::kind::{OutputKind, check_folder_name};
+use crate::passes::{Batch, Subject, ViewStates, show};
+use crate::pipeline::{Request, Target, compress_scene, keep_to_budget};
+use crate::player::view::{ViewOptions, view};
+use crate::progress::Events;
+use crate::recipe::{Effort, Recipe};
+use crate::render::Image;
+use crate::report::{self, ReportOptions};
+use crate::scene::pictures::PictureSet;
+use crate::scene::{InputOptions, Scene};
+
+/// The generated scene.
+pub const SCENE: &str = "scene.gseq";
+/// Its cameras.
+pub const CAMERAS: &str = "cameras.json";
+/// A tenth of the Gaussians, refined.
+pub const TENTH: &str = "compressed_10x.gseq";
+/// A twentieth of the Gaussians, refined.
+pub const TWENTIETH: &str = "compressed_20x.gseq";
+/// A tenth of the Gaussians, without refinement.
+pub const PRUNED: &str = "pruned_10x.gseq";
+/// The page that plays the scene beside [`TENTH`].
+pub const PLAYER: &str = "player.html";
+/// Folder of the report.
+pub const REPORT: &str = "report";
+/// The film: the scene, [`PRUNED`] and [`TENTH`] side by side.
+pub const FILM: &str = "comparison.gif";
+
+/// Size of one render in the film, pixels: three of them, side by side, fit a page of text.
+const FILM_RENDER: (u32, u32) = (280, 210);
+/// Width of the white line between two renders of the film, pixels.
+const FILM_GAP: u32 = 6;
+/// Number of frames of the film at most.
+const FILM_FRAMES: usize = 24;
+/// Frames of the film per second.
+const FILM_RATE: u32 = 8;
+/// View of the film: a test view in the middle.
+const FILM_VIEW: u32 = 5;
+
+/// Options of [`run`].
+#[derive(Debug)]
+pub struct DemoOptions {
+    /// Number of Gaussians of the scene.
+    pub gaussians: usize,
+    /// Number of frames of the scene.
+    pub frames: usize,
+    /// Number of optimization steps of each refinement; `None`: those of the default recipe at [`Effort::Fast`].
+    pub steps: Option<u32>,
+    /// Folder to write.
+    pub output: PathBuf,
+    /// Policy for an existing output.
+    pub overwrite: Replace,
+    /// Memory limit.
+    pub memory: Budget,
+    /// Receiver of the events of the run.
+    pub events: Events,
+}
+
+/// One model of the demo.
+#[derive(Debug, Clone, PartialEq)]
+pub struct DemoModel {
+    /// Name of its file.
+    pub name: &'static str,
+    /// Number of its Gaussians.
+    pub gaussians: usize,
+    /// Bytes of its file.
+    pub bytes: u64,
+    /// Mean PSNR against the scene over the test views, dB; `None` for the scene itself.
+    pub psnr: Option<f64>,
+    /// Mean SSIM over the same views.
+    pub ssim: Option<f64>,
+}
+
+/// Result of [`run`].
+#[derive(Debug)]
+pub struct DemoReport {
+    /// The scene, then its compressed models.
+    pub models: Vec<DemoModel>,
+    /// Number of test renders that were compared.
+    pub renders: usize,
+    /// Files and folders with their descriptions, in the order in which a reader may open them.
+    pub written: Vec<(&'static str, &'static str)>,
+}
+
+/// Generates the scene, compresses it and writes everything into one folder.
+///
+/// # Errors
+/// An output that may not be written; errors of the compression; a failed write.
+pub fn run(options: &DemoOptions) -> Result<DemoReport> {
+    let output = &options.output;
+    check_folder_name(output, "demo")?;
+    check_target(output, Kind::Folder, &[], options.overwrite)?;
+    let staged = StagedFolder::new(output, options.overwrite)?;
+    let report = run_in(staged.path(), options)?;
+    staged.commit()?;
+    Ok(report)
+}
+
+fn run_in(folder: &Path, options: &DemoOptions) -> Result<DemoReport> {
+    let made = Playground::new(options.gaussians, options.frames);
+    write_sequence(&made, OutputKind::Gseq, &folder.join(SCENE), 1, &options.events)?;
+    let cameras = folder.join(CAMERAS);
+    fs::write(&cameras, cameras_json(&made.rig())).map_err(Error::io("write", &cameras))?;
+
+    let fast = Recipe::preset("default")?.at_effort(Effort::Fast);
+    let refined = options.steps.map_or(fast.clone(), |steps| fast.refining_by(steps));
+    let models = [(TENTH, 0.1, refined.clone()), (TWENTIETH, 0.05, refined), (PRUNED, 0.1, fast.unrefined())];
+    let mut limits = Limits::NONE;
+    for (name, ratio, recipe) in models {
+        limits = compress(folder, name, Target::Ratio(ratio), &recipe, options)?;
+    }
+    film(folder, &made.rig(), &limits, &options.events)?;
+    let original = InputOptions {
+        path: folder.join(SCENE),
+        cameras: Some(cameras),
+        memory: options.memory,
+        events: options.events.clone(),
+        ..InputOptions::default()
+    };
+    view(&ViewOptions {
+        original: original.clone(),
+        compressed: Some(folder.join(TENTH)),
+        max_frames: options.frames,
+        original_frames: None,
+        original_degree: None,
+        background: None,
+        page_limit: u64::MAX,
+        output: folder.join(PLAYER),
+        overwrite: Replace::Never,
+    })?;
+    let found = report::report_whole(&ReportOptions {
+        evaluate: EvaluateOptions {
+            original,
+            compressed: folder.join(TENTH),
+            ground_truth: None,
+            part: PictureSet::HeldOut,
+            max_frames: None,
+            background: None,
+            flip: false,
+            csv: None,
+            overwrite: Replace::Never,
+        },
+        more: vec![folder.join(TWENTIETH), folder.join(PRUNED)],
+        sweep: None,
+        precision: None,
+        render_time: false,
+        output: folder.join(REPORT),
+        overwrite: Replace::Never,
+    })?;
+    let marker = folder.join(MARKER);
+    let summary = serde_json::json!({ "tool": crate::TOOL, "verdict": found.result.verdict });
+    fs::write(&marker, format!("{summary:#}\n")).map_err(Error::io("write", &marker))?;
+    Ok(DemoReport::new(&found))
+}
+
+/// Compresses the scene in `folder` into the file `name` there. Returns the limits by which the memory limit holds.
+fn compress(folder: &Path, name: &str, target: Target, recipe: &Recipe, options: &DemoOptions) -> Result<Limits> {
+    let input = Box::new(Container::open(&folder.join(SCENE))?);
+    let rig = Playground::new(options.gaussians, options.frames).rig();
+    let mut scene = Scene::new(PathBuf::from(SCENE), input, rig, Some(Split::Train))?;
+    scene.events = options.events.clone();
+    let plain = InputOptions { memory: options.memory, events: options.events.clone(), ..InputOptions::default() };
+    let request = Request { target: Some(target), ..Request::new(plain, folder.join(name), recipe.clone()) };
+    keep_to_budget(&mut scene, &request)?;
+    compress_scene(&scene, &request)?;
+    Ok(scene.limits)
+}
+
+/// Returns the cameras of `rig`, each at every frame, with their splits.
+fn cameras_json(rig: &Rig) -> String {
+    let frame = |shot: &crate::model::Shot| {
+        let camera = &rig.cameras[shot.camera as usize];
+        let mut rows: Vec<[f64; 4]> = (0..3)
+            .map(|row| {
+                let [a, b, c] = camera.rotation.row(row).to_array();
+                [a, b, c, camera.translation[row]]
+            })
+            .collect();
+        rows.push([0.0, 0.0, 0.0, 1.0]);
+        serde_json::json!({
+            "v": shot.view,
+            "split": if shot.split == Split::Test { "test" } else { "train" },
+            "width": camera.width,
+            "height": camera.height,
+            "fx": camera.fx,
+            "fy": camera.fy,
+            "cx": camera.cx,
+            "cy": camera.cy,
+            "w2c": rows,
+        })
+    };
+    let frames: Vec<serde_json::Value> = rig.shots.iter().map(frame).collect();
+    format!("{:#}\n", serde_json::json!({ "background": rig.background, "frames": frames }))
+}
+
+/// Writes the film: the scene, pruned, and refined, side by side.
+fn film(folder: &Path, rig: &Rig, limits: &Limits, events: &Events) -> Result<()> {
+    let models = [SCENE, PRUNED, TENTH].map(|name| Container::open(&folder.join(name)));
+    let [scene, pruned, refined] = models;
+    let (scene, pruned, refined) = (scene?, pruned?, refined?);
+    let camera = smaller(&rig.cameras[FILM_VIEW as usize]);
+    let frames = crate::source::FrameSource::info(&scene).times.len();
+    let step = frames.div_ceil(FILM_FRAMES).max(1);
+    let picture = |frame| Picture { frame, view: FILM_VIEW, camera: 0 };
+    let pictures: Vec<Picture> = (0..frames).step_by(step).map(picture).collect();
+    let path = folder.join(FILM);
+    let size = (3 * FILM_RENDER.0 + 2 * FILM_GAP, FILM_RENDER.1);
+    let mut film = FilmOutput::create((&path, &path), &FilmFormat::Gif, size, pictures.len() as u32, FILM_RATE)?;
+    let progress = events.task("film", "frames", pictures.len() as u64);
+    let subjects = [Subject::all(&scene), Subject::all(&pruned), Subject::all(&refined)];
+    show(subjects, &[camera], &pictures, Batch::of_frame(limits), |views| {
+        let render = |view: &ViewStates<'_, 3>| {
+            let black = rig.background.unwrap_or_default();
+            beside([0, 1, 2].map(|subject| view.render(subject, black)))
+        };
+        let images: Vec<Image> = views.par_iter().map(render).collect();
+        images.iter().try_for_each(|image| {
+            progress.advance(1);
+            film.add(image)
+        })
+    })?;
+    film.finish()
+}
+
+/// Returns `camera` with renders of [`FILM_RENDER`].
+fn smaller(camera: &Camera) -> Camera {
+    let (width, height) = FILM_RENDER;
+    let scale = f64::from(width) / f64::from(camera.width);
+    Camera {
+        width,
+        height,
+        fx: scale * camera.fx,
+        fy: scale * camera.fy,
+        cx: 0.5 * f64::from(width),
+        cy: 0.5 * f64::from(height),
+        ..camera.clone()
+    }
+}
+
+/// Joins three renders of one size from left to right, with a white line between two.
+fn beside(images: [Image; 3]) -> Image {
+    let (width, height) = (images[0].width, images[0].height);
+    let line = vec![1.0; 3 * FILM_GAP as usize];
+    let mut data = Vec::new();
+    for y in 0..height as usize {
+        for (k, image) in images.iter().enumerate() {
+            let row = 3 * width as usize;
+            data.extend_from_slice(&image.data[y * row..(y + 1) * row]);
+            if k < 2 {
+                data.extend_from_slice(&line);
+            }
+        }
+    }
+    Image { width: 3 * width + 2 * FILM_GAP, height, data }
+}
+
+impl DemoReport {
+    fn new(found: &report::ReportData) -> DemoReport {
+        let first = &found.result.evaluation;
+        let mut models = vec![DemoModel {
+            name: SCENE,
+            gaussians: first.count.original,
+            bytes: first.bytes.original,
+            psnr: None,
+            ssim: None,
+        }];
+        let evaluations = std::iter::once(first).chain(found.others.iter().map(|other| &other.evaluation));
+        models.extend([TENTH, TWENTIETH, PRUNED].into_iter().zip(evaluations).map(|(name, of)| DemoModel {
+            name,
+            gaussians: of.count.compressed,
+            bytes: of.bytes.compressed,
+            psnr: Some(of.loss.overall.psnr),
+            ssim: Some(of.loss.overall.ssim),
+        }));
+        DemoReport {
+            models,
+            renders: first.cameras.pairs,
+            written: vec![
+                (PLAYER, "the scene and a tenth of it, moving, in a browser"),
+                ("report/report.html", "the three results beside the scene"),
+                (FILM, "left the scene, middle a tenth without refinement, right a tenth refined"),
+                (SCENE, "the scene"),
+                (CAMERAS, "its cameras"),
+                (TENTH, "a tenth of the Gaussians, refined"),
+                (TWENTIETH, "a twentieth of the Gaussians, refined"),
+                (PRUNED, "a tenth of the Gaussians, without refinement"),
+            ],
+        }
+    }
+
+    /// Returns the table of models, the list of files in `folder`, and the command that opens the player, for a person.
+    pub fn text(&self, folder: &Path) -> String {
+        let mut out = String::new();
+        // Writing to a String cannot fail.
+        let _ = writeln!(out, "{:<24} {:>9} {:>10} {:>9} {:>7}", "", "Gaussians", "size", "PSNR", "SSIM");
+        let whole = &self.models[0];
+        for model in &self.models {
+            let size = format!("{:.2} MB", model.bytes as f64 / 1e6);
+            let psnr = model.psnr.map_or("–".to_owned(), |psnr| format!("{psnr:.1} dB"));
+            let ssim = model.ssim.map_or("–".to_owned(), |ssim| format!("{ssim:.3}"));
+            let _ = write!(out, "{:<24} {:>9} {size:>10} {psnr:>9} {ssim:>7}", model.name, model.gaussians);
+            if model.psnr.is_some() {
+                let fewer = whole.gaussians as f64 / model.gaussians.max(1) as f64;
+                let smaller = whole.bytes as f64 / model.bytes.max(1) as f64;
+                let _ = write!(out, "  {fewer:.1}× fewer, {smaller:.1}× smaller");
+            }
+            out.push('\n');
+        }
+        let _ = writeln!(out, "PSNR and SSIM: against the scene, means of {} test views\n", self.renders);
+        let _ = writeln!(out, "Written to {}:", folder.shown());
+        for (name, about) in &self.written {
+            let _ = writeln!(out, "  {name:<24} {about}");
+        }
+        let page = folder.join(PLAYER);
+        let _ = writeln!(out, "\nSee it:   {} {}", opener(), page.shown());
+        out
+    }
+}
+
+/// Returns the usual command of this system that opens a file in its program.
+fn opener() -> &'static str {
+    match std::env::consts::OS {
+        "macos" => "open",
+        "windows" => "start",
+        _ => "xdg-open",
+    }
+}
