@@ -65,7 +65,10 @@ def cases(binary, data, scratch):
         return to
 
     demo = scratch / "demo"
-    run([binary, "demo", "--gaussians", "3000", "--frames", "64", "-o", demo])
+    # Versions before the command `test-scene` made this scene with `demo`.
+    has_command = subprocess.run([binary, "test-scene", "--help"], capture_output=True).returncode == 0
+    make_scene = "test-scene" if has_command else "demo"
+    run([binary, make_scene, "--gaussians", "3000", "--frames", "64", "-o", demo])
     rig = demo / "cameras.json"
     packed, frames = scratch / "model.gseq", scratch / "frames"
     run([binary, "convert", small, packed, "--cameras", small])
@@ -77,7 +80,7 @@ def cases(binary, data, scratch):
     for part in ("cfg_args", "point_cloud"):
         run(["cp", "-r", small / part, bare])
 
-    yield "demo folder", lambda out: run([binary, "demo", "-o", out]), "demo"
+    yield "demo folder", lambda out: run([binary, make_scene, "-o", out]), "demo"
     for model in models:
         for preset in ("default", "paper", "gentle", "strong"):
             yield f"{model.name} {preset}", compress(model, "--preset", preset, cameras=model), "small"

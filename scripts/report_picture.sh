@@ -18,8 +18,8 @@ trap 'rm -rf "$folder"' EXIT
 
 "$splatsieve" compress "$model" --cameras "$model" --preset strong -o "$folder/small"
 "$splatsieve" report "$model" "$folder/small" --cameras "$model" --max-frames 3 -o "$folder/report"
-# Only the slider.
-only='header, section:not(#compare), h2 { display: none } main { padding: 14px 20px }'
+# The slider alone.
+only='header, section:not(#compare), h2, .slider + .slider, .note { display: none } main { padding: 14px 20px }'
 sed "s|</head>|<style>$only</style></head>|" "$folder/report/report.html" >"$folder/slider.html"
 "$browser" --headless --no-sandbox --disable-gpu --hide-scrollbars --window-size=620,665 \
     --screenshot="$folder/report.png" "file://$folder/slider.html" 2>/dev/null

@@ -32,9 +32,9 @@ const FOLDERS: [&str; 27] = [
     "pipeline",
     "evaluation",
     "commands",
+    "player",
     "report",
     "diagnostics",
-    "player",
 ];
 
 /// Names that the root of the library re-exports from other crates.

@@ -48,7 +48,7 @@ class Installed(unittest.TestCase):
     def setUpClass(cls):
         cls.folder = tempfile.TemporaryDirectory()
         cls.at = Path(cls.folder.name)
-        splatsieve.run("demo", output=cls.at / "demo")
+        splatsieve.run("test-scene", output=cls.at / "demo")
 
     @classmethod
     def tearDownClass(cls):

@@ -14,6 +14,7 @@ pub(super) use self::shared::{
 pub(super) use self::study::{PrecisionArgs, Sweep};
 use self::values::{parse_box, parse_bytes, parse_color, parse_decibels, parse_ratio};
 use super::recipe_flags::RecipeFlags;
+use splatsieve::diagnostics::demo_scene::Playground;
 use splatsieve::outputs::bounds::MaxError;
 
 /// Headings of the groups of options in the help.
@@ -63,8 +64,11 @@ pub(super) enum CommandArgs {
     Info(InfoArgs),
     /// List what a cache folder holds, or remove it
     Cache(CacheFolder),
-    /// Make a small scene, compress it, and show the result
+    /// Make a scene with moving objects, compress it to a tenth and a twentieth, and write pages to look at
     Demo(Demo),
+    /// Make the scene that tests use, and compress it
+    #[command(hide = true)]
+    TestScene(TestScene),
     /// Check the numerics of this program on this machine
     Selfcheck(Selfcheck),
     /// Print a recipe file with all parameters
@@ -88,7 +92,7 @@ impl CommandArgs {
             CommandArgs::Evaluate(Evaluate { models, .. }) | CommandArgs::Report(ReportArgs { models, .. }) => {
                 models.memory.explain
             }
-            CommandArgs::Demo(Demo { memory, .. }) => memory.explain,
+            CommandArgs::Demo(Demo { memory, .. }) | CommandArgs::TestScene(TestScene { memory, .. }) => memory.explain,
             CommandArgs::Sweep(_)
             | CommandArgs::Precision(_)
             | CommandArgs::Cache(_)
@@ -344,12 +348,18 @@ pub(super) struct CompareArgs {
 pub(super) struct ReportArgs {
     #[command(flatten)]
     pub(super) models: CompareArgs,
+    /// More compressed models, to show beside the first
+    #[arg(value_name = "MORE", conflicts_with_all = ["cache", "shard"])]
+    pub(super) more: Vec<PathBuf>,
     /// sweep.json that `sweep` wrote, to include its curves
     #[arg(long, value_name = "FILE")]
     pub(super) sweep: Option<PathBuf>,
     /// precision.json that `precision` wrote, to include its plots
     #[arg(long, value_name = "FILE")]
     pub(super) precision: Option<PathBuf>,
+    /// Measure the time of a render before and after; these times differ between runs
+    #[arg(long)]
+    pub(super) render_time: bool,
     /// Output folder: report.html, and its data as JSON and CSV
     #[arg(short, long, value_name = "FOLDER")]
     pub(super) output: PathBuf,
@@ -494,7 +504,28 @@ pub(super) struct CacheFolder {
 /// `demo`
 #[derive(Debug, Args)]
 pub(super) struct Demo {
-    /// Folder for the scene and the results [default: a temporary one]
+    /// Folder to write the scene, its compressed models, the pages and the film into
+    #[arg(short, long, value_name = "FOLDER", default_value = "splatsieve-demo")]
+    pub(super) output: PathBuf,
+    /// Gaussians of the scene
+    #[arg(long, value_name = "N", default_value_t = Playground::COUNT as u32, value_parser = clap::value_parser!(u32).range(1000..=1_000_000))]
+    pub(super) gaussians: u32,
+    /// Frames of the scene
+    #[arg(long, value_name = "T", default_value_t = Playground::FRAMES as u32, value_parser = clap::value_parser!(u32).range(2..=10_000))]
+    pub(super) frames: u32,
+    /// Optimization steps of each refinement [default: enough for the usual scene]
+    #[arg(long, value_name = "N")]
+    pub(super) refine_steps: Option<u32>,
+    #[command(flatten)]
+    pub(super) memory: Memory,
+    #[command(flatten)]
+    pub(super) earlier: Earlier,
+}
+
+/// `test-scene`
+#[derive(Debug, Args)]
+pub(super) struct TestScene {
+    /// Keep the scene and the result in this folder [default: a temporary one]
     #[arg(short, long, value_name = "FOLDER")]
     pub(super) output: Option<PathBuf>,
     /// Number of Gaussians of the scene

@@ -31,7 +31,8 @@ use splatsieve::diagnostics::demo::DemoOptions;
 use splatsieve::diagnostics::precision::{Knob, PrecisionOptions};
 use splatsieve::diagnostics::selfcheck;
 use splatsieve::diagnostics::sweep::SweepOptions;
-use splatsieve::diagnostics::{demo, precision, sweep};
+use splatsieve::diagnostics::test_scene::TestSceneOptions;
+use splatsieve::diagnostics::{demo, precision, sweep, test_scene};
 use splatsieve::error::{Error, Result, ShowPath};
 use splatsieve::evaluation;
 use splatsieve::evaluation::EvaluateOptions;
@@ -191,15 +192,24 @@ fn run(cli: Cli) -> Result<()> {
             evaluate.original.work = work_of(args.kept);
             let options = ReportOptions {
                 evaluate,
+                more: args.more,
                 sweep: args.sweep,
                 precision: args.precision,
+                render_time: args.render_time,
                 output: args.output,
                 overwrite: args.earlier.replace(),
             };
             let Some(found) = whole(report::report(&options)?)? else { return Ok(()) };
-            notes(&found.work_notes);
-            notes(&found.notes);
-            print(&format!("{}\n{}\n", found.verdict, page.shown()))
+            let mut verdicts = String::new();
+            for result in std::iter::once(&found.result).chain(&found.others) {
+                notes(&result.work_notes);
+                notes(&result.notes);
+                if !found.others.is_empty() {
+                    verdicts += &format!("{}: ", Path::new(&result.evaluation.path.compressed).shown());
+                }
+                verdicts += &format!("{}\n", result.verdict);
+            }
+            print(&format!("{verdicts}{}\n", page.shown()))
         }
         CommandArgs::View(args) => print(&(viewed(&view_options(args, &events))? + "\n")),
         CommandArgs::Convert(args) => write_converted(args, &events),
@@ -216,6 +226,18 @@ fn run(cli: Cli) -> Result<()> {
             let options = DemoOptions {
                 gaussians: args.gaussians as usize,
                 frames: args.frames as usize,
+                steps: args.refine_steps,
+                output: args.output,
+                overwrite: args.earlier.replace(),
+                memory: budget_of(args.memory),
+                events,
+            };
+            print(&demo::run(&options)?.text(&options.output))
+        }
+        CommandArgs::TestScene(args) => {
+            let options = TestSceneOptions {
+                gaussians: args.gaussians as usize,
+                frames: args.frames as usize,
                 kept: Target::Ratio(args.ratio),
                 recipe: args.recipe.recipe()?,
                 output: args.output,
@@ -223,7 +245,7 @@ fn run(cli: Cli) -> Result<()> {
                 memory: budget_of(args.memory),
                 events,
             };
-            print(&demo::run(&options)?.text())?;
+            print(&test_scene::run(&options)?.text())?;
             if let Some(folder) = options.output {
                 tell(&format!("kept in {}: scene.gseq, cameras.json, compressed.gseq", folder.shown()));
             }

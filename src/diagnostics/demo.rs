@@ -1,66 +1,112 @@
-//! The built-in demo: generates a scene, compresses it, and reports the result for each kind of body in it.
+//! `splatsieve demo`: generates a scene, compresses it to a tenth and a twentieth, and writes pages and a film to look
+//! at.
 
 use std::fmt::Write as _;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use crate::diagnostics::demo_scene;
-use crate::diagnostics::demo_scene::DemoBody;
-use crate::error::{Error, Result};
-use crate::files::atomic::{Kind, MARKER, Replace, ScratchFolder, StagedFolder, check_target};
+use rayon::prelude::*;
+
+use crate::diagnostics::demo_scene::Playground;
+use crate::error::{Error, Result, ShowPath};
+use crate::evaluation::EvaluateOptions;
+use crate::files::atomic::{Kind, MARKER, Replace, StagedFolder, check_target};
 use crate::files::container::Container;
+use crate::limits::Limits;
 use crate::memory_plan::Budget;
-use crate::model::{Camera, Rig, Split};
+use crate::model::{Camera, FrameView, Rig, Split};
 use crate::models::trajectories::write_sequence;
-use crate::outputs::kind::OutputKind;
-use crate::outputs::kind::check_folder_name;
-use crate::pipeline::summary::Detail;
-use crate::pipeline::summary::Summary;
+use crate::outputs::film::{FilmFormat, FilmOutput};
+use crate::outputs::kind::{OutputKind, check_folder_name};
+use crate::passes::{Batch, RenderedSource, ViewStates, show};
 use crate::pipeline::{Request, Target, compress_scene, set_limits_within_budget};
+use crate::player::view::{ViewOptions, view};
 use crate::progress::Events;
-use crate::recipe::Recipe;
+use crate::recipe::{Effort, Recipe};
+use crate::render::Image;
+use crate::report::{self, ReportOptions};
+use crate::scene::pictures::ViewSet;
 use crate::scene::{InputOptions, Scene};
 
-/// Options of the demo.
+/// The generated scene.
+pub const SCENE: &str = "scene.gseq";
+/// Its cameras.
+pub const CAMERAS: &str = "cameras.json";
+/// A tenth of the Gaussians, refined.
+pub const TENTH: &str = "compressed_10x.gseq";
+/// A twentieth of the Gaussians, refined.
+pub const TWENTIETH: &str = "compressed_20x.gseq";
+/// A tenth of the Gaussians, without refinement.
+pub const PRUNED: &str = "pruned_10x.gseq";
+/// The page that plays the scene beside [`TENTH`].
+pub const PLAYER: &str = "player.html";
+/// Folder of the report.
+pub const REPORT: &str = "report";
+/// The film: the scene, [`PRUNED`] and [`TENTH`] side by side.
+pub const FILM: &str = "comparison.gif";
+
+/// Size of one render in the film, pixels: three of them, side by side, fit a page of text.
+const FILM_RENDER: (u32, u32) = (280, 210);
+/// Width of the white line between two renders of the film, pixels.
+const FILM_GAP: u32 = 6;
+/// Number of frames of the film at most.
+const FILM_FRAMES: usize = 24;
+/// Frames of the film per second.
+const FILM_RATE: u32 = 8;
+/// View of the film: a test view in the middle.
+const FILM_VIEW: u32 = 5;
+
+/// Options of [`run`].
 #[derive(Debug)]
 pub struct DemoOptions {
     /// Number of Gaussians of the scene.
     pub gaussians: usize,
     /// Number of frames of the scene.
     pub frames: usize,
-    /// Number of Gaussians to keep.
-    pub kept: Target,
-    /// Recipe of the compression.
-    pub recipe: Recipe,
-    /// Folder for `scene.gseq`, `cameras.json` and `compressed.gseq`; `None`: a temporary folder that is deleted at the
-    /// end.
-    pub output: Option<PathBuf>,
-    /// Policy if the folder exists.
+    /// Number of optimization steps of each refinement; `None`: those of the default recipe at [`Effort::Fast`].
+    pub steps: Option<u32>,
+    /// Folder to write.
+    pub output: PathBuf,
+    /// Policy for an existing output.
     pub overwrite: Replace,
-    /// Memory limit of the run.
+    /// Memory limit.
     pub memory: Budget,
     /// Receiver of the events of the run.
     pub events: Events,
 }
 
-/// Result of the demo.
-#[derive(Debug)]
-pub struct DemoReport {
-    /// Summary of the compression.
-    pub summary: Summary,
-    /// Numbers of Gaussians of every body: all, kept unchanged or as leaders, merged into another.
-    pub bodies: Vec<(DemoBody, usize, usize, usize)>,
+/// One model of the demo.
+#[derive(Debug, Clone, PartialEq)]
+pub struct DemoModel {
+    /// Name of its file.
+    pub name: &'static str,
+    /// Number of its Gaussians.
+    pub gaussians: usize,
+    /// Bytes of its file.
+    pub bytes: u64,
+    /// Mean PSNR against the scene over the test views, dB; `None` for the scene itself.
+    pub psnr: Option<f64>,
+    /// Mean SSIM over the same views.
+    pub ssim: Option<f64>,
 }
 
-/// Generates the scene, writes it as a container and compresses that.
+/// Result of [`run`].
+#[derive(Debug)]
+pub struct DemoReport {
+    /// The scene, then its compressed models.
+    pub models: Vec<DemoModel>,
+    /// Number of test renders that were compared.
+    pub renders: usize,
+    /// Files and folders with their descriptions, in the order in which a reader may open them.
+    pub written: Vec<(&'static str, &'static str)>,
+}
+
+/// Generates the scene, compresses it and writes everything into one folder.
 ///
 /// # Errors
-/// Fails if the number of Gaussians to keep is impossible, if the compression fails, or if a file cannot be written.
+/// An output that may not be written; errors of the compression; a failed write.
 pub fn run(options: &DemoOptions) -> Result<DemoReport> {
-    options.kept.count(options.gaussians)?;
-    let Some(output) = &options.output else {
-        return run_in(ScratchFolder::new(&std::env::temp_dir())?.path(), options);
-    };
+    let output = &options.output;
     check_folder_name(output, "demo")?;
     check_target(output, Kind::Folder, &[], options.overwrite)?;
     let staged = StagedFolder::new(output, options.overwrite)?;
@@ -70,76 +116,232 @@ pub fn run(options: &DemoOptions) -> Result<DemoReport> {
 }
 
 fn run_in(folder: &Path, options: &DemoOptions) -> Result<DemoReport> {
-    let demo = demo_scene::Scene::new(options.gaussians, options.frames);
-    let packed = folder.join("scene.gseq");
-    write_sequence(&demo, OutputKind::Gseq, &packed, 1, &options.events)?;
-    let rig = demo.rig();
-    let cameras = folder.join("cameras.json");
-    fs::write(&cameras, cameras_json(&rig)).map_err(Error::io("write", &cameras))?;
+    let made = Playground::new(options.gaussians, options.frames);
+    write_sequence(&made, OutputKind::Gseq, &folder.join(SCENE), 1, &options.events)?;
+    let cameras = folder.join(CAMERAS);
+    fs::write(&cameras, cameras_json(&made.rig())).map_err(Error::io("write", &cameras))?;
 
-    let input = Box::new(Container::open(&packed)?);
-    let mut scene = Scene::new(PathBuf::from("scene.gseq"), input, rig, Some(Split::Train))?;
-    scene.events = options.events.clone();
-    let input_options =
-        InputOptions { memory: options.memory, events: options.events.clone(), ..InputOptions::default() };
-    let request = Request {
-        target: Some(options.kept),
-        ..Request::new(input_options, folder.join("compressed.gseq"), options.recipe.clone())
+    let fast = Recipe::preset("default")?.with_effort(Effort::Fast);
+    let refined = options.steps.map_or(fast.clone(), |steps| fast.refining_by(steps));
+    let models = [(TENTH, 0.1, refined.clone()), (TWENTIETH, 0.05, refined), (PRUNED, 0.1, fast.unrefined())];
+    let mut limits = Limits::NONE;
+    for (name, ratio, recipe) in models {
+        limits = compress(folder, name, Target::Ratio(ratio), &recipe, options)?;
+    }
+    film(folder, &made.rig(), &limits, &options.events)?;
+    let original = InputOptions {
+        path: folder.join(SCENE),
+        cameras: Some(cameras),
+        memory: options.memory,
+        events: options.events.clone(),
+        ..InputOptions::default()
     };
-    set_limits_within_budget(&mut scene, &request)?;
-    let (mut summary, map) = compress_scene(&scene, &request)?;
-    // The path is temporary, so it is not reported.
-    summary.output.clear();
+    view(&ViewOptions {
+        original: original.clone(),
+        compressed: Some(folder.join(TENTH)),
+        max_frames: options.frames,
+        original_frames: None,
+        original_degree: None,
+        background: None,
+        page_limit: u64::MAX,
+        output: folder.join(PLAYER),
+        overwrite: Replace::Never,
+    })?;
+    let found = report::report_whole(&ReportOptions {
+        evaluate: EvaluateOptions {
+            original,
+            compressed: folder.join(TENTH),
+            ground_truth: None,
+            part: ViewSet::HeldOut,
+            max_frames: None,
+            max_views: None,
+            background: None,
+            flip: false,
+            csv: None,
+            overwrite: Replace::Never,
+        },
+        more: vec![folder.join(TWENTIETH), folder.join(PRUNED)],
+        sweep: None,
+        precision: None,
+        render_time: false,
+        output: folder.join(REPORT),
+        overwrite: Replace::Never,
+    })?;
     let marker = folder.join(MARKER);
-    fs::write(&marker, summary.json()).map_err(Error::io("write", &marker))?;
-
-    let mut leaders = vec![false; summary.gaussians];
-    let bodies = DemoBody::ALL
-        .iter()
-        .map(|&body| {
-            let members = demo.members(body);
-            // The first Gaussian with an index of the output counts as kept; later ones with the same index count as
-            // merged.
-            let kept = members
-                .clone()
-                .filter(|&id| map[id].is_some_and(|new| !std::mem::replace(&mut leaders[new as usize], true)));
-            let kept = kept.count();
-            let merged = members.clone().filter(|&id| map[id].is_some()).count() - kept;
-            (body, members.len(), kept, merged)
-        })
-        .collect();
-    Ok(DemoReport { summary, bodies })
+    let summary = serde_json::json!({ "tool": crate::TOOL, "verdict": found.result.verdict });
+    fs::write(&marker, format!("{summary:#}\n")).map_err(Error::io("write", &marker))?;
+    Ok(DemoReport::new(&found))
 }
 
-/// Returns the cameras as 3DGS writes them: camera-to-world rotations, every camera at every frame.
+/// Compresses the scene in `folder` into the file `name` there. Returns the limits by which the memory limit holds.
+fn compress(folder: &Path, name: &str, target: Target, recipe: &Recipe, options: &DemoOptions) -> Result<Limits> {
+    let input = Box::new(Container::open(&folder.join(SCENE))?);
+    let rig = Playground::new(options.gaussians, options.frames).rig();
+    let mut scene = Scene::new(PathBuf::from(SCENE), input, rig, Some(Split::Train))?;
+    scene.events = options.events.clone();
+    let plain = InputOptions { memory: options.memory, events: options.events.clone(), ..InputOptions::default() };
+    let request = Request { target: Some(target), ..Request::new(plain, folder.join(name), recipe.clone()) };
+    set_limits_within_budget(&mut scene, &request)?;
+    compress_scene(&scene, &request)?;
+    Ok(scene.limits)
+}
+
+/// Returns the cameras of `rig`, each at every frame, with their splits.
 fn cameras_json(rig: &Rig) -> String {
-    let camera = |(id, camera): (usize, &Camera)| {
-        let to_world = camera.rotation.transpose();
-        let rows = [0, 1, 2].map(|row| to_world.row(row).to_array());
+    let frame = |shot: &crate::model::Shot| {
+        let camera = &rig.cameras[shot.camera as usize];
+        let mut rows: Vec<[f64; 4]> = (0..3)
+            .map(|row| {
+                let [a, b, c] = camera.rotation.row(row).to_array();
+                [a, b, c, camera.translation[row]]
+            })
+            .collect();
+        rows.push([0.0, 0.0, 0.0, 1.0]);
         serde_json::json!({
-            "id": id,
-            "img_name": format!("view_{id:02}"),
+            "v": shot.view,
+            "split": if shot.split == Split::Test { "test" } else { "train" },
             "width": camera.width,
             "height": camera.height,
-            "position": camera.center().to_array(),
-            "rotation": rows,
             "fx": camera.fx,
             "fy": camera.fy,
+            "cx": camera.cx,
+            "cy": camera.cy,
+            "w2c": rows,
         })
     };
-    let all: Vec<serde_json::Value> = rig.cameras.iter().enumerate().map(camera).collect();
-    format!("{:#}\n", serde_json::Value::from(all))
+    let frames: Vec<serde_json::Value> = rig.shots.iter().map(frame).collect();
+    format!("{:#}\n", serde_json::json!({ "background": rig.background, "frames": frames }))
+}
+
+/// Writes the film: the scene, pruned, and refined, side by side.
+fn film(folder: &Path, rig: &Rig, limits: &Limits, events: &Events) -> Result<()> {
+    let models = [SCENE, PRUNED, TENTH].map(|name| Container::open(&folder.join(name)));
+    let [scene, pruned, refined] = models;
+    let (scene, pruned, refined) = (scene?, pruned?, refined?);
+    let camera = smaller(&rig.cameras[FILM_VIEW as usize]);
+    let frames = crate::source::FrameSource::info(&scene).times.len();
+    let step = frames.div_ceil(FILM_FRAMES).max(1);
+    let picture = |frame| FrameView { frame, view: FILM_VIEW, camera: 0 };
+    let pictures: Vec<FrameView> = (0..frames).step_by(step).map(picture).collect();
+    let path = folder.join(FILM);
+    let size = (3 * FILM_RENDER.0 + 2 * FILM_GAP, FILM_RENDER.1);
+    let mut film = FilmOutput::create((&path, &path), &FilmFormat::Gif, size, pictures.len() as u32, FILM_RATE)?;
+    let progress = events.task("film", "frames", pictures.len() as u64);
+    let subjects = [RenderedSource::all(&scene), RenderedSource::all(&pruned), RenderedSource::all(&refined)];
+    show(subjects, &[camera], &pictures, Batch::of_frame(limits), |views| {
+        let render = |view: &ViewStates<'_, 3>| {
+            let black = rig.background.unwrap_or_default();
+            beside([0, 1, 2].map(|subject| view.render(subject, black)))
+        };
+        let images: Vec<Image> = views.par_iter().map(render).collect();
+        images.iter().try_for_each(|image| {
+            progress.advance(1);
+            film.add(image)
+        })
+    })?;
+    film.finish()
+}
+
+/// Returns `camera` with renders of [`FILM_RENDER`].
+fn smaller(camera: &Camera) -> Camera {
+    let (width, height) = FILM_RENDER;
+    let scale = f64::from(width) / f64::from(camera.width);
+    Camera {
+        width,
+        height,
+        fx: scale * camera.fx,
+        fy: scale * camera.fy,
+        cx: 0.5 * f64::from(width),
+        cy: 0.5 * f64::from(height),
+        ..camera.clone()
+    }
+}
+
+/// Joins three renders of one size from left to right, with a white line between two.
+fn beside(images: [Image; 3]) -> Image {
+    let (width, height) = (images[0].width, images[0].height);
+    let line = vec![1.0; 3 * FILM_GAP as usize];
+    let mut data = Vec::new();
+    for y in 0..height as usize {
+        for (k, image) in images.iter().enumerate() {
+            let row = 3 * width as usize;
+            data.extend_from_slice(&image.data[y * row..(y + 1) * row]);
+            if k < 2 {
+                data.extend_from_slice(&line);
+            }
+        }
+    }
+    Image { width: 3 * width + 2 * FILM_GAP, height, data }
 }
 
 impl DemoReport {
-    /// Returns the report as a text table.
-    pub fn text(&self) -> String {
-        let mut out = self.summary.text(Detail::Most);
-        // Writing to a String cannot fail.
-        let _ = writeln!(out, "\n  {:<12} {:>9} {:>9} {:>9} {:>9}", "body", "Gaussians", "kept", "merged", "pruned");
-        for &(body, all, kept, merged) in &self.bodies {
-            let _ = writeln!(out, "  {:<12} {all:>9} {kept:>9} {merged:>9} {:>9}", body.name(), all - kept - merged);
+    fn new(found: &report::ReportData) -> DemoReport {
+        let first = &found.result.evaluation;
+        let mut models = vec![DemoModel {
+            name: SCENE,
+            gaussians: first.count.original,
+            bytes: first.bytes.original,
+            psnr: None,
+            ssim: None,
+        }];
+        let evaluations = std::iter::once(first).chain(found.others.iter().map(|other| &other.evaluation));
+        models.extend([TENTH, TWENTIETH, PRUNED].into_iter().zip(evaluations).map(|(name, of)| DemoModel {
+            name,
+            gaussians: of.count.compressed,
+            bytes: of.bytes.compressed,
+            psnr: Some(of.loss.overall.psnr),
+            ssim: Some(of.loss.overall.ssim),
+        }));
+        DemoReport {
+            models,
+            renders: first.cameras.pairs,
+            written: vec![
+                (PLAYER, "the scene and a tenth of it, moving, in a browser"),
+                ("report/report.html", "the three results beside the scene"),
+                (FILM, "left the scene, middle a tenth without refinement, right a tenth refined"),
+                (SCENE, "the scene"),
+                (CAMERAS, "its cameras"),
+                (TENTH, "a tenth of the Gaussians, refined"),
+                (TWENTIETH, "a twentieth of the Gaussians, refined"),
+                (PRUNED, "a tenth of the Gaussians, without refinement"),
+            ],
         }
+    }
+
+    /// Returns the table of models, the list of files in `folder`, and the command that opens the player, for a person.
+    pub fn text(&self, folder: &Path) -> String {
+        let mut out = String::new();
+        // Writing to a String cannot fail.
+        let _ = writeln!(out, "{:<24} {:>9} {:>10} {:>9} {:>7}", "", "Gaussians", "size", "PSNR", "SSIM");
+        let whole = &self.models[0];
+        for model in &self.models {
+            let size = format!("{:.2} MB", model.bytes as f64 / 1e6);
+            let psnr = model.psnr.map_or("–".to_owned(), |psnr| format!("{psnr:.1} dB"));
+            let ssim = model.ssim.map_or("–".to_owned(), |ssim| format!("{ssim:.3}"));
+            let _ = write!(out, "{:<24} {:>9} {size:>10} {psnr:>9} {ssim:>7}", model.name, model.gaussians);
+            if model.psnr.is_some() {
+                let fewer = whole.gaussians as f64 / model.gaussians.max(1) as f64;
+                let smaller = whole.bytes as f64 / model.bytes.max(1) as f64;
+                let _ = write!(out, "  {fewer:.1}× fewer, {smaller:.1}× smaller");
+            }
+            out.push('\n');
+        }
+        let _ = writeln!(out, "PSNR and SSIM: against the scene, means of {} test views\n", self.renders);
+        let _ = writeln!(out, "Written to {}:", folder.shown());
+        for (name, about) in &self.written {
+            let _ = writeln!(out, "  {name:<24} {about}");
+        }
+        let page = folder.join(PLAYER);
+        let _ = writeln!(out, "\nSee it:   {} {}", opener(), page.shown());
         out
+    }
+}
+
+/// Returns the usual command of this system that opens a file in its program.
+fn opener() -> &'static str {
+    match std::env::consts::OS {
+        "macos" => "open",
+        "windows" => "start",
+        _ => "xdg-open",
     }
 }

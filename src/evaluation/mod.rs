@@ -367,6 +367,24 @@ impl ModelPair {
         Ok(found)
     }
 
+    /// Passes each of `pictures`, by frame, of the scene's cameras to `visit`, one after the other, with the states of
+    /// the original and of the compressed model.
+    ///
+    /// # Errors
+    /// A source that cannot be read; those of `visit`.
+    pub(crate) fn each(
+        &self,
+        pictures: &[FrameView],
+        mut visit: impl FnMut(&ViewStates<'_, 2>) -> Result<()>,
+    ) -> Result<()> {
+        self.show(pictures, |views| views.iter().try_for_each(&mut visit))
+    }
+
+    /// Color behind the scene, red, green, blue in [0, 1].
+    pub(crate) fn background(&self) -> [f32; 3] {
+        self.background
+    }
+
     /// Gaussians of the compressed model.
     pub fn compressed_count(&self) -> usize {
         self.compressed.source().info().count

@@ -1,7 +1,7 @@
-//! States as whole numbers: every value at the nearest point of a lattice, so that differences in time are small
-//! integers that repeat.
+//! Quantization of frame states for the page: every value becomes the nearest point of a grid, so that differences in
+//! time are small integers that repeat.
 //!
-//! In: one frame's Gaussians. Out: planes of i32, component after component. Memory: one plane per component.
+//! In: the Gaussians of one frame. Out: planes of i32, component after component. Memory: one plane per component.
 
 use std::ops::Range;
 
@@ -11,36 +11,36 @@ use crate::error::Result;
 use crate::files::accuracy::{Accuracy, RenderedAttributes};
 use crate::model::{AttributeValues, Attributes, Gaussians, opacity, sh_coefficients};
 
-/// Distances between lattice points; a value is off by half of its own at most.
+/// Quantization steps. Each value is off by at most half of its step.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Steps {
-    /// Of positions, scene units.
+    /// Step of positions, scene units.
     pub position: f64,
-    /// Of components of unit quaternions.
+    /// Step of components of unit quaternions.
     pub rotation: f64,
-    /// Of natural logarithms of scales.
+    /// Step of natural logarithms of scales.
     pub log_scale: f64,
-    /// Of opacities in [0, 1].
+    /// Step of opacities in [0, 1].
     pub opacity: f64,
-    /// Of harmonics' coefficients.
+    /// Step of SH coefficients.
     pub sh: f64,
 }
 
-/// Parts of the scene's extent that a position's step is made of, as a power of two: a picture that shows the whole scene
-/// on 800 pixels has it at most a fortieth of a pixel off.
+/// Negative exponent of two of a position step relative to the scene's extent: in a render of the whole scene on 800
+/// pixels, positions are at most a fortieth of a pixel off.
 const POSITION_BITS: i32 = 14;
-/// Logarithms of scales are cut to ± this, as the rasteriser does.
+/// Limit of the absolute logarithm of scales, as in the rasterizer.
 const LOGARITHM_LIMIT: f32 = 80.0;
-/// The page holds harmonics in 16 bits.
+/// Largest SH coefficient in steps: the page stores them in 16 bits.
 const SH_LIMIT: f64 = 32767.0;
-/// A position has room for this many steps either way.
+/// Largest absolute position in steps.
 const POSITION_LIMIT: f64 = (1 << 30) as f64;
 
 impl Steps {
-    /// For a scene of this extent: powers of two, so that a point of a lattice is the same number everywhere.
+    /// Returns the steps for a scene of this extent: powers of two, so that grid points are exact in any precision.
     ///
-    /// The others were set by pictures: with them `deform2` and `room2_big` are over 50 dB from themselves.
-    pub fn of_extent(extent: f64) -> Steps {
+    /// The other steps were chosen by renders: with them `deform2` and `room2_big` reach over 50 dB PSNR.
+    pub fn from_extent(extent: f64) -> Steps {
         let position = extent.log2().floor() as i32 - POSITION_BITS;
         Steps {
             position: f64::from(position.clamp(-100, 100)).exp2(),
@@ -52,22 +52,24 @@ impl Steps {
     }
 }
 
-/// Components of a column, among those of all columns in the order position, rotation, log scale, opacity, harmonics.
+/// Returns the components of an attribute among all components, in the order position, rotation, log scale, opacity,
+/// SH.
 pub fn components(column: Attributes, sh_degree: usize) -> Range<usize> {
     let width = |column: Attributes| column.width(sh_degree);
     let before = Attributes::all().iter().take_while(|&other| other != column).map(width).sum();
     before..before + width(column)
 }
 
-/// Components of all columns.
+/// Returns the number of components of all attributes.
 pub fn width(sh_degree: usize) -> usize {
     11 + 3 * sh_coefficients(sh_degree)
 }
 
-/// Writes the columns `which` of `state` as lattice points into `points`, `[width, N]`; the others are left alone.
+/// Writes the attributes `which` of `state` as grid points into `points`, `[width, N]`; leaves the other attributes as
+/// they are. Returns the number of invisible Gaussians.
 ///
-/// Quaternions become unit ones, on the side of what `points` held before. A Gaussian that is not finite, or too far
-/// away for its number, gets opacity 0, with which nothing of it is seen: of such a one the return value tells how many.
+/// Quaternions are normalized; of both signs the one closer to the earlier content of `points` is taken. A Gaussian
+/// that is not finite, or too far away for its integer, gets opacity 0 and is invisible.
 ///
 /// # Panics
 /// If `points` is not that large.
@@ -111,10 +113,11 @@ pub fn write_points(state: &Gaussians, which: Attributes, steps: &Steps, points:
     unseen
 }
 
-/// Confirms that the positions of `points`, written of all columns of `state` with harmonics up to `sh_degree`, are about those of the state.
+/// Checks that the positions of `points`, written of all attributes of `state` with SH up to `sh_degree`, match the
+/// state.
 ///
 /// # Errors
-/// A Gaussian that is seen, further from where it was than [`accuracy`](crate::files::accuracy) allows.
+/// A visible Gaussian that moved further than [`accuracy`](crate::files::accuracy) allows.
 pub fn check_positions(state: &Gaussians, sh_degree: usize, steps: &Steps, points: &[i32]) -> Result<()> {
     let count = state.len();
     let mut accuracy = Accuracy::new(&state.position);
@@ -127,20 +130,20 @@ pub fn check_positions(state: &Gaussians, sh_degree: usize, steps: &Steps, point
     accuracy.check("a page")
 }
 
-/// The number of the lattice point nearest to `value`; 0 of NaN.
+/// Returns the number of the grid point nearest to `value`; 0 for NaN.
 fn nearest(value: f64, step: f64) -> i32 {
     (value / step).round_ties_even() as i32
 }
 
-/// Unit quaternions: of both that are the same rotation the one nearer to what was there, so that what turns evenly moves
-/// evenly.
+/// Writes unit quaternions. Of both signs of a rotation the one closer to the earlier content is taken, so that an even
+/// turn gives even differences.
 fn turn(rotation: &AttributeValues, step: f64, points: &mut [i32]) {
     let count = rotation.len();
     for i in 0..count {
         let q: [f32; 4] = rotation.row(i);
         let q = q.map(f64::from);
         let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
-        // A zero quaternion is the identity, as for the rasteriser.
+        // A zero quaternion is the identity, as in the rasterizer.
         let unit = if length > 0.0 { q.map(|x| x / length) } else { [1.0, 0.0, 0.0, 0.0] };
         let before: [f64; 4] = std::array::from_fn(|c| f64::from(points[c * count + i]));
         let along: f64 = unit.iter().zip(before).map(|(a, b)| a * b).sum();
@@ -158,7 +161,7 @@ mod tests {
     use super::*;
     use crate::model::AttributeValues;
 
-    /// What a point stands for, by the words of [`Steps`].
+    /// Returns the step of a component.
     fn step_of(component: usize, steps: &Steps) -> f64 {
         match component {
             0..3 => steps.position,
@@ -169,7 +172,7 @@ mod tests {
         }
     }
 
-    fn of_values(values: [Vec<f32>; 5]) -> Gaussians {
+    fn gaussians(values: [Vec<f32>; 5]) -> Gaussians {
         let [position, rotation, log_scale, opacity_logit, sh] = values;
         Gaussians {
             position: AttributeValues::from_planes(3, position),
@@ -187,8 +190,8 @@ mod tests {
             log_scale in prop::collection::vec(-9f32..3.0, 6), logit in prop::collection::vec(-9f32..9.0, 2),
             sh in prop::collection::vec(-3f32..3.0, 24), extent in 0.01f64..1e4,
         ) {
-            let state = of_values([position, rotation.clone(), log_scale, logit, sh]);
-            let steps = Steps::of_extent(extent);
+            let state = gaussians([position, rotation.clone(), log_scale, logit, sh]);
+            let steps = Steps::from_extent(extent);
             prop_assert!(steps.position <= extent / 16384.0 && steps.position > extent / 32768.0);
             let mut points = vec![0; 2 * width(1)];
             prop_assert_eq!(write_points(&state, Attributes::all(), &steps, &mut points), 0);
@@ -213,14 +216,14 @@ mod tests {
     }
 
     #[test]
-    fn a_quaternion_stays_on_its_side_and_what_cannot_be_placed_is_not_seen() {
-        let steps = Steps::of_extent(1.0);
+    fn quaternions_keep_their_sign_and_odd_gaussians_are_invisible() {
+        let steps = Steps::from_extent(1.0);
         let mut state = Gaussians::zeros(4, 0);
         let mut points = vec![0; 4 * width(0)];
         (0..4).for_each(|i| state.rotation.set_row(i, [-0.1, 0.995, 0.0, 0.0]));
         write_points(&state, Attributes::all(), &steps, &mut points);
         assert!(points[3 * 4] > 0 && points[4 * 4] < 0, "{points:?}");
-        // Past the equator the same rotation with the other sign would be a jump.
+        // With the other sign the next rotation would be a jump.
         state.rotation.set_row(0, [-0.1, -0.995, 0.0, 0.0]);
         state.rotation.set_row(1, [0.0; 4]);
         write_points(&state, Attributes::ROTATION, &steps, &mut points);

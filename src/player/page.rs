@@ -1,7 +1,8 @@
-//! The page: a program for the browser, what it is told of the scene, and the chunks of its models.
+//! Page: a program for the browser, the description of the scene, and the chunks of its models.
 //!
-//! In: chunks as they come. Out: one HTML file, or a folder whose page loads them as scripts, for a page from a disk may not
-//! read files. Memory: one chunk. Every name is in JSON that no `<` leaves, and the program shows names as text.
+//! In: chunks, in the order in which they are encoded. Out: one HTML file, or a folder whose page loads the chunks as
+//! scripts, because a page from a disk may not read files. Memory: one chunk. Names are in JSON without `<`, and the
+//! program shows names as text.
 
 use std::fs::{self, File};
 use std::io::{BufWriter, Write};
@@ -20,18 +21,19 @@ use crate::files::atomic::ScratchFolder;
 use crate::files::page_policy::{digest_of, policy};
 use crate::model::{Rig, Split};
 
-/// The page of a folder.
+/// File name of the page in a folder.
 pub const INDEX: &str = "index.html";
-/// Cameras that the page offers at most, evenly among all.
+/// Maximum number of cameras on the page, evenly chosen.
 const CAMERAS: usize = 400;
 
 const PAGE: &str = include_str!("page/page.html");
-/// What stands for what in the page.
+/// Marks in the page and the files that replace them.
 const PARTS: [(&str, &str); 3] = [
     ("/*page.css*/", include_str!("page/page.css")),
     ("/*sorter.js*/", include_str!("page/sorter.js")),
     ("/*player.js*/", concat!(include_str!("page/painter.js"), include_str!("page/player.js"))),
 ];
+/// Names and sources of the shaders.
 const SHADERS: [(&str, &str); 5] = [
     ("cover", include_str!("page/cover.vert")),
     ("project", include_str!("page/project.frag")),
@@ -40,50 +42,53 @@ const SHADERS: [(&str, &str); 5] = [
     ("compose", include_str!("page/compose.frag")),
 ];
 
-/// One model as the page is told of it.
+/// Description of a model for the page.
 #[derive(Debug, Serialize)]
 pub struct PageModel {
-    /// What it is: `original` or `compressed`.
+    /// Role of the model: `original` or `compressed`.
     pub role: &'static str,
     /// Name of its file or folder.
     pub name: String,
-    /// Bytes of it on the disk.
+    /// Bytes of the model on disk.
     pub bytes: u64,
-    /// Frames that it has.
+    /// Number of frames of the model.
     pub frames: usize,
-    /// Degree of harmonics that it has.
+    /// SH degree of the model.
     pub degree: usize,
-    /// What is shown.
+    /// Encoded frames.
     pub track: PageSequence,
 }
 
-/// What the page is told.
+/// Description of the scene for the page.
 #[derive(Debug, Serialize)]
 pub struct PageScene {
-    /// What made the page.
+    /// Program and version.
     pub tool: &'static str,
-    /// One, or the original and the compressed one.
+    /// One model, or the original and the compressed model.
     pub models: Vec<PageModel>,
-    /// Where cameras stood.
+    /// Cameras of the scene.
     pub cameras: Vec<PageCamera>,
-    /// Behind the scene, red, green, blue in [0, 1].
+    /// Background, red, green, blue in [0, 1].
     pub background: [f32; 3],
-    /// Middle of the scene.
+    /// Center of the scene.
     pub middle: [f64; 3],
     /// Longest side of the scene without its floaters.
     pub extent: f64,
-    /// Upwards in the cameras' pictures.
+    /// Mean upward direction of the cameras.
     pub up: [f64; 3],
     /// Files of the chunks to load, in order; none where they are in the page.
     pub files: Vec<String>,
+    /// Data URI of the image shown until the scene is drawn; it is part of the page's elements.
+    #[serde(skip)]
+    pub poster: Option<String>,
 }
 
-/// A camera, as the page is told.
+/// Camera of the page.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct PageCamera {
     view: u32,
     split: Split,
-    /// When its only picture was taken.
+    /// Time of its only shot; `None` for several shots or any time.
     time: Option<f64>,
     size: [u32; 2],
     focal: [f64; 2],
@@ -94,8 +99,8 @@ pub struct PageCamera {
     eye: [f64; 3],
 }
 
-/// The cameras of a rig, one for each place and size.
-pub fn looks(rig: &Rig) -> Vec<PageCamera> {
+/// Returns the cameras of a rig, one for each place and size.
+pub fn cameras(rig: &Rig) -> Vec<PageCamera> {
     let mut places: HashMap<(u32, u32), usize> = HashMap::new();
     let mut found: Vec<(PageCamera, usize)> = Vec::new();
     for shot in &rig.shots {
@@ -123,24 +128,24 @@ pub fn looks(rig: &Rig) -> Vec<PageCamera> {
     found.into_iter().step_by(step).map(|(look, _)| look).collect()
 }
 
-/// Upwards in the pictures of a rig, on average; z where they say nothing.
+/// Returns the mean upward direction of the cameras of a rig; z where it is undefined.
 pub fn upwards(rig: &Rig) -> DVec3 {
     let sum: DVec3 = rig.cameras.iter().map(|camera| -camera.rotation.row(1)).sum();
     let is_known = sum.is_finite() && sum.length() > 1e-3 * rig.cameras.len() as f64;
     if is_known { sum.normalize() } else { DVec3::Z }
 }
 
-/// Chunks as scripts, on their way into a page.
+/// Chunks as scripts, waiting in scratch files.
 pub struct Chunks {
     folder: ScratchFolder,
-    /// When it is wanted, in parts of the time shown; model; chunk; bytes.
+    /// Start time as a share of the time shown; model; chunk; bytes.
     made: Vec<(f64, usize, usize, u64)>,
-    /// Digests of the scripts, as a policy names them.
+    /// Digests of the scripts for the content security policy.
     digests: Vec<String>,
 }
 
 impl Chunks {
-    /// None yet; they wait in a folder in `scratch`.
+    /// Creates an empty collection with a folder in `scratch`.
     ///
     /// # Errors
     /// The system refuses.
@@ -148,7 +153,7 @@ impl Chunks {
         Ok(Chunks { folder: ScratchFolder::new(scratch)?, made: Vec::new(), digests: Vec::new() })
     }
 
-    /// Takes chunk `chunk` of model `model`, wanted after the part `since` of the time that is shown.
+    /// Adds chunk `chunk` of model `model`, whose first frame is at the share `since` of the time shown.
     ///
     /// # Errors
     /// A disk that is full.
@@ -161,7 +166,7 @@ impl Chunks {
         Ok(())
     }
 
-    /// Bytes of all of them.
+    /// Returns the bytes of all chunks.
     pub fn bytes(&self) -> u64 {
         self.made.iter().map(|made| made.3).sum()
     }
@@ -170,14 +175,14 @@ impl Chunks {
         self.folder.path().join(name(model, chunk))
     }
 
-    /// In the order in which they are wanted: of both models what is shown first.
+    /// Returns (model, chunk) in the order of time, so that the first frames of both models load first.
     fn ordered(&self) -> Vec<(usize, usize)> {
         let mut made = self.made.clone();
         made.sort_by(|a, b| a.0.total_cmp(&b.0).then((a.2, a.1).cmp(&(b.2, b.1))));
         made.into_iter().map(|(_, model, chunk, _)| (model, chunk)).collect()
     }
 
-    /// Writes one page with everything in it; gives its bytes.
+    /// Writes one page with all chunks inside. Returns its bytes.
     ///
     /// # Errors
     /// A disk that is full.
@@ -195,7 +200,7 @@ impl Chunks {
         Ok(fs::metadata(path).map_err(failed())?.len())
     }
 
-    /// Writes the page and the chunks beside it into a folder; gives the names of all files, and their bytes.
+    /// Writes the page and its chunks into a folder. Returns the names of all files, and their bytes.
     ///
     /// # Errors
     /// A disk that is full.
@@ -205,7 +210,7 @@ impl Chunks {
             let (from, to) = (self.folder.path().join(file), folder.join(file));
             fs::copy(&from, &to).map_err(Error::io("write", &to))?;
         }
-        // Scripts that the page itself adds may run: of files from a disk no browser says where they are from.
+        // The policy allows scripts that the page itself adds: files from a disk have no origin that it could name.
         let page = head(stage, &["'strict-dynamic'".to_owned()]) + "</body>\n</html>\n";
         let path = folder.join(INDEX);
         fs::write(&path, &page).map_err(Error::io("write", &path))?;
@@ -218,19 +223,22 @@ fn name(model: usize, chunk: usize) -> String {
     format!("frames_{model}_{chunk:05}.js")
 }
 
-/// Returns the page up to its chunks; its policy allows its own scripts, and those of `chunks`.
+/// Returns the page up to its chunks. Its policy allows its own scripts and those with the digests `chunks`.
 fn head(stage: &PageScene, chunks: &[String]) -> String {
     let shaders: serde_json::Map<String, serde_json::Value> =
         SHADERS.iter().map(|&(name, text)| (name.to_owned(), text.into())).collect();
     let json = serde_json::to_value(stage).expect("plain data");
     let mut page = PARTS.iter().fold(PAGE.to_owned(), |page, (mark, text)| page.replace(mark, text));
     page = page.replace("/*tool*/", TOOL).replace("/*shaders*/", &inline(&shaders.into()));
-    // Names may look like anything, and come after all replacements.
+    let image = |uri: &String| format!("<img id=\"poster\" alt=\"First frame of the scene\" src=\"{uri}\">");
+    page = page.replace("<!--poster-->", &stage.poster.as_ref().map_or(String::new(), image));
+    // Names may contain any text, so they are inserted after all replacements.
     let begin = format!("splatsieve.begin({});", inline(&json));
     let own = [between(&page, "<script>", "</script>"), &begin].map(digest_of);
     let scripts: Vec<String> = own.into_iter().chain(chunks.iter().cloned()).collect();
     let policy = policy(&[
         ("style-src", &[digest_of(between(&page, "<style>", "</style>"))]),
+        ("img-src", &["data:".to_owned()]),
         ("worker-src", &["blob:".to_owned()]),
         ("script-src", &scripts),
     ]);
@@ -243,7 +251,7 @@ fn between<'a>(page: &'a str, start: &str, end: &str) -> &'a str {
     rest.split_once(end).map_or(rest, |(content, _)| content)
 }
 
-/// JSON that may stand in a script.
+/// Returns JSON that may stand in a script.
 fn inline(json: &serde_json::Value) -> String {
     json.to_string().replace('<', "\\u003c")
 }
@@ -258,7 +266,7 @@ mod tests {
             count: 0,
             sh_degree: 0,
             times: vec![0.0],
-            steps: Steps::of_extent(1.0),
+            steps: Steps::from_extent(1.0),
             varying: Vec::new(),
             groups: vec![1],
             unseen: 0,
@@ -272,11 +280,12 @@ mod tests {
             extent: 1.0,
             up: [0.0, 0.0, 1.0],
             files: Vec::new(),
+            poster: None,
         }
     }
 
     #[test]
-    fn every_part_has_its_place_and_no_name_leaves_its_own() {
+    fn every_mark_is_replaced_once_and_names_stay_text() {
         let page = head(&stage("</script><script>alert(1)//*page.css*/"), &[]);
         assert!(!page.contains("<script>alert") && page.contains("\\u003c/script>\\u003cscript>alert(1)//*page.css*/"));
         for (mark, _) in PARTS.iter().chain(&[("/*shaders*/", ""), ("/*tool*/", "")]) {
@@ -286,7 +295,7 @@ mod tests {
     }
 
     #[test]
-    fn chunks_come_in_the_order_of_time_whoever_made_them_first() {
+    fn chunks_are_in_the_order_of_time() {
         let scratch = tempfile::tempdir().unwrap();
         let mut chunks = Chunks::new(scratch.path()).unwrap();
         for (model, chunk, since) in [(0, 0, 0.0), (0, 1, 0.0), (0, 2, 0.5), (1, 0, 0.0), (1, 1, 0.0), (1, 2, 0.4)] {

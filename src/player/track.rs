@@ -1,15 +1,16 @@
-//! A sequence as the page unpacks it: a first state, then groups of frames as differences in time.
+//! Encoding of a sequence for the page: a first state, then groups of frames as differences in time.
 //!
-//! In: a source of frames. Out: chunks of bytes, in order, each a zlib stream (RFC 1950) that needs the first chunk and
-//! itself. Memory: one state, and the lattice points of a group's frames, at most [`GROUP_VALUES`] or those of one frame.
+//! In: a source of frames. Out: chunks of bytes, in order. Each chunk is a zlib stream (RFC 1950) and is decoded with
+//! the first chunk only. Memory: one state, and the grid points of a group's frames, at most [`GROUP_VALUES`] or those
+//! of one frame.
 //!
-//! A chunk holds, for each of its components, a byte and then planes of bytes. Chunk 0 has every component at the first
-//! frame; the others have the components of the columns that vary, at some frames that follow one another. The byte: bits
-//! 0 to 2, how many planes there are; bit 3, whether differences are those of differences; bit 4, whether a value
-//! takes more than 16 bits. Planes hold byte 0, 1, … of every difference d as 2d or −2d − 1, Gaussian by Gaussian,
-//! those of one Gaussian frame by frame. The first difference of a Gaussian in a group is to the first frame of all, in chunk 0
-//! to 0; the next to the frame before; from then on, with bit 3, to the frame before and as much further as that was
-//! from the one before it. No planes: no differences.
+//! A chunk holds, for each of its components, a byte of flags and then planes of bytes. Chunk 0 has every component at
+//! the first frame; the other chunks have the components of varying attributes at consecutive frames. Flags: bits 0 to
+//! 2, number of planes; bit 3, second-order differences; bit 4, some value takes more than 16 bits. Planes hold byte 0,
+//! 1, … of every difference d, coded as 2d or −2d − 1, Gaussian by Gaussian, and frame by frame for one Gaussian. The
+//! first difference of a Gaussian in a group is relative to the first frame of the sequence (in chunk 0 to 0), the
+//! second to the frame before. Later differences are relative to the frame before; with bit 3 the last step is
+//! extrapolated. No planes: all differences are 0.
 
 use std::io::Write;
 
@@ -25,45 +26,45 @@ use crate::passes::States;
 use crate::progress::Events;
 use crate::source::{FrameSource, ReadPlan};
 
-/// Lattice points of a group's frames that lie ready together.
+/// Maximum number of grid points of a group in memory.
 pub const GROUP_VALUES: usize = 1 << 23;
-/// Frames of a group at most: what a jump in time has to unpack.
+/// Maximum number of frames of a group, which the page unpacks for a jump in time.
 const GROUP_FRAMES: usize = 20;
-/// Of deflate: differences are mostly noise, in which higher ones look long for little.
+/// Compression level of deflate. Differences are mostly noise, so higher levels gain little for their time.
 const LEVEL: u32 = 6;
-/// Differences are those of differences.
+/// Flag of second-order differences.
 const SECOND_ORDER: u8 = 8;
-/// A value takes more than 16 bits.
+/// Flag of a component with values of more than 16 bits.
 const WIDE: u8 = 16;
 
-/// What the page is told of a sequence before its chunks.
+/// Description of a sequence, which the page reads before the chunks.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct PageSequence {
-    /// N.
+    /// Number of Gaussians.
     pub count: usize,
-    /// Degree of the harmonics that are shown.
+    /// SH degree that is shown.
     pub sh_degree: usize,
     /// Time stamps of the frames that are shown.
     pub times: Vec<f64>,
-    /// Lattices of the values.
+    /// Quantization steps of the values.
     pub steps: Steps,
-    /// The first of the components that change with time, and how many: runs, in order.
+    /// Runs of components that vary with time: first component and number, in order.
     pub varying: Vec<[usize; 2]>,
     /// First frame of each group, then the number of frames.
     pub groups: Vec<usize>,
-    /// Gaussians that have no place on the lattices at some frame, and are not shown there.
+    /// Largest number of Gaussians of a frame that have no place on the grid and are invisible there.
     #[serde(skip)]
     pub unseen: usize,
 }
 
 impl PageSequence {
-    /// How `frames` of `source` are divided, with harmonics of at most `sh_degree`.
+    /// Divides `frames` of `source` into groups, with SH of at most `sh_degree`.
     pub fn plan(source: &dyn FrameSource, frames: &[usize], sh_degree: usize, steps: Steps) -> PageSequence {
         let info = source.info();
         let sh_degree = sh_degree.min(info.sh_degree);
         let of_frame = info.varying.width(sh_degree).max(1) * info.count.max(1);
         let together = (GROUP_VALUES / of_frame).clamp(1, GROUP_FRAMES);
-        // All alike in length, for each costs about the same to begin.
+        // Groups are about equally long, because each costs about the same to start.
         let groups = (frames.len().saturating_sub(1)).div_ceil(together);
         let varying = if groups == 0 { Attributes::empty() } else { changing(info.varying) };
         PageSequence {
@@ -77,19 +78,20 @@ impl PageSequence {
         }
     }
 
-    /// Number of chunks.
+    /// Returns the number of chunks.
     pub fn chunks(&self) -> usize {
         self.groups.len()
     }
 }
 
-/// Columns to follow where `varying` change: a Gaussian that is not finite for a while is not seen meanwhile.
+/// Returns the attributes to encode where `varying` vary. Opacity is among them, because a Gaussian that is not finite
+/// at some frames is invisible there.
 fn changing(varying: Attributes) -> Attributes {
     if varying.is_empty() { varying } else { varying | Attributes::OPACITY }
 }
 
-/// Hands the chunks of `track`, which was planned for `frames` of `source`, to `sink`, in order; of frames decoded together
-/// a reader keeps `held`.
+/// Encodes the chunks of `track`, planned for `frames` of `source`, and passes them to `sink` in order. A reader keeps
+/// `held` of the frames that are decoded together.
 ///
 /// # Errors
 /// A frame that cannot be read; those of `sink`.
@@ -148,11 +150,11 @@ pub fn encode(
     Ok(())
 }
 
-/// The bytes of components, each a plane to start from and one of every frame.
+/// Compresses components, each with a start plane and one plane per frame.
 fn pack(components: Vec<(&[i32], Vec<&[i32]>)>) -> Result<Vec<u8>> {
     let failed = |error| Error::io("compress", "the page's frames".as_ref())(error);
     let mut to = ZlibEncoder::new(Vec::new(), Compression::new(LEVEL));
-    // A few at a time on all threads: their bytes wait to be compressed in order.
+    // A few components at a time on all threads; their bytes are compressed in order.
     for some in components.chunks(8) {
         let bytes: Vec<Vec<u8>> = some.par_iter().map(|(start, frames)| component_bytes(start, frames)).collect();
         bytes.iter().try_for_each(|bytes| to.write_all(bytes)).map_err(failed)?;
@@ -160,6 +162,7 @@ fn pack(components: Vec<(&[i32], Vec<&[i32]>)>) -> Result<Vec<u8>> {
     to.finish().map_err(failed)
 }
 
+/// Returns the flags and planes of a component.
 fn component_bytes(start: &[i32], frames: &[&[i32]]) -> Vec<u8> {
     let mut orders = [false, true].map(|is_second| differences(start, frames, is_second));
     let cost = |values: &[u32]| values.iter().map(|&v| u64::from(32 - v.leading_zeros())).sum::<u64>();
@@ -174,7 +177,7 @@ fn component_bytes(start: &[i32], frames: &[&[i32]]) -> Vec<u8> {
     bytes
 }
 
-/// Differences, Gaussian by Gaussian, with the sign in the lowest bit.
+/// Returns the differences, Gaussian by Gaussian, with the sign in the lowest bit.
 fn differences(start: &[i32], frames: &[&[i32]], is_second: bool) -> Vec<u32> {
     let mut values = Vec::with_capacity(start.len() * frames.len());
     for (i, &first) in start.iter().enumerate() {
@@ -183,7 +186,7 @@ fn differences(start: &[i32], frames: &[&[i32]], is_second: bool) -> Vec<u32> {
             let expected = if is_second { before.wrapping_add(step) } else { before };
             let off = frame[i].wrapping_sub(expected);
             values.push(((off << 1) ^ (off >> 31)) as u32);
-            // The way from the first frame of all says nothing of the next one.
+            // The first frame of the sequence may be far away in time, so its difference is not extrapolated.
             step = if place == 0 { 0 } else { frame[i].wrapping_sub(before) };
             before = frame[i];
         }
@@ -201,7 +204,8 @@ mod tests {
     use crate::diagnostics::demo_scene;
     use crate::passes::gather_all;
 
-    /// Every frame of the chunks, `[frames][width][N]`: the words of the header of this file, one value at a time.
+    /// Decodes every frame of the chunks, `[frames][width][N]`, one value at a time, by the description at the top of
+    /// this file.
     fn unpacked(track: &PageSequence, chunks: &[Vec<u8>]) -> Vec<Vec<Vec<i64>>> {
         let (count, width) = (track.count, width(track.sh_degree));
         let chunk = |k: usize, moving: &[usize], frames: usize, base: &[Vec<i64>]| {
@@ -245,7 +249,7 @@ mod tests {
     }
 
     fn encoded(source: &dyn FrameSource, frames: &[usize], degree: usize) -> (PageSequence, Vec<Vec<u8>>) {
-        let mut track = PageSequence::plan(source, frames, degree, Steps::of_extent(2.0));
+        let mut track = PageSequence::plan(source, frames, degree, Steps::from_extent(2.0));
         let mut chunks = Vec::new();
         let sink = |place: usize, bytes| {
             assert_eq!(place, chunks.len());
@@ -311,7 +315,7 @@ mod tests {
     }
 
     #[test]
-    fn the_demo_takes_few_bytes_for_a_gaussian_and_frame() {
+    fn a_gaussian_takes_few_bytes_per_frame() {
         let scene = demo_scene::Scene::new(2000, 48);
         let frames: Vec<usize> = (0..48).collect();
         let bytes: usize = encoded(&scene, &frames, 3).1.iter().map(Vec::len).sum();

@@ -1,4 +1,4 @@
-//! A page that plays one model, or two side by side.
+//! `splatsieve view`: writes a page that plays one model, or two side by side.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -11,43 +11,44 @@ use crate::memory_plan::{Plan, ResourceEstimate, Workload};
 use crate::model::{Attributes, NO_SH_LIMIT, SequenceInfo};
 use crate::models::InputModel;
 use crate::player::lattice::{Steps, width};
-use crate::player::page::{Chunks, INDEX, PageModel, PageScene, looks, upwards};
+use crate::player::page::{Chunks, INDEX, PageModel, PageScene, cameras, upwards};
+use crate::player::poster::{self, poster};
 use crate::player::track::{GROUP_VALUES, PageSequence, encode};
 use crate::progress::Events;
 use crate::scene::open_compressed;
 use crate::scene::pictures::background;
 use crate::scene::{InputOptions, first_box, open_scene, scratch_beside};
 
-/// What making the page is called.
+/// Name of the stage.
 const NAME: &str = "view";
 
-/// What to show.
+/// Options of [`view`].
 #[derive(Debug, Clone)]
 pub struct ViewOptions {
-    /// The model, or the one before compression; of its split nothing is used.
+    /// The model, or the original of a compressed one; its split is ignored.
     pub original: InputOptions,
-    /// The one after it, of any kind.
+    /// The compressed model, of any format.
     pub compressed: Option<PathBuf>,
-    /// Show at most so many frames, evenly from first to last.
+    /// Maximum number of frames, evenly from first to last.
     pub max_frames: usize,
-    /// Of the original beside a compressed one; none: as many.
+    /// Maximum number of frames of an original beside a compressed model; `None`: `max_frames`.
     pub original_frames: Option<usize>,
-    /// Degree of harmonics to show the original with, beside a compressed one; none: its own.
+    /// Maximum SH degree of an original beside a compressed model; `None`: its own.
     pub original_degree: Option<usize>,
-    /// Red, green, blue in [0, 1]; none: see [`background`].
+    /// Background, red, green, blue in [0, 1]; `None`: see [`background`].
     pub background: Option<[f32; 3]>,
-    /// Bytes above which one file becomes a folder.
+    /// Maximum number of bytes of frames in one file; larger pages become folders.
     pub page_limit: u64,
-    /// NAME.html, or a folder.
+    /// Path of a page, NAME.html, or of a folder.
     pub output: PathBuf,
-    /// Replace an earlier output.
+    /// Policy for an existing output.
     pub overwrite: Replace,
 }
 
-/// What was written.
+/// Result of [`view`].
 #[derive(Debug)]
 pub struct Viewed {
-    /// The page to open.
+    /// Page to open.
     pub page: PathBuf,
     /// Bytes of all files.
     pub bytes: u64,
@@ -55,11 +56,11 @@ pub struct Viewed {
     pub files: usize,
     /// Number of frames shown.
     pub frames: usize,
-    /// Things a person should know.
+    /// Notes for a person.
     pub notes: Vec<String>,
 }
 
-/// Confirms, before any work, that the page may be written.
+/// Checks, before any work, that the page may be written.
 ///
 /// # Errors
 /// Those of [`check_target`].
@@ -71,16 +72,18 @@ pub fn check(options: &ViewOptions) -> Result<()> {
     check_target(&options.output, kind, &inputs, options.overwrite)
 }
 
+/// Returns whether `output` names a page rather than a folder.
 fn is_page(output: &Path) -> bool {
     output.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("html") || ending.eq_ignore_ascii_case("htm"))
 }
 
 /// Writes the page.
 ///
-/// Memory: one state of one model, and a group of its frames as lattice points ([`GROUP_VALUES`]).
+/// Memory: one state of one model, a group of its frames as grid points ([`GROUP_VALUES`]), and the render of the
+/// poster.
 ///
 /// # Errors
-/// Whatever is wrong with inputs, cameras or output. Nothing is left behind then.
+/// Invalid inputs, cameras or output. Nothing is written then.
 pub fn view(options: &ViewOptions) -> Result<Viewed> {
     check(options)?;
     let mut scene = open_scene(&InputOptions { split: None, ..options.original.clone() })?;
@@ -100,7 +103,7 @@ pub fn view(options: &ViewOptions) -> Result<Viewed> {
     scene.limits = limits;
     let bounds = first_box(scene.source())?;
     let (middle, extent) = bounds.map_or(Default::default(), |found| (found.middle, found.extent()));
-    let steps = Steps::of_extent(if extent > 0.0 { extent } else { 1.0 });
+    let steps = Steps::from_extent(if extent > 0.0 { extent } else { 1.0 });
 
     let all = options.max_frames.max(1);
     let (frames, degree) = match compressed {
@@ -123,12 +126,13 @@ pub fn view(options: &ViewOptions) -> Result<Viewed> {
     let mut stage = PageScene {
         tool: TOOL,
         models,
-        cameras: looks(&scene.rig),
+        cameras: cameras(&scene.rig),
         background,
         middle: middle.to_array(),
         extent: if extent > 0.0 { extent } else { 1.0 },
         up: upwards(&scene.rig).to_array(),
         files: Vec::new(),
+        poster: poster(scene.source(), &scene.rig, background, &limits)?,
     };
     if is_page(&options.output) && chunks.bytes() <= options.page_limit {
         let staged = StagedFile::new(&options.output, options.overwrite)?;
@@ -141,7 +145,7 @@ pub fn view(options: &ViewOptions) -> Result<Viewed> {
         check_target(&folder, Kind::Folder, &[&options.original.path], options.overwrite)?;
         let (bytes, most) = (chunks.bytes(), options.page_limit);
         notes.push(format!(
-            "{bytes} bytes of frames are more than one page is to hold ({most}, --page-limit): a folder it is"
+            "{bytes} bytes of frames are more than the limit of one page ({most}, --page-limit); a folder was written instead"
         ));
     }
     let staged = StagedFolder::new(&folder, options.overwrite)?;
@@ -153,7 +157,7 @@ pub fn view(options: &ViewOptions) -> Result<Viewed> {
     Ok(Viewed { page: folder.join(INDEX), bytes, files: names.len(), frames, notes })
 }
 
-/// How a model is to be shown.
+/// Options for one model of the page.
 struct ModelView<'a> {
     role: &'static str,
     path: &'a Path,
@@ -161,7 +165,7 @@ struct ModelView<'a> {
     degree: usize,
 }
 
-/// Makes the chunks of model `place` of the page.
+/// Encodes model `place` of the page.
 fn show(
     model: &dyn InputModel,
     place: usize,
@@ -191,15 +195,16 @@ fn show(
     })
 }
 
-/// `count` of `frames` frames at most, evenly from first to last.
+/// Returns at most `count` of `frames` frames, evenly from first to last.
 fn evenly(frames: usize, count: usize) -> Vec<usize> {
     let count = count.clamp(1, frames.max(1));
     let step = (frames.max(1) - 1) as f64 / (count - 1).max(1) as f64;
     (0..count.min(frames)).map(|i| (i as f64 * step).round_ties_even() as usize).collect()
 }
 
-/// What it takes to turn frames into chunks.
+/// Estimates the resources of encoding.
 fn need(work: &Workload, limits: &Limits) -> ResourceEstimate {
+    let [per_gaussian, render] = poster::memory();
     let points = 4 * width(work.sh_degree) as u64;
     let of_all = points / 4 * work.gaussians * work.frames.max(1);
     ResourceEstimate {
@@ -211,9 +216,10 @@ fn need(work: &Workload, limits: &Limits) -> ResourceEstimate {
             ("readers", work.input.reader),
             ("held", work.held(limits, Attributes::all())),
             ("points", 3 * points),
+            per_gaussian,
         ],
-        // The group, and eight of its components as differences and as bytes, and what comes of all.
-        fixed: vec![work.arriving(), ("group", 10 * of_all.min(GROUP_VALUES as u64))],
+        // The group, eight of its components as differences and as bytes, and the compressed chunk.
+        fixed: vec![work.arriving(), render, ("group", 10 * of_all.min(GROUP_VALUES as u64))],
     }
 }
 

@@ -1,93 +1,99 @@
-//! Charts: from data to SVG, as text to be put into a page.
+//! Charts as SVG elements of a page.
 //!
-//! Data in: numbers and names. Data out: one `<svg>` element that takes its colors from [`STYLE`] and
-//! its text from the page around it. Nothing is drawn for values that are not finite. Series differ by
-//! shape and dash as well as by color, and the colors are those of Okabe and Ito ("Color Universal
-//! Design", 2008), which color-blind people tell apart.
+//! Data in: numbers and names. Data out: one `<svg>` element with colors from [`STYLE`] and the font of the page around
+//! it. Values that are not finite are not drawn. Series differ by shape and dash as well as by color. The colors are
+//! those of Okabe and Ito ("Color Universal Design", 2008), which color-blind people can tell apart.
 
 use std::fmt::{self, Write as _};
 
 use super::html::{escape, figure};
 
-/// CSS that a page with charts must hold once.
+/// Style sheet of charts, which a page must hold once.
 pub const STYLE: &str = include_str!("chart.css");
 
-/// Size of a chart in its own units, which are about a pixel.
+/// Width of a chart in its own units, which are about a pixel each.
 const WIDTH: f64 = 480.0;
+/// Height of a chart with two axes.
 const HEIGHT: f64 = 270.0;
+/// Left margin.
 const LEFT: f64 = 80.0;
+/// Right margin.
 const RIGHT: f64 = 14.0;
+/// Bottom margin.
 const BOTTOM: f64 = 46.0;
-/// Height of a line of the legend, and about how wide one of its letters is on a narrow page, where they are largest.
+/// Height of a line of the legend.
 const LINE: f64 = 18.0;
+/// Approximate width of a letter on a narrow page, where letters are largest.
 const LETTER: f64 = 8.2;
-/// Colors, shapes and dashes that [`STYLE`] and this file know.
+/// Number of styles of series in [`STYLE`].
 const LOOKS: usize = 9;
 
-/// A direction of a plot.
+/// Axis of a plot.
 #[derive(Debug, Clone, Default)]
 pub struct ChartAxis {
-    /// What it measures, with the unit.
+    /// Measure and unit.
     pub label: String,
-    /// Whether equal steps are equal ratios; values that are not positive are then left out.
+    /// Whether the axis is logarithmic; values that are not positive are then left out.
     pub log: bool,
-    /// Whether it must reach 0.
+    /// Whether the axis must reach 0.
     pub from_zero: bool,
 }
 
-/// Points with a name.
+/// Series of points.
 #[derive(Debug, Clone, Default)]
 pub struct Series {
-    /// For the legend; without one it is not listed.
+    /// Name in the legend; a series without a name is not listed.
     pub name: String,
-    /// (x, y), joined in this order.
+    /// Points (x, y), joined in this order.
     pub points: Vec<(f64, f64)>,
     /// Whether a line joins the points.
     pub joined: bool,
-    /// Whether it is the other one of a pair with the series before it: in the same color, dashed and hollow.
+    /// Whether the series is paired with the one before it: same color, dashed and hollow.
     pub paired: bool,
-    /// What stands beside the points where there is room, as many as they are, or nothing.
+    /// Labels beside the points where there is room: one per point, or none.
     pub labels: Vec<String>,
 }
 
-/// Series over two axes.
+/// Plot of series over two axes.
 #[derive(Debug, Clone, Default)]
 pub struct Plot {
-    /// What it shows, for those who do not see it.
+    /// Description for readers who do not see the chart.
     pub title: String,
-    /// Along.
+    /// Horizontal axis.
     pub x: ChartAxis,
-    /// Up.
+    /// Vertical axis.
     pub y: ChartAxis,
-    /// In the order of the legend.
+    /// Series in the order of the legend.
     pub series: Vec<Series>,
 }
 
-/// One value per name, as horizontal bars from 0.
+/// Horizontal bars, or marks, of one value per name.
 #[derive(Debug, Clone, Default)]
 pub struct Bars {
-    /// What it shows.
+    /// Description.
     pub title: String,
-    /// What the values measure, with the unit.
+    /// Measure and unit of the values.
     pub label: String,
-    /// From the top.
+    /// Names and values from the top.
     pub bars: Vec<(String, f64)>,
+    /// Whether the axis covers the values instead of starting at 0; marks then stand for bars.
+    pub is_fitted: bool,
 }
 
-/// Counts per bin, one group on the other.
+/// Stacked counts per bin.
 #[derive(Debug, Clone, Default)]
 pub struct Stack {
-    /// What it shows.
+    /// Description.
     pub title: String,
-    /// The values that the bins part.
+    /// Axis of the binned values.
     pub x: ChartAxis,
-    /// One more than there are bins, increasing.
+    /// Edges of the bins, increasing, one more than bins.
     pub edges: Vec<f64>,
-    /// Groups from the bottom, each with a count per bin.
+    /// Groups from the bottom, with a count per bin.
     pub groups: Vec<(String, Vec<usize>)>,
 }
 
-/// An axis with its range, and where on the picture it lies.
+/// Axis with its range and its place in the chart.
 struct AxisScale {
     log: bool,
     low: f64,
@@ -97,7 +103,7 @@ struct AxisScale {
 }
 
 impl AxisScale {
-    /// Covers `values` with a little room, from pixel `from` to pixel `to`.
+    /// Returns a scale that covers `values` with a margin, from pixel `from` to pixel `to`; `None` without values.
     fn new(axis: &ChartAxis, values: impl Iterator<Item = f64>, [from, to]: [f64; 2]) -> Option<AxisScale> {
         let fits = |v: &f64| v.is_finite() && (!axis.log || *v > 0.0);
         let (mut low, mut high) =
@@ -126,20 +132,20 @@ impl AxisScale {
         })
     }
 
-    /// Leaves `room` pixels more behind the last value.
+    /// Adds `room` pixels behind the last value.
     fn leave(&mut self, room: f64) {
         let length = self.to - self.from;
         self.high += (self.high - self.low) * room / (length - room).max(0.5 * length);
     }
 
-    /// Pixel of a value; none if it cannot be shown.
+    /// Returns the pixel of a value; `None` if it cannot be shown.
     fn at(&self, value: f64) -> Option<f64> {
         let value = if self.log { value.log10() } else { value };
         let at = self.from + (value - self.low) / (self.high - self.low) * (self.to - self.from);
         at.is_finite().then_some(at)
     }
 
-    /// Round values inside the range.
+    /// Returns round values inside the range.
     fn ticks(&self) -> Vec<f64> {
         if self.log {
             let decades = (self.low.floor() as i32)..=(self.high.ceil() as i32);
@@ -153,7 +159,7 @@ impl AxisScale {
                 })
                 .filter(|tick| (self.low..=self.high).contains(&tick.log10()))
                 .collect();
-            // Within a small part of a decade a logarithm is as good as straight.
+            // Within a small part of a decade a logarithm is almost linear.
             if ticks.len() >= 2 {
                 return ticks;
             }
@@ -163,7 +169,7 @@ impl AxisScale {
     }
 }
 
-/// Round values from `low` to `high`, evenly apart.
+/// Returns round values from `low` to `high`, evenly spaced.
 fn even_ticks(low: f64, high: f64) -> Vec<f64> {
     let rough = (high - low) / 5.0;
     let power = 10f64.powf(rough.log10().floor());
@@ -175,7 +181,7 @@ fn even_ticks(low: f64, high: f64) -> Vec<f64> {
 }
 
 impl Plot {
-    /// The chart.
+    /// Draws the chart.
     pub fn svg(&self) -> String {
         let looks = self.looks();
         let legend: Vec<LegendEntry<'_>> = self
@@ -210,7 +216,7 @@ impl Plot {
         out.finish()
     }
 
-    /// The look of every series.
+    /// Returns the style of every series.
     fn looks(&self) -> Vec<SeriesStyle> {
         let mut colors = 0;
         let look = |series: &Series| {
@@ -223,40 +229,47 @@ impl Plot {
 }
 
 impl Bars {
-    /// The chart, as high as it needs to be.
+    /// Draws the chart, as high as its rows need.
     pub fn svg(&self) -> String {
         const ROW: f64 = 24.0;
         let height = ROW * self.bars.len() as f64 + BOTTOM + 8.0;
         let mut out = Drawing::new(&self.title, &[], height);
         let longest = self.bars.iter().map(|bar| bar.0.chars().count()).max().unwrap_or(0) as f64;
         let left = (longest * LETTER + 14.0).max(LEFT);
-        let axis = ChartAxis { from_zero: true, ..ChartAxis::default() };
+        let axis = ChartAxis { from_zero: !self.is_fitted, ..ChartAxis::default() };
         let values = self.bars.iter().map(|bar| bar.1);
         let Some(x) = AxisScale::new(&axis, values, [left, WIDTH - RIGHT - 60.0]) else { return out.empty() };
         out.x_axis(&x, &self.label, [8.0, height - BOTTOM]);
         for (row, (name, value)) in self.bars.iter().enumerate() {
-            let (Some(start), Some(end)) = (x.at(0.0), x.at(*value)) else { continue };
+            let start = if self.is_fitted { Some(x.from) } else { x.at(0.0) };
+            let (Some(start), Some(end)) = (start, x.at(*value)) else { continue };
             let y = 8.0 + ROW * row as f64;
             let middle = y + 0.5 * ROW + 4.0;
             out.push(&format!(
-                "<text class=\"end\" x=\"{:.1}\" y=\"{middle:.1}\">{}</text>\
-                 <rect class=\"area s0\" x=\"{start:.1}\" y=\"{:.1}\" width=\"{:.1}\" height=\"{:.1}\"/>\
-                 <text x=\"{:.1}\" y=\"{middle:.1}\">{}</text>",
+                "<text class=\"end\" x=\"{:.1}\" y=\"{middle:.1}\">{}</text><text x=\"{:.1}\" y=\"{middle:.1}\">{}</text>",
                 left - 8.0,
                 escape(name),
-                y + 4.0,
-                (end - start).max(0.0),
-                ROW - 8.0,
-                end + 6.0,
+                end + 8.0,
                 figure(*value),
             ));
+            if self.is_fitted {
+                out.push(&format!("<path class=\"grid\" d=\"M{start:.1} {:.1}H{end:.1}\"/>", middle - 4.0));
+                out.mark(SeriesStyle::from_number(0), end, middle - 4.0, name);
+            } else {
+                out.push(&format!(
+                    "<rect class=\"area s0\" x=\"{start:.1}\" y=\"{:.1}\" width=\"{:.1}\" height=\"{:.1}\"/>",
+                    y + 4.0,
+                    (end - start).max(0.0),
+                    ROW - 8.0,
+                ));
+            }
         }
         out.finish()
     }
 }
 
 impl Stack {
-    /// The chart.
+    /// Draws the chart.
     pub fn svg(&self) -> String {
         let names = self.groups.iter().enumerate();
         let legend: Vec<LegendEntry<'_>> = names
@@ -297,16 +310,16 @@ impl Stack {
     }
 }
 
-/// How a series is drawn: class names of [`STYLE`].
+/// Style of a series: class names of [`STYLE`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct SeriesStyle {
-    /// Below [`LOOKS`].
+    /// Number below [`LOOKS`].
     number: usize,
     hollow: bool,
 }
 
 impl SeriesStyle {
-    /// Of the series of that number, alone.
+    /// Returns the style of a series without a pair.
     fn from_number(number: usize) -> SeriesStyle {
         SeriesStyle { number: number % LOOKS, hollow: false }
     }
@@ -318,20 +331,20 @@ impl fmt::Display for SeriesStyle {
     }
 }
 
-/// A line of a legend.
+/// Entry of a legend.
 struct LegendEntry<'a> {
     name: &'a str,
     look: SeriesStyle,
     joined: bool,
 }
 
-/// An SVG being written.
+/// SVG being written.
 struct Drawing {
     text: String,
     height: f64,
-    /// Where the plot begins, below the legend.
+    /// Top of the plot, below the legend.
     top: f64,
-    /// Left end, foot and width of words beside points.
+    /// Left end, foot and width of the labels placed so far.
     labels: Vec<(f64, f64, f64)>,
 }
 
@@ -346,7 +359,7 @@ impl Drawing {
         };
         let (mut x, mut y) = (LEFT, 17.0);
         for LegendEntry { name, look, joined } in legend.iter().filter(|entry| !entry.name.is_empty()) {
-            // The mark, with a piece of the line through it.
+            // The mark with a piece of the line.
             let sample = if *joined { 26.0 } else { 12.0 };
             let wide = name.chars().count() as f64 * LETTER + sample + 22.0;
             if x + wide > WIDTH && x > LEFT {
@@ -367,7 +380,7 @@ impl Drawing {
         self.text.push_str(element);
     }
 
-    /// A point in the shape of its series.
+    /// Draws a point in the shape of its series.
     fn mark(&mut self, look: SeriesStyle, x: f64, y: f64, tip: &str) {
         let shape = match look.number % 4 {
             0 => format!("<circle class=\"mark {look}\" cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"3.4\">"),
@@ -387,10 +400,10 @@ impl Drawing {
         let _ = write!(self.text, "{shape}<title>{}</title>{close}", escape(tip));
     }
 
-    /// Words beside a point where they lie on no others, inside the plot; none where there is no such place.
+    /// Writes a label beside a point where it overlaps no other, inside the plot; leaves it out where there is no room.
     fn label(&mut self, x: f64, y: f64, words: &str) {
         let wide = words.chars().count() as f64 * LETTER;
-        // Left end and foot; above first, as curves of what more time buys fall.
+        // Left end and foot. Places above come first, because curves of error against time fall.
         let places = [(x + 6.0, y - 4.0), (x - 6.0 - wide, y - 4.0), (x - 6.0 - wide, y + 14.0), (x + 6.0, y + 14.0)];
         let is_free = |&(left, foot): &(f64, f64)| {
             let inside = left > LEFT && left + wide < WIDTH && foot >= self.top + 2.0 && foot < HEIGHT - BOTTOM;
@@ -430,7 +443,7 @@ impl Drawing {
         self.x_axis(x, x_label, [self.top, bottom]);
     }
 
-    /// Ticks, grid and label of a horizontal axis over rows from `top` to `bottom`.
+    /// Draws ticks, grid and label of a horizontal axis for rows from `top` to `bottom`.
     fn x_axis(&mut self, x: &AxisScale, label: &str, [top, bottom]: [f64; 2]) {
         for tick in x.ticks() {
             let Some(at) = x.at(tick) else { continue };

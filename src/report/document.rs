@@ -1,7 +1,7 @@
 //! HTML files that need no network, and their parts.
 //!
-//! Everything that comes from files or paths passes through [`escape`]; the content security policy in the head lets a
-//! browser load nothing but what is inside, and run nothing but the scripts given by their digests.
+//! All text from files or paths passes through [`escape`]. The content security policy in the head allows a browser to
+//! load only the images inside and to run only the scripts named by their digests.
 
 use super::chart;
 use super::html::escape;
@@ -9,13 +9,13 @@ use crate::files::page_policy::{digest_of, policy};
 
 const STYLE: &str = include_str!("page.css");
 
-/// Returns a whole file; `scripts` run at its end, and must hold no text from files.
+/// Returns a whole file. `scripts` run at its end and must hold no text from files.
 pub(super) fn document(title: &str, body: &str, scripts: &[&str]) -> String {
     let scripts: Vec<String> = scripts.iter().map(|script| format!("\n{script}")).collect();
     let digests: Vec<String> = scripts.iter().map(|script| digest_of(script)).collect();
     let policy = policy(&[
         ("img-src", &["data:".to_owned()]),
-        // Sizes of pictures are attributes, which no digest allows.
+        // Sizes of images are attributes, which no digest can allow.
         ("style-src", &["'unsafe-inline'".to_owned()]),
         ("script-src", &digests),
     ]);
@@ -30,19 +30,24 @@ pub(super) fn document(title: &str, body: &str, scripts: &[&str]) -> String {
     )
 }
 
-/// A chart under its name.
+/// Returns a chart under its name.
 pub(super) fn figure_of(caption: &str, svg: &str) -> String {
     format!("<figure><figcaption>{}</figcaption>{svg}</figure>\n", escape(caption))
 }
 
-/// Things a person should know; of none nothing.
+/// Returns a list of notes; empty without notes.
 pub(super) fn list<'a>(notes: impl IntoIterator<Item = &'a String>) -> String {
     let items: Vec<String> = notes.into_iter().map(|note| format!("<li>{}</li>", escape(note))).collect();
     if items.is_empty() { String::new() } else { format!("<ul class=\"note\">{}</ul>\n", items.join("\n")) }
 }
 
-/// Files beside the page.
+/// Returns links to files beside the page.
 pub(super) fn links(names: &[&str]) -> String {
     let links: Vec<String> = names.iter().map(|name| format!("<a href=\"{name}\">{name}</a>")).collect();
     links.join(", ")
+}
+
+/// Returns the heading of result `number` where there are several, else nothing.
+pub(super) fn heading(names: &[String], number: usize) -> String {
+    if names.len() < 2 { String::new() } else { format!("<h3>{}</h3>\n", escape(&names[number])) }
 }

@@ -1,12 +1,11 @@
-//! Looking for the failure modes that the paper names, in the pictures.
+//! Failure modes that the paper names, detected in renders.
 //!
-//! In: what kinds of Gaussian there are ([`mod@super::traits`]), and both models' pictures. Out: per kind
-//! how much larger the error is where it is seen, where that is worst, and a verdict. Where a kind is
-//! seen is known exactly: the original is rendered once more with colors that say the kind, which gives
-//! for every pixel the share w of it that such Gaussians have.
+//! In: the kinds of every Gaussian ([`mod@super::traits`]) and the renders of both models. Out: for each kind the error
+//! where the kind is visible and elsewhere, the worst place, and a verdict. The original is rendered once more with
+//! colors that encode the kinds; the result is, for every pixel, the share w of each kind.
 //!
-//! The failure cases are those of "Temporally-Aware Pruning for Compact 4D Gaussian Splatting Models",
-//! section 4.5. Memory: per thread one more picture, and the original's state without its colors.
+//! The failure modes are from "Temporally-Aware Pruning for Compact 4D Gaussian Splatting Models", section 4.5.
+//! Memory: per thread one more render, and the original's state without its colors.
 
 use serde::{Deserialize, Serialize};
 
@@ -16,21 +15,21 @@ use crate::metrics::{PSNR_CAP_DB, clamped, psnr};
 use crate::model::{AttributeValues, Camera, Gaussians, SH_C0};
 use crate::render::{Image, render};
 
-/// PSNR below which an error can be seen: one part in a hundred, root mean square.
+/// PSNR below which an error is visible, dB: one part in a hundred, root mean square.
 pub const VISIBLE_DB: f64 = 40.0;
-/// How much worse than elsewhere it must be: 3 dB are twice the squared error.
+/// Least distance to the PSNR elsewhere for a flag, dB: 3 dB are twice the squared error.
 pub const APART_DB: f64 = 3.0;
-/// Part of the pixels that a kind must have for its error to mean anything.
+/// Least share of the pixels for a kind to be judged.
 pub const SHOWN: f64 = 1e-3;
-/// Part of a kind's coverage that must have been dropped or merged for the loss to be its own.
+/// Least share of a kind's coverage that was dropped or merged for a flag.
 pub const LOST: f64 = 0.01;
-/// Side of the square shown of the worst place, pixels.
+/// Side of the square of the worst place, pixels.
 pub const CROP: u32 = 64;
 
-/// Error sums of one picture, in f64 over pixels.
+/// Error sums of one render, in f64 over pixels.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct Observed {
-    /// By [`GaussianKind::ALL`].
+    /// Sums by kind, in the order of [`GaussianKind::ALL`].
     kinds: [FailureSums; 3],
     /// Σ e², e² the mean over channels of the squared difference.
     error: f64,
@@ -43,85 +42,85 @@ struct FailureSums {
     weight: f64,
     /// Σ w e².
     error: f64,
-    /// Σ w ∇c·∇o and Σ w ∇o·∇o, of the brightness of the compressed and the original picture.
+    /// Σ w ∇c·∇o and Σ w ∇o·∇o; c and o are the brightness of the compressed and the original render.
     kept_detail: f64,
     detail: f64,
 }
 
-/// What a search for one failure mode came to.
+/// Result of the search for one failure mode.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Verdict {
-    /// The scene has nothing it could happen to.
+    /// The scene has no Gaussian of the kind.
     Absent,
-    /// The scene has such Gaussians, but they make up too little of any picture to be judged.
+    /// The scene has such Gaussians, but their share of every render is too small to be judged.
     Unseen,
-    /// Nothing of the kind was dropped or merged.
+    /// No Gaussian of the kind was dropped or merged, or almost none.
     Untouched,
-    /// The pictures err no more there than they should.
+    /// The error there is not visible, or not larger than elsewhere.
     Passed,
-    /// The pictures err visibly there, and much more than elsewhere.
+    /// The error there is visible and much larger than elsewhere.
     Flagged,
 }
 
-/// The place in a picture where a failure is worst.
+/// Render in which a failure mode is worst.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct WorstPlace {
-    /// Index into the evaluation's pictures.
+    /// Index into the evaluation's renders.
     #[serde(skip)]
     pub place: usize,
     /// Frame of the sequence.
     pub frame: usize,
     /// View number.
     pub view: u32,
-    /// PSNR of that picture where the kind is seen, dB.
+    /// PSNR of this render where the kind is visible, dB.
     pub psnr: f64,
 }
 
-/// One failure mode, looked for.
+/// Figures and verdict of one failure mode.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct FailureMode {
-    /// Its name.
+    /// Name of the mode.
     pub name: &'static str,
-    /// Which Gaussians it happens to.
+    /// Description of the Gaussians of this kind.
     pub happens_to: String,
-    /// What came of it.
+    /// Verdict.
     pub verdict: Verdict,
-    /// Gaussians of the original that are of the kind.
+    /// Number of Gaussians of this kind in the original.
     pub gaussians: usize,
-    /// Of these, dropped and merged ones; none without an index map.
+    /// Number of them that were dropped; `None` without an index map.
     pub dropped: Option<usize>,
-    /// Of these, merged ones.
+    /// Number of them that were merged; `None` without an index map.
     pub merged: Option<usize>,
-    /// Part of the scene's coverage that is theirs.
+    /// Share of the scene's coverage.
     pub coverage: f64,
-    /// Part of their coverage that was dropped or merged; none without an index map.
+    /// Share of their coverage that was dropped or merged; `None` without an index map.
     pub coverage_lost: Option<f64>,
-    /// Part of all pixels that is theirs.
+    /// Share of all pixels.
     pub shown: f64,
-    /// PSNR over what is theirs, dB; none where nothing is.
+    /// PSNR where the kind is visible, weighted by its shares, dB; `None` where it is nowhere.
     pub psnr_there: Option<f64>,
-    /// PSNR over the rest, dB.
+    /// PSNR elsewhere, dB.
     pub psnr_elsewhere: Option<f64>,
-    /// Part of the original's brightness gradients there that the compressed pictures do not follow; below
-    /// 0 where they exaggerate.
+    /// Share of the original's brightness gradients that the compressed renders do not follow; negative where they
+    /// exaggerate.
     pub detail_lost: Option<f64>,
-    /// The picture in which it is worst.
+    /// Render in which the mode is worst.
     pub worst: Option<WorstPlace>,
 }
 
-/// What is known of a kind's Gaussians before any picture is made.
+/// Counts of the Gaussians of a kind, known before rendering.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct KindMembers {
-    /// How many there are.
+    /// Number of Gaussians.
     pub count: usize,
-    /// Dropped and merged ones, where that is known.
+    /// Numbers of dropped and merged ones, where known.
     pub fates: Option<(usize, usize)>,
-    /// Part of the scene's coverage that is theirs, and the part of that which was dropped or merged.
+    /// Share of the scene's coverage, and the share of that coverage that was dropped or merged.
     pub shares: (f64, f64),
 }
 
-/// For every pixel the share of each kind, as red, green and blue.
+/// Renders the share of each kind in every pixel, as red, green and blue.
 pub fn shares_of_pixels(state: &Gaussians, traits: &[Traits], camera: &Camera) -> Image {
     let mut sh = AttributeValues::zeros(3, state.len());
     for (i, traits) in traits.iter().enumerate() {
@@ -138,7 +137,7 @@ pub fn shares_of_pixels(state: &Gaussians, traits: &[Traits], camera: &Camera) -
     render(&marked, camera, [0.0; 3])
 }
 
-/// What one picture shows of each kind.
+/// Sums the error of one render by kind.
 ///
 /// # Panics
 /// If the sizes differ.
@@ -150,7 +149,7 @@ pub fn observe(state: &Gaussians, traits: &[Traits], camera: &Camera, taken: &Re
     let error = squared_error(&taken.original, &taken.compressed);
     for (i, (error, shares)) in error.iter().zip(shares.data.chunks_exact(3)).enumerate() {
         found.error += error;
-        // Forward differences; at the far borders there are none.
+        // Forward differences; 0 at the far borders.
         let step = |of: &[f64]| {
             let along = if (i + 1).is_multiple_of(width) { 0.0 } else { of[i + 1] - of[i] };
             let down = if i + width >= of.len() { 0.0 } else { of[i + width] - of[i] };
@@ -168,7 +167,7 @@ pub fn observe(state: &Gaussians, traits: &[Traits], camera: &Camera, taken: &Re
     found
 }
 
-/// Per pixel the mean over channels of the squared difference, clamped to what a screen shows.
+/// Returns per pixel the mean over channels of the squared difference of values clamped to [0, 1].
 pub fn squared_error(a: &Image, b: &Image) -> Vec<f64> {
     let square = |(a, b): (&f32, &f32)| (clamped(*a) - clamped(*b)).powi(2);
     let pixels = a.data.chunks_exact(3).zip(b.data.chunks_exact(3));
@@ -179,7 +178,7 @@ fn brightness(image: &Image) -> Vec<f64> {
     image.data.chunks_exact(3).map(|p| p.iter().map(|&v| clamped(v)).sum::<f64>() / 3.0).collect()
 }
 
-/// Judges one kind by the pictures `seen`, whose (frame, view) are `names`.
+/// Judges one kind by the error sums `seen` of all renders, whose (frame, view) are `names`.
 pub fn judge(kind: GaussianKind, members: KindMembers, seen: &[Observed], names: &[(usize, u32)]) -> FailureMode {
     let (name, happens_to) = described(kind);
     let at = kind as usize;
@@ -228,15 +227,15 @@ pub fn judge(kind: GaussianKind, members: KindMembers, seen: &[Observed], names:
     }
 }
 
-/// The mode's name, and the Gaussians it happens to.
+/// Returns the name of a kind's failure mode and the description of its Gaussians.
 fn described(kind: GaussianKind) -> (&'static str, String) {
-    use super::traits::{COLOUR_CHANGE, FAST, NEIGHBOURS, NON_RIGID, OPACITY_CHANGE, STILL, THIN};
+    use super::traits::{COLOR_CHANGE, FAST, NEIGHBORS, NON_RIGID, OPACITY_CHANGE, STILL, THIN};
     match kind {
         GaussianKind::Motion => (
             "fast, non-rigid motion",
             format!(
                 "Gaussians that move by {}% of the scene extent per frame or more (root mean square), while the \
-                 distance to half of their {NEIGHBOURS} nearest neighbours changes by {}% or more",
+                 distance to half of their {NEIGHBORS} nearest neighbors changes by {}% or more",
                 100.0 * FAST,
                 100.0 * NON_RIGID
             ),
@@ -246,26 +245,26 @@ fn described(kind: GaussianKind) -> (&'static str, String) {
             "fine changes of appearance",
             format!(
                 "Gaussians that stand still (up to {}% of the extent per frame) while their opacity varies by {} or \
-                 their colour by {} (standard deviation) or more",
+                 their color by {} (standard deviation) or more",
                 100.0 * STILL,
                 OPACITY_CHANGE,
-                COLOUR_CHANGE
+                COLOR_CHANGE
             ),
         ),
     }
 }
 
-/// PSNR of a weighted sum of squared errors; none without weight.
+/// Returns the PSNR of a weighted sum of squared errors, dB; `None` without weight.
 fn db(error: f64, weight: f64) -> Option<f64> {
     (weight > 0.0).then(|| (-10.0 * (error / weight).log10()).min(PSNR_CAP_DB))
 }
 
-/// Corner of the square of [`CROP`] pixels, or less in a smaller picture, that holds most of the error
-/// that is a kind's: Σ w e². Of equals the first by rows.
+/// Returns the corner of the square of [`CROP`] pixels, or less in a smaller render, with the largest error of a kind,
+/// Σ w e². Of equal squares the first by rows wins.
 pub fn worst_corner(taken: &RenderedViews, shares: &Image, kind: GaussianKind) -> (u32, u32) {
     let (width, height) = (taken.original.width as usize, taken.original.height as usize);
     let (across, down) = ((CROP as usize).min(width), (CROP as usize).min(height));
-    // sums[y][x] over the rectangle above and left of (x, y).
+    // sums[y][x] is the sum over the rectangle above and left of (x, y).
     let stride = width + 1;
     let mut sums = vec![0.0; stride * (height + 1)];
     let error = squared_error(&taken.original, &taken.compressed);
@@ -290,7 +289,7 @@ pub fn worst_corner(taken: &RenderedViews, shares: &Image, kind: GaussianKind) -
     best.1
 }
 
-/// Part of a picture, from `corner`, [`CROP`] pixels each way or up to the border.
+/// Returns the part of a render from `corner`, [`CROP`] pixels each way or up to the border.
 pub fn crop(image: &Image, (left, top): (u32, u32)) -> Image {
     let (width, height) = (CROP.min(image.width - left), CROP.min(image.height - top));
     let row = |y: u32| {
@@ -300,7 +299,7 @@ pub fn crop(image: &Image, (left, top): (u32, u32)) -> Image {
     Image { width, height, data: (top..top + height).flat_map(row).copied().collect() }
 }
 
-/// PSNR of the part of both pictures that [`crop`] gives, dB.
+/// Returns the PSNR of the part that [`crop`] returns, dB.
 pub fn crop_psnr(taken: &RenderedViews, corner: (u32, u32)) -> f64 {
     psnr(&crop(&taken.compressed, corner), &crop(&taken.original, corner))
 }

@@ -3,7 +3,7 @@
   const films = [...document.querySelectorAll("[data-film]")];
   const choices = [...document.querySelectorAll("[data-play]")];
   const controls = document.getElementById("reel");
-  // Pictures a second.
+  // Frames per second.
   const SPEED = 10;
   let film = 0;
   let timer = 0;
@@ -28,12 +28,12 @@
   const stop = () => {
     clearInterval(timer);
     timer = 0;
-    controls.querySelector("button").textContent = "Play";
+    controls.querySelector("#play").textContent = "Play";
   };
 
   const toggle = () => {
     if (timer) return stop();
-    controls.querySelector("button").textContent = "Pause";
+    controls.querySelector("#play").textContent = "Pause";
     timer = setInterval(() => {
       const at = controls.querySelector("input").valueAsNumber;
       show((at + 1) % frames().length);
@@ -43,7 +43,7 @@
   if (controls) {
     controls.hidden = false;
     const time = controls.querySelector("input");
-    controls.querySelector("button").addEventListener("click", toggle);
+    controls.querySelector("#play").addEventListener("click", toggle);
     time.addEventListener("input", () => {
       stop();
       show(time.valueAsNumber);

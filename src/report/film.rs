@@ -1,7 +1,8 @@
-//! The page's films: how one or two views go on, before and after, with the difference, at some of the frames.
+//! Animations of the page: one or two views over time, before and after, with the difference.
 //!
-//! In: pictures chosen to be looked at, and both models again. Out: JPEG files as data URIs. A page holds at most [`VIEWS`]
-//! films of at most [`FRAMES`] frames, each with two images of at most [`MAX_PIXELS`] pixels and their difference: about 3 MB.
+//! In: the chosen renders, and both models. Out: JPEG files as data URIs. A page holds at most [`VIEWS`] animations of
+//! at most [`FRAMES`] frames, each with two images of at most [`MAX_PIXELS`] pixels and their difference: about 3 MB
+//! per result.
 
 use std::io;
 
@@ -19,29 +20,29 @@ use crate::model::FrameView;
 use crate::render::Image;
 use crate::scene::pictures::thin;
 
-/// Views that are followed: that of the worst picture, and that of the median one if it is another.
+/// Maximum number of animated views: the view of the worst render, and of the median one if it is another.
 pub const VIEWS: usize = 2;
-/// Frames of a film, evenly from first to last.
+/// Maximum number of frames of an animation, evenly from first to last.
 pub const FRAMES: usize = 24;
-/// A picture of more pixels is shown smaller.
+/// Maximum number of pixels of an image; larger renders are shown smaller.
 pub const MAX_PIXELS: u64 = 90_000;
-/// The same of differences, whose noise takes most bytes.
+/// Maximum number of pixels of a difference, whose noise takes most bytes.
 pub const MAX_PIXELS_OF_DIFFERENCE: u64 = 30_000;
-/// Of 100.
+/// JPEG quality, of 100.
 pub const QUALITY: u8 = 80;
 
-/// A film of the page.
+/// An animation of the page.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct FilmPanel {
-    /// Why its view was chosen: "worst picture", ...
+    /// Reasons for the choice of its view: "worst picture", ...
     pub why: Vec<String>,
     /// View number.
     pub view: u32,
-    /// Frame of the picture whose camera it is, for views whose camera moves.
+    /// Frame whose camera is used, for views with a moving camera.
     pub camera_of_frame: usize,
     /// Frames of the sequence, in order.
     pub frames: Vec<usize>,
-    /// PSNR of compressed against original at each, in full size, dB.
+    /// PSNR of compressed against original at each frame, in full size, dB.
     pub psnr: Vec<f64>,
     /// Data URIs of original, compressed and difference of every frame.
     #[serde(skip)]
@@ -49,24 +50,24 @@ pub struct FilmPanel {
     /// Pixels across and down, as shown.
     #[serde(skip)]
     pub size: (u32, u32),
-    /// Pixels of the picture, each way, that one shown pixel stands for.
+    /// Pixels of the render, each way, that one shown pixel stands for.
     #[serde(skip)]
     pub shrunk: u32,
-    /// By how much the difference was made brighter.
+    /// Factor by which the difference was made brighter.
     #[serde(skip)]
     pub factor: u32,
 }
 
-/// What the images are of, in order.
+/// Names of the images of a frame, in order.
 pub const KINDS: [&str; 3] = ["original", "compressed", "difference"];
 
-/// Memory that films take, and the page with them: about a byte a pixel.
+/// Returns the bytes of memory of the animations and of the page with them: about one byte per pixel.
 pub fn bytes(work: &Workload) -> u64 {
     let images = 3 * VIEWS as u64 * work.frames.min(FRAMES as u64);
     2 * images * work.pixels.min(MAX_PIXELS)
 }
 
-/// Films from where pictures of `shown` were taken; none of a scene of one frame.
+/// Makes the animations of the views of `shown`; none for a scene of one frame.
 ///
 /// # Errors
 /// A source that cannot be read.
@@ -109,9 +110,9 @@ pub fn films(side: &ModelPair, shown: &[ShownImage]) -> Result<Vec<FilmPanel>> {
     Ok(films)
 }
 
-/// A picture as a JPEG inside a URI.
+/// Returns an image as a JPEG inside a data URI.
 fn data_uri(image: &Image) -> Result<String> {
     let bytes = jpeg_bytes(image, QUALITY)
-        .map_err(|e: io::Error| Error::internal(format!("a picture cannot be shown: {e}")))?;
+        .map_err(|e: io::Error| Error::internal(format!("an image cannot be encoded: {e}")))?;
     Ok(format!("data:image/jpeg;base64,{}", STANDARD.encode(bytes)))
 }

@@ -1,8 +1,8 @@
-//! How the scores of what was kept, merged and dropped are spread.
+//! Histograms of the scores of kept, merged and dropped Gaussians.
 //!
-//! In: one value per Gaussian, and its fate. Out: counts per bin and fate. Bins are equal in ratio
-//! over the positive values, for scores span many powers of ten; those of parts of the frames are of equal width
-//! over all of their range. What is 0 is counted apart.
+//! In: one value per Gaussian, and its fate. Out: counts per bin and fate. Bins have equal ratios over the positive
+//! values, because scores span many powers of ten; bins of shares of the frames have equal width from 0 to 1. Zeros are
+//! counted separately.
 
 use std::borrow::Cow;
 
@@ -13,24 +13,24 @@ use crate::files::csv::table;
 use crate::model::{Rows, Statistic, StatisticAccess};
 use crate::statistics::score::{Quantity, Scores};
 
-/// Bins of a histogram.
+/// Maximum number of bins of a histogram.
 const BINS: usize = 40;
-/// Smallest value with a bin of its own, as a part of the largest.
+/// Smallest value with its own bin, as a share of the largest value.
 const DEEPEST: f64 = 1e-8;
 
 /// Counts by fate.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
 pub struct ByFate<T> {
-    /// Of those in the result as they were.
+    /// Value for Gaussians that survive as they were.
     pub kept: T,
-    /// Of those in a proxy.
+    /// Value for Gaussians merged into a proxy.
     pub merged: T,
-    /// Of those that are gone.
+    /// Value for removed Gaussians.
     pub dropped: T,
 }
 
 impl<T> ByFate<T> {
-    /// The one of a fate.
+    /// Returns the value of a fate.
     pub fn get_mut(&mut self, fate: Fate) -> &mut T {
         match fate {
             Fate::Kept => &mut self.kept,
@@ -40,25 +40,25 @@ impl<T> ByFate<T> {
     }
 }
 
-/// One score over all Gaussians.
+/// Histogram of one score over all Gaussians.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Histogram {
-    /// As scores call it.
+    /// Name of the score.
     pub name: &'static str,
-    /// What it measures, with the unit.
+    /// Meaning of the score, with the unit.
     pub meaning: &'static str,
-    /// Whether bins are equal in ratio; else they are of equal width from 0 to 1.
+    /// Whether bins have equal ratios; otherwise they have equal width from 0 to 1.
     pub log: bool,
-    /// One more than there are bins, increasing; empty if no value is positive.
+    /// Edges of the bins, increasing, one more than bins; empty if no value is positive.
     pub edges: Vec<f64>,
-    /// Counts per bin; of a bin its lower edge is in it, of the last both; the first also holds what is
-    /// positive and below.
+    /// Counts per bin. A bin includes its lower edge, the last bin both edges; the first bin also holds smaller
+    /// positive values.
     pub bins: ByFate<Vec<usize>>,
-    /// Values of 0 or below, or not finite.
+    /// Counts of values of 0 or below, or not finite.
     pub zero: ByFate<usize>,
 }
 
-/// The histograms of everything that was scored.
+/// Returns the histograms of every score and statistic.
 pub fn histograms(rows: &Rows, scores: &Scores, frames: usize, fates: &[Fate]) -> Vec<Histogram> {
     use Statistic::{C, D, Kappa, Life, V, Vis, W};
     let scores = [
@@ -76,7 +76,7 @@ pub fn histograms(rows: &Rows, scores: &Scores, frames: usize, fates: &[Fate]) -
     };
     let scores = scores.map(|(name, meaning, values)| (name, meaning, Cow::Borrowed(&values[..]), None));
     let all = scores.into_iter().chain([C, W, D, Kappa, V, Life, Vis].map(statistic));
-    // Without visible coverage there is no W.
+    // W exists only with visible coverage.
     all.filter(|(_, _, values, _)| values.len() == fates.len() && !fates.is_empty())
         .map(|(name, meaning, values, parts)| match parts {
             Some(frames) => Histogram::within(name, meaning, even(frames), &values, fates),
@@ -85,14 +85,14 @@ pub fn histograms(rows: &Rows, scores: &Scores, frames: usize, fates: &[Fate]) -
         .collect()
 }
 
-/// Edges from 0 to 1 for parts of `frames` frames: no bin is narrower than a frame.
+/// Returns edges from 0 to 1 for shares of `frames` frames. No bin is narrower than one frame.
 fn even(frames: usize) -> Vec<f64> {
     let bins = frames.clamp(1, BINS);
     (0..=bins).map(|k| k as f64 / bins as f64).collect()
 }
 
 impl Histogram {
-    /// Of `values`, one per fate, by powers of ten.
+    /// Counts `values`, one per fate, in bins of equal ratios.
     fn from_values(name: &'static str, meaning: &'static str, values: &[f64], fates: &[Fate]) -> Histogram {
         let positive = |v: &f64| *v > 0.0 && v.is_finite();
         let (mut low, high) = values
@@ -117,7 +117,7 @@ impl Histogram {
         Histogram { log: true, ..Histogram::within(name, meaning, edges, values, fates) }
     }
 
-    /// Of `values`, one per fate, between `edges`.
+    /// Counts `values`, one per fate, between `edges`.
     fn within(name: &'static str, meaning: &'static str, edges: Vec<f64>, values: &[f64], fates: &[Fate]) -> Histogram {
         let positive = |v: &f64| *v > 0.0 && v.is_finite();
         let bins = edges.len().saturating_sub(1);
@@ -135,7 +135,7 @@ impl Histogram {
                 *found.zero.get_mut(fate) += 1;
                 continue;
             }
-            // Not by the logarithm, whose rounding could put an edge into the bin below.
+            // Rounding of a logarithm could put an edge into the bin below.
             let bin = found.edges.partition_point(|edge| edge <= value).clamp(1, bins) - 1;
             found.bins.get_mut(fate)[bin] += 1;
         }
@@ -143,7 +143,7 @@ impl Histogram {
     }
 }
 
-/// One line per bin, and one for the zeros of each score.
+/// Returns one line per bin, and one for the zeros of each score.
 pub fn csv(histograms: &[Histogram]) -> String {
     let mut rows = Vec::new();
     for Histogram { name, edges, bins, zero, .. } in histograms {
@@ -196,7 +196,7 @@ mod tests {
     }
 
     #[test]
-    fn parts_of_the_frames_are_drawn_over_all_of_their_range() {
+    fn shares_of_the_frames_are_counted_from_0_to_1() {
         // 4 of 10 frames, 7 of 10, and twice all of them.
         let found = Histogram::within("life", "", even(10), &[0.4, 0.7, 1.0, 1.0, 0.0], &[Fate::Kept; 5]);
         assert_eq!((found.edges[0], found.edges[10], found.log), (0.0, 1.0, false));

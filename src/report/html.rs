@@ -1,9 +1,9 @@
-//! Words and numbers as a page shows them.
+//! Text and numbers in the form that a page shows.
 
 use crate::error::printable;
 
-/// Returns `text` with everything escaped that could end a text or an attribute in quotes, and unprintable characters
-/// (marks of direction among them) by their codes.
+/// Escapes characters that could end a text or a quoted attribute. Shows unprintable characters, among them marks of
+/// direction, by their codes.
 pub(super) fn escape(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
     for letter in printable(text).chars() {
@@ -19,13 +19,18 @@ pub(super) fn escape(text: &str) -> String {
     out
 }
 
-/// The last name of a path.
+/// Returns the last name of a path.
 pub(super) fn file_name(path: &str) -> &str {
     let name = path.trim_end_matches(['/', '\\']).rsplit(['/', '\\']).next().unwrap_or("");
     if name.is_empty() { path } else { name }
 }
 
-/// A number in at most four significant digits, without needless zeros: for ticks and bars.
+/// Returns decibels with two decimals.
+pub(super) fn db(value: f64) -> String {
+    format!("{value:.2} dB")
+}
+
+/// Returns a number in at most four significant digits, without needless zeros: for ticks and bars.
 pub(super) fn figure(value: f64) -> String {
     let size = value.abs();
     if value == 0.0 || !value.is_finite() {
@@ -42,7 +47,7 @@ pub(super) fn figure(value: f64) -> String {
     }
 }
 
-/// A whole number with its thousands apart.
+/// Returns a whole number with its thousands apart.
 pub(super) fn count(value: usize) -> String {
     let digits = value.to_string();
     let mut out = String::new();
@@ -55,7 +60,7 @@ pub(super) fn count(value: usize) -> String {
     out
 }
 
-/// Bytes in the decimal unit that suits them.
+/// Returns bytes in kB, MB or GB.
 pub(super) fn bytes(value: u64) -> String {
     let value = value as f64;
     match value {
@@ -66,7 +71,7 @@ pub(super) fn bytes(value: u64) -> String {
     }
 }
 
-/// `part` of `whole` in percent; of nothing all. A part too small for a digit is not called none.
+/// Returns `part` of `whole` in percent; 100% where `whole` is 0. A share below 0.1% is not rounded to 0.
 pub(super) fn percent(part: f64, whole: f64) -> String {
     let share = if whole > 0.0 { 100.0 * part / whole } else { 100.0 };
     match share {

@@ -1,21 +1,28 @@
-//! A page that a person opens: what compression did to a model, and what it cost.
+//! Report: one page that shows what compression did to a model, with the data behind it.
 //!
-//! Data in: two models, their cameras, and what `compress` left beside its result. Data out: a folder
-//! with `report.html`, which needs nothing but a browser, and everything it shows as JSON and CSV. Reads
-//! as a pipeline: `run` (what compress left), `traits` (which Gaussians are at risk), the evaluation with
-//! `failure` looking on, `histogram`, `shown` (pictures), `page` with `document`, `chart` and `html`.
+//! Data in: the original, one or more compressed models, their cameras, and the files that `compress` left beside its
+//! results. Data out: a folder with `report.html`, which needs nothing but a browser, and all its data as JSON and CSV.
+//! The steps are `run` (files of `compress`), `traits` (Gaussians at risk), the evaluation observed by `failure`,
+//! `histogram`, `shown` and `film` (images), and the page: `page` with `cards`, `compare`, `quality`, `details`.
 //!
-//! Memory: that of an evaluation and of scoring, one after the other, and the page.
+//! Memory: the memory of an evaluation and of scoring, one after the other, and the page.
 
+mod analysis;
+mod cards;
 pub mod chart;
+mod compare;
+mod details;
 mod document;
 pub mod failure;
+mod failure_section;
 pub mod film;
 mod findings;
 pub mod histogram;
 mod html;
 mod page;
 pub mod precision;
+mod quality;
+mod render_time;
 pub mod run;
 pub mod shown;
 mod tables;
@@ -43,58 +50,98 @@ use crate::pipeline::stages::measure::Measure;
 use crate::pruning::score::{SCORED_BYTES, Scored, UserOverrides};
 use crate::recipe::{NonFinite, Recipe};
 use crate::scene::Scene;
-pub use findings::ReportData;
+pub use findings::{ReportData, ResultData};
+pub use render_time::RenderTime;
 
+use analysis::Analysis;
 use failure::{FailureMode, KindMembers, judge, observe};
 use findings::Close;
 use histogram::histograms;
 use run::{Fate, RunFiles};
-use shown::{Choice, ShownImage, choices, show};
+use shown::{Choice, ShownImage, choices, scores_at, show};
 use traits::{GaussianKind, Traits, shares, traits};
 
-/// The page's name in the folder.
+/// File name of the page.
 pub const PAGE: &str = "report.html";
 
-/// What to report on.
+/// Options of [`report`].
 #[derive(Debug, Clone)]
 pub struct ReportOptions {
-    /// The models and the pictures to compare them on; its files to write are not looked at.
+    /// The original, the first result, and the renders to compare; its files to write are ignored.
     pub evaluate: EvaluateOptions,
-    /// What `sweep` wrote.
+    /// Further results of the same original.
+    pub more: Vec<PathBuf>,
+    /// Data of a sweep, written by `sweep`.
     pub sweep: Option<PathBuf>,
-    /// What `precision` wrote.
+    /// Data of work-precision diagrams, written by `precision`.
     pub precision: Option<PathBuf>,
+    /// Whether to measure the time of a render. Measured times differ from run to run.
+    pub render_time: bool,
     /// Folder to write.
     pub output: PathBuf,
-    /// Replace an earlier report.
+    /// Policy for an existing output.
     pub overwrite: Replace,
 }
 
-/// Compares two models and writes the report.
+/// Compares one or more results with their original and writes the report.
 ///
 /// # Errors
-/// Whatever is wrong with inputs, cameras, pictures, sweep or output. Nothing is left behind then.
+/// Invalid inputs, cameras, photographs, sweep or output. Nothing is written then.
 pub fn report(options: &ReportOptions) -> Result<Completion<ReportData>> {
     Completion::from_result(report_whole(options))
 }
 
-fn report_whole(options: &ReportOptions) -> Result<ReportData> {
+/// Writes the report of a whole run, without shards.
+///
+/// # Errors
+/// Those of [`report`].
+pub(crate) fn report_whole(options: &ReportOptions) -> Result<ReportData> {
     let mut inputs = options.evaluate.inputs();
+    inputs.extend(options.more.iter().map(PathBuf::as_path));
     inputs.extend(options.sweep.as_deref());
     inputs.extend(options.precision.as_deref());
     check_folder_name(&options.output, "report")?;
     check_target(&options.output, TargetKind::Folder, &inputs, options.overwrite)?;
+    if !options.more.is_empty() && options.evaluate.original.is_stream() {
+        return Err(Error::usage(
+            "several results: expected an original that can be read again, found standard input (-)",
+        ));
+    }
     let trade_off = options.sweep.as_deref().map(|path| read_found(path, "sweep")).transpose()?;
     let precision = options.precision.as_deref().map(|path| read_found(path, "precision")).transpose()?;
-    let mut side = ModelPair::open(&options.evaluate)?;
+    let mut results = vec![analyze(&options.evaluate, None, options.render_time)?];
+    for path in &options.more {
+        let evaluate = EvaluateOptions { compressed: path.clone(), ..options.evaluate.clone() };
+        let choices: Vec<Choice> = results[0].shown.iter().map(|shown| shown.choice.clone()).collect();
+        results.push(analyze(&evaluate, Some(&choices), options.render_time)?);
+    }
+    let page = page::page(&results, trade_off.as_ref(), precision.as_ref());
+    let mut results = results.into_iter();
+    let first = results.next().ok_or_else(|| Error::internal("a report without results"))?;
+    let report = ReportData {
+        tool: first.data.evaluation.tool.clone(),
+        result: first.data,
+        shown: first.shown.into_iter().map(|shown| shown.choice).collect(),
+        films: first.films,
+        trade_off,
+        precision,
+        others: results.map(|result| result.data).collect(),
+    };
+    write(options, &report, &page, &first.run)?;
+    Ok(report)
+}
+
+/// Compares the result of `options` with the original. Shows the renders of `wanted`; `None`: chooses them.
+fn analyze(options: &EvaluateOptions, wanted: Option<&[Choice]>, render_time: bool) -> Result<Analysis> {
+    let mut side = ModelPair::open(options)?;
     let info = side.scene.source().info();
     let (count, frames) = (info.count, info.times.len());
-    let run = RunFiles::beside(&options.evaluate.compressed, count, side.compressed_count());
+    let run = RunFiles::beside(&options.compressed, count, side.compressed_count());
     let mut notes = notes_on(&run, &side.scene)?;
 
     let recipe = recipe_to_score_with(&run)?;
     let measure = Measure::new(&recipe, side.scene.has_cameras, UserOverrides::default());
-    side.keep_to(options.evaluate.original.memory, |work, limits| {
+    side.keep_to(options.original.memory, |work, limits| {
         let mut needs = measure.needs(work, limits, MeasuredOnArrival::default());
         needs.push(traits::need(work));
         needs.extend(evaluation::needs(work, limits).into_iter().map(|mut need| {
@@ -108,7 +155,7 @@ fn report_whole(options: &ReportOptions) -> Result<ReportData> {
     let compared = if in_parts { Some(side.compare()?) } else { None };
     side.scene.schedule = scored_pictures(&side.scene, &run)?;
     if in_parts {
-        // What comes now follows from this too; the comparison is that of `evaluate`.
+        // The comparison above has the key of `evaluate`; the keys of later stages also depend on the recipe.
         side.scene.work.follow_from(CacheKey::new(&(&side.scene.schedule, &recipe)));
     }
     let scored = measure.measure(&side.scene, None, &mut Journal::default())?;
@@ -126,9 +173,11 @@ fn report_whole(options: &ReportOptions) -> Result<ReportData> {
     let names: Vec<(usize, u32)> = evaluation.pictures.iter().map(|picture| (picture.frame, picture.view)).collect();
     let failure_modes: Vec<FailureMode> =
         GaussianKind::ALL.iter().zip(members).map(|(&kind, members)| judge(kind, members, &seen, &names)).collect();
-    let choices = choices(&evaluation);
+    let choices = wanted.map_or_else(|| choices(&evaluation), |wanted| scores_at(&evaluation, wanted));
     let (shown, close) = show_again(&side, &choices, &failure_modes, &traits)?;
     let films = film::films(&side, &shown)?;
+    let places: Vec<usize> = choices.iter().map(|choice| choice.place).collect();
+    let render_time = render_time.then(|| render_time::measure(&side, &places)).transpose()?;
 
     notes.extend(evaluation.notes.iter().cloned());
     let work_notes = evaluation.work_notes.iter().cloned().chain(side.scene.work.take_notes()).collect();
@@ -136,54 +185,49 @@ fn report_whole(options: &ReportOptions) -> Result<ReportData> {
         Some(fates) => Some(histograms(&rows, &scored.scores(&recipe.score)?, frames, fates)),
         None => None,
     };
-    let report = ReportData {
-        tool: evaluation.tool.clone(),
+    let data = ResultData {
         verdict: verdict::verdict(&evaluation, &failure_modes),
         pictures: evaluation.pictures.clone(),
         evaluation: evaluation.without_folders(),
-        shown: choices,
-        films,
+        render_time,
         failure_modes,
         histograms,
         missing: run.missing.clone(),
         run: run.summary.as_ref().map(|(_, whole)| whole.clone()),
-        trade_off,
-        precision,
         notes,
         work_notes,
     };
-    write(options, &report, &page::page(&report, &run, &shown, &close), &run)?;
-    Ok(report)
+    Ok(Analysis { data, run, shown, films, close })
 }
 
-/// Maximum number of bytes of the data that another command wrote: a thousand runs take less than one million.
+/// Maximum number of bytes of data that another command wrote. A thousand runs take less than one million.
 const MAX_FOUND: u64 = 16 << 20;
 
-/// Reads the data that `verb` wrote.
-fn read_found<T: DeserializeOwned>(path: &Path, verb: &str) -> Result<T> {
+/// Reads the data that the command `command` wrote.
+fn read_found<T: DeserializeOwned>(path: &Path, command: &str) -> Result<T> {
     let text = read_text(path, MAX_FOUND)?;
     serde_json::from_str(&text).map_err(|error| {
-        let expected = format!("what `splatsieve {verb}` wrote");
+        let expected = format!("the data of `splatsieve {command}`");
         Error::input(path, format!("line {}", error.line()), expected, error.to_string())
-            .hint(format!("splatsieve {verb} ORIGINAL --cameras F -o FOLDER writes a {verb}.json"))
+            .hint(format!("splatsieve {command} ORIGINAL --cameras F -o FOLDER writes a {command}.json"))
     })
 }
 
-/// What beside the result does not fit these two models.
+/// Returns a note if the summary beside the result belongs to another original.
 fn notes_on(run: &RunFiles, scene: &Scene) -> Result<Vec<String>> {
     let Some((summary, _)) = &run.summary else { return Ok(Vec::new()) };
     let digest = scene.input.digest()?;
     Ok(match summary.input.digest == digest {
         true => Vec::new(),
         false => vec![format!(
-            "the summary beside the result is of an original with digest {}, this one has {digest}",
+            "the summary beside the result belongs to another original (digest {}, this one has {digest})",
             summary.input.digest
         )],
     })
 }
 
-/// The recipe of the result, else the usual one. The report looks at what is there: values that are not
-/// finite do not stop it.
+/// Returns the recipe beside the result, else the default one. Values that are not finite are kept, so that they do
+/// not stop the report.
 fn recipe_to_score_with(run: &RunFiles) -> Result<Recipe> {
     let mut recipe = match &run.recipe {
         Some(recipe) => recipe.clone(),
@@ -193,8 +237,8 @@ fn recipe_to_score_with(run: &RunFiles) -> Result<Recipe> {
     Ok(recipe)
 }
 
-/// The pictures that the run scored with: the split that has as many as its summary says, else those of
-/// training, else all.
+/// Returns the views that the run scored with: the split with as many views as its summary says, else the training
+/// views, else all.
 fn scored_pictures(scene: &Scene, run: &RunFiles) -> Result<ViewSchedule> {
     let times = &scene.source().info().times;
     let wanted = run.summary.as_ref().map(|(summary, _)| summary.cameras.pairs);
@@ -212,7 +256,8 @@ fn scored_pictures(scene: &Scene, run: &RunFiles) -> Result<ViewSchedule> {
     first.map_or_else(|| scene.rig.schedule(times, None), Ok)
 }
 
-/// A term whose percentiles are not those of the run: the scores shown are then not those that decided.
+/// Returns a note if the percentiles of a term differ from those of the run: the scores shown are then not the scores
+/// that decided.
 fn differing_terms(run: &RunFiles, scored: &Scored) -> Option<String> {
     // Numbers lose their last bit on the way through JSON.
     let same = |a: f64, b: f64| (a - b).abs() <= 1e-12 * a.abs().max(b.abs());
@@ -223,13 +268,13 @@ fn differing_terms(run: &RunFiles, scored: &Scored) -> Option<String> {
     };
     let then = summary.terms.iter().find(differs)?;
     Some(format!(
-        "the scores shown are computed anew and differ from those of the run: its 99th percentile of {} was {}; other \
-         cameras, another split or other frames",
+        "the scores shown are computed anew and differ from those of the run, whose 99th percentile of {} was {}: \
+         cameras, split or frames are not the same",
         then.name, then.p99
     ))
 }
 
-/// How many Gaussians of each kind there are, and what became of them.
+/// Counts the Gaussians of each kind by fate.
 fn members(rows: &Rows, traits: &[Traits], fates: Option<&[Fate]>) -> [KindMembers; 3] {
     let fate = |i: usize| fates.map_or(Fate::Kept, |fates| fates[i]);
     let shares = shares(rows, traits, |i| fate(i) != Fate::Kept);
@@ -243,7 +288,7 @@ fn members(rows: &Rows, traits: &[Traits], fates: Option<&[Fate]>) -> [KindMembe
     })
 }
 
-/// Makes the pictures of the page, and of the failure modes' worst ones the worst part.
+/// Renders the chosen views again, and the worst part of each failure mode's worst view.
 fn show_again(
     side: &ModelPair,
     choices: &[Choice],
@@ -267,29 +312,30 @@ fn show_again(
         Ok(())
     })?;
     made.into_iter().collect::<Result<()>>()?;
-    // As chosen: pictures come back by frame.
+    // In the order of the choices: renders come back by frame.
     shown.sort_by_key(|shown| choices.iter().position(|choice| choice.place == shown.choice.place));
     Ok((shown, close))
 }
 
+/// Writes the page and its data.
 fn write(options: &ReportOptions, report: &ReportData, page: &str, run: &RunFiles) -> Result<()> {
     let staged = StagedFolder::new(&options.output, options.overwrite)?;
     let mut json = serde_json::to_string_pretty(report).expect("a report is plain data");
     json.push('\n');
     let marker = serde_json::json!({
         "tool": report.tool,
-        "original": report.evaluation.path.original,
-        "compressed": report.evaluation.path.compressed,
-        "verdict": report.verdict,
+        "original": report.result.evaluation.path.original,
+        "compressed": report.result.evaluation.path.compressed,
+        "verdict": report.result.verdict,
     });
     let mut files = vec![
         (PAGE, page.to_owned()),
         ("report.json", json),
-        ("pictures.csv", report.evaluation.csv()),
-        ("failure_modes.csv", tables::failure_modes(&report.failure_modes)),
+        ("pictures.csv", report.result.evaluation.csv()),
+        ("failure_modes.csv", tables::failure_modes(&report.result.failure_modes)),
         (MARKER, format!("{marker:#}\n")),
     ];
-    files.extend(report.histograms.as_ref().map(|of| ("histograms.csv", histogram::csv(of))));
+    files.extend(report.result.histograms.as_ref().map(|of| ("histograms.csv", histogram::csv(of))));
     files.extend(run.summary.as_ref().map(|(of, _)| ("stages.csv", tables::stages(&of.stages))));
     files.extend(report.trade_off.as_ref().map(|of| ("trade_off.csv", of.csv())));
     let turned = report.trade_off.as_ref().filter(|of| !of.knobs.is_empty());

@@ -1,7 +1,7 @@
-//! Work-precision diagrams as a page: error against time and memory, a curve for every way to turn a knob, a mark for every
+//! Work-precision diagrams as a page: error against time and memory, a curve for every parameter, a mark for every
 //! value.
 //!
-//! Data in: a [`PrecisionDiagram`]. Data out: charts as SVG, and a page with them.
+//! Data in: a [`PrecisionDiagram`]. Data out: charts as SVG, and a page with charts.
 
 use super::chart::{ChartAxis, Plot, Series};
 use super::document::{document, figure_of, links, list};
@@ -11,20 +11,20 @@ use crate::evaluation::precision::{
     ADDED, KEPT, PICTURES, PrecisionCurve, PrecisionDiagram, PrecisionKnob, PrecisionSetting, STAYING, meaning,
 };
 
-/// The page's name in the folder of its data.
+/// File name of the page in the folder of its data.
 pub const PAGE: &str = "precision.html";
 
-/// A measure of work: what it is called, and where it is found.
+/// Measure of work: its name, and the function that returns it.
 type WorkMeasure = (&'static str, fn(&PrecisionSetting) -> Option<f64>);
 
-/// What is drawn along the bottom.
+/// Measures along the horizontal axis.
 const WORK: [WorkMeasure; 3] = [
     ("time of all processors, s", |mark| mark.cost.processor_seconds.map(|seconds| seconds.median)),
-    ("time on the wall, s", |mark| Some(mark.cost.seconds.median)),
+    ("wall time, s", |mark| Some(mark.cost.seconds.median)),
     ("peak memory, MiB", |mark| mark.cost.peak_memory_bytes.map(|bytes| bytes as f64 / f64::from(1 << 20))),
 ];
 
-/// The page, to lie beside its data.
+/// Returns the page.
 pub fn page(found: &PrecisionDiagram) -> String {
     let title = format!("{} – error against run time", file_name(&found.path));
     let mut body = format!(
@@ -48,7 +48,7 @@ pub fn page(found: &PrecisionDiagram) -> String {
     document(&title, &body, &[])
 }
 
-/// All of it as a part of another page.
+/// Returns the diagrams as a section of a report.
 pub(super) fn section(found: &PrecisionDiagram) -> String {
     let knob = |knob: &PrecisionKnob| {
         format!("<h3>{}</h3>\n{}", escape(&format!("{} ({} error)", knob.name, knob.source.name())), turned(knob))
@@ -56,10 +56,10 @@ pub(super) fn section(found: &PrecisionDiagram) -> String {
     conditions(found) + &found.knobs.iter().map(knob).collect::<String>()
 }
 
-/// What all of it was measured on, and the notes.
+/// Returns the conditions of the measurement, and the notes.
 fn conditions(found: &PrecisionDiagram) -> String {
     let said = format!(
-        "<p class=\"note\">{} Gaussians × {} frames; {} pictures of {} frames looked at, judged by {}: {}. Every setting \
+        "<p class=\"note\">{} Gaussians × {} frames; {} renders of {} frames scanned, judged by {}: {}. Every setting \
          keeps {} Gaussians. {} threads; medians of up to {} runs, fewer where they took {} s.</p>\n",
         count(found.gaussians),
         count(found.frames),
@@ -75,7 +75,7 @@ fn conditions(found: &PrecisionDiagram) -> String {
     said + &list(&found.notes)
 }
 
-/// What turning a knob showed.
+/// Returns the charts and tables of one parameter.
 fn turned(knob: &PrecisionKnob) -> String {
     let mut out = format!("<p>{}</p>\n<div class=\"charts\">\n", escape(&knob.about));
     for (caption, svg) in charts(knob) {
@@ -88,12 +88,12 @@ fn turned(knob: &PrecisionKnob) -> String {
     out
 }
 
-/// Charts of a knob: its errors against the time of all processors, and the first one of them against the wall and memory
-/// too. What is 0 throughout has none.
+/// Returns the charts of one parameter: its errors against the time of all processors, and the first error also against
+/// wall time and memory. An error that is always 0 has no chart.
 pub fn charts(knob: &PrecisionKnob) -> Vec<Chart> {
     let mut errors: Vec<&String> =
         knob.curves.iter().flat_map(|curve| &curve.marks).flat_map(|m| m.errors.keys()).collect();
-    // What pictures say comes first.
+    // Errors of renders come first.
     errors
         .sort_by_key(|error| ([ADDED, PICTURES, KEPT, STAYING].iter().position(|of| of == error).unwrap_or(4), *error));
     errors.dedup();
@@ -106,7 +106,7 @@ pub fn charts(knob: &PrecisionKnob) -> Vec<Chart> {
     charts
 }
 
-/// An error against work, both as ratios.
+/// Returns the chart of an error against work, both on logarithmic axes.
 fn chart(knob: &PrecisionKnob, error: &str, (work, at): WorkMeasure) -> Chart {
     let series = knob.curves.iter().map(|curve| {
         let marks: Vec<(&PrecisionSetting, f64, f64)> =
@@ -125,20 +125,21 @@ fn chart(knob: &PrecisionKnob, error: &str, (work, at): WorkMeasure) -> Chart {
     (title, plot.svg())
 }
 
-/// A mark's value; the recipe's own with a star.
+/// Returns the label of a mark: its value, with a star if it is the recipe's.
 fn label(curve: &PrecisionCurve, mark: &PrecisionSetting) -> String {
     let own = if curve.own == Some(mark.value) { "*" } else { "" };
     format!("{}{own}", figure(mark.value))
 }
 
-/// Every mark with all its numbers.
+/// Returns a table of all marks with all their numbers.
 fn table(curve: &PrecisionCurve) -> String {
     let mut errors: Vec<&String> = curve.marks.iter().flat_map(|mark| mark.errors.keys()).collect();
     errors.sort_unstable();
     errors.dedup();
     let names: String = errors.iter().map(|error| format!("<th>{}</th>", escape(error))).collect();
     let mut out = format!(
-        "<details><summary>{}, against {}</summary>\n<table><tr><th>{}</th><th>s</th><th>from – to</th><th>processor s</th>\
+        "<details><summary>{}, against {}</summary>\n<div class=\"scroll\" tabindex=\"0\" role=\"region\" \
+         aria-label=\"StatisticAccess\"><table><tr><th>{}</th><th>s</th><th>from – to</th><th>processor s</th>\
          <th>MiB</th><th>dB</th>{names}</tr>\n",
         escape(&curve.name),
         escape(&curve.against),
@@ -160,7 +161,7 @@ fn table(curve: &PrecisionCurve) -> String {
         let cells: String = cells.into_iter().chain(errors).map(|cell| format!("<td>{cell}</td>")).collect();
         out += &format!("<tr>{cells}</tr>\n");
     }
-    out += "</table>\n";
+    out += "</table></div>\n";
     let mut said: Vec<String> = curve
         .orders
         .iter()
@@ -210,7 +211,7 @@ mod tests {
             [
                 "look: error added / error of the model, by time of all processors",
                 "look: relative L2 error of C, by time of all processors",
-                "look: error added / error of the model, by time on the wall",
+                "look: error added / error of the model, by wall time",
                 "look: error added / error of the model, by peak memory",
             ]
         );

@@ -1,7 +1,7 @@
-//! What `compress` left beside its result: the summary, the recipe, the index map.
+//! Files that `compress` writes beside its result: the summary, the recipe, the index map.
 //!
-//! In: the path of the result. Out: as much of the three as is there and fits the models; for the rest
-//! the reason, for the page to give. Memory: 8 bytes per Gaussian.
+//! In: the path of the result. Out: the files that exist and fit the models; for each other file the reason, which the
+//! page tells. Memory: 8 bytes per Gaussian.
 
 use std::io::{BufRead, BufReader};
 use std::path::Path;
@@ -18,34 +18,34 @@ use crate::pipeline::stages::write::{INDEX_MAP, RECIPE, beside};
 use crate::pipeline::summary::Summary;
 use crate::recipe::Recipe;
 
-/// What became of a Gaussian of the original.
+/// Fate of a Gaussian of the original.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Fate {
-    /// It is in the result as it was.
+    /// Survives as it was.
     Kept,
-    /// It went into a proxy with others.
+    /// Merged with others into a proxy.
     Merged,
-    /// It is gone.
+    /// Removed.
     Dropped,
 }
 
-/// What was found beside a result.
+/// Files found beside a result.
 #[derive(Debug, Default)]
 pub struct RunFiles {
-    /// The summary, and all of it as it stands in its file.
+    /// The summary, and the whole content of its file.
     pub summary: Option<(Summary, Value)>,
-    /// The parameters.
+    /// The recipe.
     pub recipe: Option<Recipe>,
-    /// What became of every Gaussian of the original.
+    /// Fate of every Gaussian of the original.
     pub fates: Option<Vec<Fate>>,
-    /// For each of the three that is missing the reason.
+    /// Reason for each missing file.
     pub missing: Vec<String>,
 }
 
 impl RunFiles {
-    /// Looks beside `result`, made of `original` Gaussians into `compressed`.
+    /// Reads the files beside `result`, which has `compressed` Gaussians made of `original` ones.
     ///
-    /// A file that is absent or does not fit is no failure: any two models can be compared.
+    /// A file that is absent or does not fit is no error: any two models can be compared.
     pub fn beside(result: &Path, original: usize, compressed: usize) -> RunFiles {
         let is_folder = result.is_dir();
         let mut run = RunFiles::default();
@@ -67,8 +67,9 @@ impl RunFiles {
     }
 }
 
-/// Maximum number of bytes of a summary and of a recipe.
+/// Maximum number of bytes of a summary.
 const MAX_SUMMARY: u64 = 16 << 20;
+/// Maximum number of bytes of a recipe.
 const MAX_RECIPE: u64 = 1 << 20;
 
 fn read_summary(path: &Path) -> Result<(Summary, Value), String> {
@@ -91,7 +92,7 @@ fn read_fates(path: &Path, original: usize, compressed: usize) -> Result<Vec<Fat
         return Err("expected a NumPy array, found a header that no array of numbers has".to_owned());
     }
     let array = npyz::NpyFile::new(file).map_err(|e| e.to_string())?;
-    // Before anything is allocated by a length that the file claims.
+    // The shape is checked before memory is allocated for it.
     if array.shape() != [original as u64] {
         return Err(format!("expected an array of the original's {original} Gaussians, found {:?}", array.shape()));
     }
@@ -99,7 +100,7 @@ fn read_fates(path: &Path, original: usize, compressed: usize) -> Result<Vec<Fat
     fates(&map, compressed)
 }
 
-/// From an index map into a result of `compressed` Gaussians: shared places are merged ones.
+/// Returns the fates by an index map into a result of `compressed` Gaussians. Gaussians that share a place were merged.
 fn fates(map: &[i64], compressed: usize) -> Result<Vec<Fate>, String> {
     let mut sharers = vec![0u32; compressed];
     for (id, &place) in map.iter().enumerate().filter(|(_, place)| **place != -1) {

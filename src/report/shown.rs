@@ -1,7 +1,7 @@
-//! Pictures in the page: which ones, what of them, and as what.
+//! Choice of the renders that the page shows, and their images.
 //!
-//! In: the scores of all pictures, then the chosen ones again. Out: PNG files as data URIs. A page holds
-//! at most [`CHOSEN`] of at most [`MAX_PIXELS`] pixels, three or four images of each: 5 MB at the most.
+//! In: the scores of all renders, then the chosen renders again. Out: PNG files as data URIs. A page holds at most
+//! [`CHOSEN`] renders of at most [`MAX_PIXELS`] pixels, with three or four images of each: at most 5 MB per result.
 
 use std::io;
 
@@ -15,21 +15,23 @@ use crate::evaluation::found::{Evaluation, ImageScore};
 use crate::files::image::write::{ImageFormat, image_bytes};
 use crate::render::Image;
 
-/// Pictures to look at: the worst, that of the worst view, of the worst frame, and the median.
+/// Maximum number of chosen renders: the worst one, the worst of the worst view, the worst of the worst frame, and the
+/// median one.
 pub const CHOSEN: usize = 4;
-/// A picture of more pixels is shown smaller. Trained scenes take about 2 bytes a pixel in base64.
+/// Maximum number of pixels of an image; larger renders are shown smaller. Trained scenes take about 2 bytes per pixel
+/// in base64.
 pub const MAX_PIXELS: u64 = 160_000;
-/// Differences are made brighter until this part of their values is still not clipped.
+/// Least share of the values of a difference that its brightening does not clip.
 const UNCLIPPED: f64 = 0.999;
-/// The most that differences are made brighter: one step of 255 is then a quarter of the range.
+/// Maximum brightening of differences: one step of 255 is then a quarter of the range.
 const MAX_FACTOR: u32 = 64;
 
-/// A picture chosen to be looked at.
+/// A render that the page shows.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Choice {
-    /// Why: "worst picture", "median picture", ...
+    /// Reasons of the choice: "worst picture", "median picture", ...
     pub why: Vec<String>,
-    /// Index into the evaluation's pictures.
+    /// Index into the evaluation's renders.
     #[serde(skip)]
     pub place: usize,
     /// Frame of the sequence.
@@ -38,14 +40,14 @@ pub struct Choice {
     pub view: u32,
     /// PSNR of compressed against original, dB.
     pub psnr: f64,
-    /// SSIM of the same.
+    /// SSIM of compressed against original.
     pub ssim: f64,
-    /// FLIP of the same, where it was computed.
+    /// FLIP of compressed against original, where it was computed.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub flip: Option<f64>,
 }
 
-/// The pictures worth looking at, the worst first; one that is several of them comes once.
+/// Chooses the renders to show, the worst first. A render with several reasons comes once.
 pub fn choices(found: &Evaluation) -> Vec<Choice> {
     let pictures = &found.pictures;
     let lowest = |places: &mut dyn Iterator<Item = usize>| -> Option<usize> {
@@ -77,25 +79,34 @@ pub fn choices(found: &Evaluation) -> Vec<Choice> {
     chosen
 }
 
-/// A chosen picture, ready for the page.
+/// Returns the renders of `choices`, made for another result of the same original, with the scores of `found`.
+pub fn scores_at(found: &Evaluation, choices: &[Choice]) -> Vec<Choice> {
+    let scored = |choice: &Choice| {
+        let ImageScore { psnr, ssim, flip, .. } = found.pictures[choice.place].loss;
+        Choice { psnr, ssim, flip, ..choice.clone() }
+    };
+    choices.iter().map(scored).collect()
+}
+
+/// Images of a chosen render.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ShownImage {
-    /// Which it is.
+    /// The render.
     pub choice: Choice,
-    /// What it shows and its data URI: original, compressed, difference and, if there is one, photograph.
+    /// Names and data URIs of the images: original, compressed, difference and, if there is one, photograph.
     pub images: Vec<(&'static str, String)>,
     /// Pixels across and down, as shown.
     pub size: (u32, u32),
-    /// Pixels of the picture, each way, that one shown pixel stands for.
+    /// Pixels of the render, each way, that one shown pixel stands for.
     pub shrunk: u32,
-    /// By how much the difference was made brighter.
+    /// Factor by which the difference was made brighter.
     pub factor: u32,
 }
 
-/// Prepares a chosen picture.
+/// Makes the images of a chosen render.
 ///
 /// # Errors
-/// A picture without pixels, which PNG does not know.
+/// A render without pixels, which PNG does not support.
 pub fn show(choice: &Choice, taken: &RenderedViews) -> Result<ShownImage> {
     let shrunk = shrinkage(&taken.original, MAX_PIXELS);
     let difference = difference(&taken.compressed, &taken.original);
@@ -116,29 +127,29 @@ pub fn show(choice: &Choice, taken: &RenderedViews) -> Result<ShownImage> {
     Ok(ShownImage { choice: choice.clone(), images, size, shrunk, factor })
 }
 
-/// A picture as a PNG inside a URI.
+/// Returns an image as a PNG inside a data URI.
 ///
 /// # Errors
-/// A picture without pixels.
+/// An image without pixels.
 pub fn data_uri(image: &Image) -> Result<String> {
     let bytes = image_bytes(image, ImageFormat::Png)
-        .map_err(|e: io::Error| Error::internal(format!("a picture cannot be shown: {e}")))?;
+        .map_err(|e: io::Error| Error::internal(format!("an image cannot be encoded: {e}")))?;
     Ok(format!("data:image/png;base64,{}", STANDARD.encode(bytes)))
 }
 
-/// |a − b| of what a screen shows, per channel.
+/// Returns |a − b| per channel, of values clamped to [0, 1].
 pub(super) fn difference(a: &Image, b: &Image) -> Image {
     let shown = |v: f32| v.clamp(0.0, 1.0);
     let data = a.data.iter().zip(&b.data).map(|(&a, &b)| (shown(a) - shown(b)).abs()).collect();
     Image { width: a.width, height: a.height, data }
 }
 
-/// All of it `factor` times as bright.
+/// Returns the image `factor` times as bright.
 pub(super) fn brighter(image: &Image, factor: u32) -> Image {
     Image { data: image.data.iter().map(|v| v * factor as f32).collect(), ..*image }
 }
 
-/// The largest power of two, up to [`MAX_FACTOR`], that clips no more than it may.
+/// Returns the largest power of two, up to [`MAX_FACTOR`], that clips at most 1 − [`UNCLIPPED`] of the values.
 fn brightening(difference: &Image) -> u32 {
     let mut values = difference.data.clone();
     if values.is_empty() {
@@ -153,13 +164,13 @@ fn brightening(difference: &Image) -> u32 {
     factor
 }
 
-/// Pixels each way that become one, so that at most `most` are left.
+/// Returns the number of pixels each way that become one, so that at most `most` pixels are left.
 pub(super) fn shrinkage(image: &Image, most: u64) -> u32 {
     let pixels = |by: u32| u64::from(image.width.div_ceil(by)) * u64::from(image.height.div_ceil(by));
     (1..).find(|&by| pixels(by) <= most).unwrap_or(1)
 }
 
-/// Means over squares of `by` pixels, those at the far borders perhaps smaller.
+/// Averages squares of `by` pixels each way; squares at the far borders may be smaller.
 pub(super) fn shrink(image: &Image, by: u32) -> Image {
     if by == 1 {
         return image.clone();

@@ -1,10 +1,10 @@
-//! The page's tables as CSV.
+//! Tables of the page as CSV.
 
 use super::failure::FailureMode;
 use crate::files::csv::{known, table};
 use crate::journal::records::StageRecord;
 
-/// One line per failure mode.
+/// Returns one line per failure mode.
 pub(super) fn failure_modes(modes: &[FailureMode]) -> String {
     let names = [
         "failure_mode",
@@ -43,7 +43,7 @@ pub(super) fn failure_modes(modes: &[FailureMode]) -> String {
     table(&names, modes.iter().map(row))
 }
 
-/// One line per stage of the run.
+/// Returns one line per stage of the run.
 pub(super) fn stages(stages: &[StageRecord]) -> String {
     let row = |of: &StageRecord| {
         vec![

@@ -1,6 +1,7 @@
-//! The curves of a sweep: what quality costs in Gaussians, bytes, time and memory, and what more time buys.
+//! Curves of a sweep: quality against Gaussians, bytes, time and memory.
 //!
-//! Data in: a [`TradeOff`]. Data out: charts as SVG, which need [`super::chart::STYLE`] around them, and pages with them.
+//! Data in: a [`TradeOff`]. Data out: charts as SVG, whose colors come from [`super::chart::STYLE`], and pages with
+//! charts.
 
 use super::chart::{ChartAxis, Plot, Series};
 use super::document::{document, figure_of, links, list};
@@ -9,16 +10,16 @@ use crate::evaluation::method::Method;
 use crate::evaluation::trade_off::{EffortCurve, TradeOff, TradeOffPoint};
 use crate::pipeline::summary::GoalSummary;
 
-/// The page's name in the folder of a sweep.
+/// File name of the page in the folder of a sweep.
 pub const PAGE: &str = "sweep.html";
 
-/// What a chart is about, and its SVG.
+/// Title of a chart, and its SVG.
 pub type Chart = (String, String);
 
-/// A coordinate of a point, if it is known.
+/// Function that returns a coordinate of a point, if it is known.
 type Value<'a> = &'a dyn Fn(&TradeOffPoint) -> Option<f64>;
 
-/// The page of a sweep, to lie beside its data.
+/// Returns the page of a sweep.
 pub fn page(found: &TradeOff) -> String {
     let mut files = vec!["sweep.json", "sweep.csv"];
     files.extend((!found.knobs.is_empty()).then_some("knobs.csv"));
@@ -33,13 +34,13 @@ pub fn page(found: &TradeOff) -> String {
     document(&format!("{} – what quality costs", file_name(&found.path)), &body, &[])
 }
 
-/// What was swept, the charts and the notes.
+/// Returns a description of the sweep, the charts and the notes.
 pub(super) fn section(found: &TradeOff) -> String {
     let runs = if found.runs > 1 { format!("; times are medians of {} runs", found.runs) } else { String::new() };
     let paired = curves(found).iter().any(|curve| curve.paired);
-    let pair = if paired { " Hollow, in the same colour: the same method without refining." } else { "" };
+    let pair = if paired { " Hollow, in the same color: the same method without refinement." } else { "" };
     let mut out = format!(
-        "<p class=\"note\">{}: {} Gaussians, {}; {} pictures, {} threads{runs}. Lines go from few Gaussians to \
+        "<p class=\"note\">{}: {} Gaussians, {}; {} renders, {} threads{runs}. Lines go from few Gaussians to \
          many.{pair}</p>\n<div class=\"charts\">\n",
         escape(&found.path),
         count(found.gaussians),
@@ -53,7 +54,7 @@ pub(super) fn section(found: &TradeOff) -> String {
     out + "</div>\n" + &list(&found.notes)
 }
 
-/// The sizes that a run tried to find the one that was asked for by its quality, and what each has.
+/// Returns a chart of the sizes that a search for a quality tried, with the quality of each.
 pub(super) fn search(goal: &GoalSummary) -> String {
     let mut tried: Vec<(f64, f64)> = goal.tried.iter().map(|&(size, quality)| (size as f64, quality)).collect();
     tried.sort_by(|a, b| a.0.total_cmp(&b.0));
@@ -73,7 +74,7 @@ pub(super) fn search(goal: &GoalSummary) -> String {
     format!("<div class=\"charts\">\n{}</div>\n", figure_of(&title, &plot.svg()))
 }
 
-/// Every curve of a sweep, a series per method in the order of its points, and every knob.
+/// Returns all charts of a sweep: a series per method in the order of its points, and a chart per varied parameter.
 pub fn charts(found: &TradeOff) -> Vec<Chart> {
     let curves = curves(found);
     let kept = |point: &TradeOffPoint| Some(100.0 * found.fraction(point));
@@ -105,7 +106,8 @@ pub fn charts(found: &TradeOff) -> Vec<Chart> {
     charts
 }
 
-/// Error against run time as a parameter is turned, beside the same method without refining at that size.
+/// Returns the chart of error against run time for the values of one parameter, beside the same method without
+/// refinement at that size.
 fn turned(knob: &EffortCurve, found: &TradeOff) -> Chart {
     let at = |point: &TradeOffPoint| (point.seconds, error(point));
     let first = knob.settings.first().map(|setting| &setting.point);
@@ -133,10 +135,10 @@ fn turned(knob: &EffortCurve, found: &TradeOff) -> Chart {
     (title.clone(), Plot { title, x, y, series }.svg())
 }
 
-/// Label of an axis of [`error`].
+/// Label of the axis of [`error`].
 const ERROR: &str = "root mean square error";
 
-/// Of colors from 0 to 1, as the mean PSNR has it.
+/// Returns the root mean square error of colors from 0 to 1 that corresponds to the mean PSNR.
 fn error(point: &TradeOffPoint) -> f64 {
     10f64.powf(-point.psnr / 20.0)
 }
@@ -149,16 +151,16 @@ fn log(label: &str) -> ChartAxis {
     ChartAxis { label: label.to_owned(), log: true, from_zero: false }
 }
 
-/// The points of a method.
+/// Points of a method.
 struct MethodCurve<'a> {
     name: &'a str,
-    /// By count, rising.
+    /// Points by increasing count.
     points: Vec<&'a TradeOffPoint>,
-    /// Whether it is what the method before it refines.
+    /// Whether the method before it is the same with refinement.
     paired: bool,
 }
 
-/// Methods as they come, behind one that is there with and without refining: that pair has the solid look.
+/// Groups the points by method. A method that occurs with and without refinement comes first, as a pair.
 fn curves(found: &TradeOff) -> Vec<MethodCurve<'_>> {
     let mut curves: Vec<MethodCurve<'_>> = Vec::new();
     for point in &found.points {
@@ -173,7 +175,7 @@ fn curves(found: &TradeOff) -> Vec<MethodCurve<'_>> {
         if pair.iter().all(|&name| curves.iter().any(|curve| curve.name == name)) {
             let place =
                 |curve: &MethodCurve<'_>| pair.iter().position(|&name| name == curve.name).unwrap_or(pair.len());
-            // Stable: the others stay in their order.
+            // The sort is stable, so the others stay in their order.
             curves.sort_by_key(place);
             curves[1].paired = true;
         }

@@ -1,9 +1,9 @@
-//! Which Gaussians of the original are of the kinds that compression is known to hurt.
+//! Kinds of Gaussian that compression is known to hurt.
 //!
-//! In: the original's frames and its rows of statistics. Out: for every Gaussian a [`Traits`] set.
-//! The kinds are the failure cases of "Temporally-Aware Pruning for Compact 4D Gaussian Splatting
-//! Models", section 4.5; the paper gives no measures for them, those here are this project's.
-//! Memory: where colors vary one frame of them and 88 bytes per Gaussian; per fast one at most 190.
+//! In: the original's frames and statistics. Out: a set of [`Traits`] for every Gaussian. The kinds are the failure
+//! cases of "Temporally-Aware Pruning for Compact 4D Gaussian Splatting Models", section 4.5. The paper gives no
+//! thresholds; the thresholds here are this project's.
+//! Memory: where colors vary, one frame of colors and 88 bytes per Gaussian; at most 190 bytes per fast Gaussian.
 
 use rayon::prelude::*;
 
@@ -17,28 +17,28 @@ use crate::passes::{FrameReaders, gather};
 use crate::pruning::score::{SCORED_BYTES, Scored};
 use crate::source::{BlockReader, FrameSource, Ids, ReadPlan};
 
-/// D from which a Gaussian is fast: this part of the scene extent per frame. On a picture as wide as the
-/// scene and 500 pixels across, a pixel per frame.
+/// Least D of a fast Gaussian, as a share of the scene extent per frame: one pixel per frame in a render that is as
+/// wide as the scene and has 500 pixels across.
 pub const FAST: f64 = 2e-3;
-/// Root mean square change of the distance to half of its neighbors, as part of that distance, from which
-/// motion is not rigid.
+/// Least relative change of distance of non-rigid motion: the root mean square over time, for half of the neighbors.
 pub const NON_RIGID: f64 = 0.05;
-/// Distances below this part of the extent count as it: nobody sees neighbors so near change places.
+/// Least distance in relative changes, as a share of the extent: closer neighbors may change places invisibly.
 const NEAREST: f64 = 1e-3;
-/// Neighbors whose distance is followed.
-pub const NEIGHBOURS: usize = 8;
-/// Longest over second scale from which a Gaussian is thin.
+/// Number of neighbors whose distance is followed.
+pub const NEIGHBORS: usize = 8;
+/// Least ratio of the longest to the second scale of a thin Gaussian.
 pub const THIN: f64 = 5.0;
-/// D up to which a Gaussian stands still, as part of the extent per frame.
+/// Largest D of a still Gaussian, as a share of the extent per frame.
 pub const STILL: f64 = 5e-4;
-/// Standard deviation over its life of a still Gaussian's opacity from which its appearance changes.
+/// Least standard deviation of the opacity over the life span for a change of appearance.
 pub const OPACITY_CHANGE: f64 = 0.05;
-/// The same of its base color, root mean square over the channels: five of 255 steps.
-pub const COLOUR_CHANGE: f64 = 0.02;
-/// Frames at which distances and colors are sampled, evenly.
+/// Least standard deviation of the base color over the life span for a change of appearance, root mean square over the
+/// channels: five of 255 steps.
+pub const COLOR_CHANGE: f64 = 0.02;
+/// Maximum number of frames at which distances and colors are sampled, evenly.
 pub const SAMPLES: usize = 24;
 
-/// Kinds of Gaussian.
+/// Kind of Gaussian.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum GaussianKind {
     /// Fast, and moving otherwise than its neighbors.
@@ -50,17 +50,17 @@ pub enum GaussianKind {
 }
 
 impl GaussianKind {
-    /// Every kind, in the paper's order; a kind's place here is that of its numbers everywhere.
+    /// Every kind, in the paper's order. Arrays by kind have this order.
     pub const ALL: [GaussianKind; 3] = [GaussianKind::Motion, GaussianKind::Thin, GaussianKind::Appearance];
 }
 
-/// Memory that finding [`traits`] takes.
+/// Estimates the resources of [`traits`].
 pub fn need(work: &Workload) -> ResourceEstimate {
     let per_gaussian = vec![
         ("rows", SCORED_BYTES),
         ("states", work.state(Attributes::POSITION | Attributes::LOG_SCALE)),
-        ("colours", 88 + work.state(Attributes::SH | Attributes::OPACITY)),
-        ("neighbours", 190),
+        ("colors", 88 + work.state(Attributes::SH | Attributes::OPACITY)),
+        ("neighbors", 190),
         ("readers", work.input.reader),
         ("held", work.held(&Limits::NONE, Attributes::SH | Attributes::OPACITY)),
     ];
@@ -70,10 +70,10 @@ pub fn need(work: &Workload) -> ResourceEstimate {
     ResourceEstimate { stage: "traits", reads, seconds, per_gaussian, fixed: vec![work.arriving()] }
 }
 
-/// The kinds one Gaussian is of, by [`GaussianKind::ALL`].
+/// Membership of one Gaussian in each kind, in the order of [`GaussianKind::ALL`].
 pub type Traits = [bool; 3];
 
-/// The traits of every Gaussian that is ever visible; of the others none.
+/// Finds the traits of every Gaussian. Gaussians that are never visible have none.
 ///
 /// # Errors
 /// Frames that cannot be read.
@@ -96,14 +96,14 @@ pub fn traits(source: &dyn FrameSource, scored: &Scored, alpha_min: f64) -> Resu
     for i in (0..rows.len()).filter(|&i| visible(i)) {
         found[i][GaussianKind::Thin as usize] = is_thin(reference.log_scale.row(i));
         found[i][GaussianKind::Appearance as usize] = rows.d[i] <= STILL * extent
-            && (rows.v[i].sqrt() >= OPACITY_CHANGE || recolored.get(i).is_some_and(|&c| c >= COLOUR_CHANGE));
+            && (rows.v[i].sqrt() >= OPACITY_CHANGE || recolored.get(i).is_some_and(|&c| c >= COLOR_CHANGE));
     }
     Ok(found)
 }
 
-/// Part of the coverage that Gaussians of each kind have, and of that the part whose fate `is_lost` says.
+/// Returns for each kind its share of the coverage, and the share of that coverage for which `is_lost` is true.
 pub fn shares(rows: &Rows, traits: &[Traits], is_lost: impl Fn(usize) -> bool) -> [(f64, f64); 3] {
-    // An empty sum is −0, which would be shown.
+    // `sum` of nothing is −0, which would be displayed.
     let total: f64 = rows.c.iter().fold(0.0, |sum, c| sum + c);
     std::array::from_fn(|kind| {
         let of = |wanted: &dyn Fn(usize) -> bool| -> f64 {
@@ -120,16 +120,16 @@ fn is_thin(mut log_scale: [f32; 3]) -> bool {
     f64::from(log_scale[2]) - f64::from(log_scale[1]) >= THIN.ln()
 }
 
-/// At most [`SAMPLES`] of `frames` frames, evenly from first to last.
+/// Returns at most [`SAMPLES`] of `frames` frames, evenly from first to last.
 fn samples(frames: usize) -> Vec<usize> {
     let count = frames.min(SAMPLES);
     (0..count).map(|k| if count < 2 { 0 } else { k * (frames - 1) / (count - 1) }).collect()
 }
 
-/// How much the surroundings of the Gaussians `ids` change shape: for each the lower median, over its
-/// nearest visible neighbors at the reference frame, of the root mean square change of distance as part
-/// of that distance (of `nearest`, if that is more). A rigid motion, rotations included, changes none; the
-/// median leaves out neighbors that belong to another thing.
+/// Measures the non-rigid motion around the Gaussians `ids`. Returns for each the lower median, over its nearest
+/// visible neighbors at the reference frame, of the root mean square change of distance relative to that distance (or
+/// to `nearest`, if that is more). A rigid motion, rotations included, gives 0. The median ignores neighbors that
+/// belong to another object.
 fn bending(
     source: &dyn FrameSource,
     reference: &Gaussians,
@@ -147,7 +147,7 @@ fn bending(
         .par_iter()
         .map_init(
             || index.search(),
-            |search, &id| search.nearest(id, reference.position.row(id as usize), NEIGHBOURS).0.collect(),
+            |search, &id| search.nearest(id, reference.position.row(id as usize), NEIGHBORS).0.collect(),
         )
         .collect();
     let mut followed: Vec<u32> = near.iter().flatten().chain(ids).copied().collect();
@@ -185,13 +185,13 @@ fn bending(
         .collect())
 }
 
-/// Standard deviation of every Gaussian's base color over the sampled frames it lives in; empty where
+/// Returns the standard deviation of every Gaussian's base color over the sampled frames of its life span; empty where
 /// colors are constant.
 fn color_change(source: &dyn FrameSource, all: &[u32], frames: &[usize], alpha_min: f64) -> Result<Vec<f64>> {
     if !source.info().varying.contains(Attributes::SH) {
         return Ok(Vec::new());
     }
-    // From the first living frame's color: sums of small differences lose no digits.
+    // Differences from the first color: sums of small numbers lose no digits.
     let mut first: Vec<Option<[f64; 3]>> = vec![None; all.len()];
     let mut sums = vec![(0u32, [0.0f64; 3], [0.0f64; 3]); all.len()];
     let columns = Attributes::SH | Attributes::OPACITY;
@@ -274,7 +274,7 @@ mod tests {
             [x * cos - y * sin + 40.0 * t, x * sin + y * cos, z - 7.0 * t]
         });
         assert!(turned.iter().all(|&bent| bent < 1e-5), "got {turned:?}");
-        // Every distance grows by 40% towards the end, evenly.
+        // Every distance grows evenly by 40%.
         let grown = bent(|at, t| at.map(|x| x * (1.0 + 0.4 * t)));
         let expected = 0.4 * ((0..10).map(|k| f64::from(k * k) / 81.0).sum::<f64>() / 10.0).sqrt();
         assert!(grown.iter().all(|&bent| (bent - expected).abs() < 1e-5), "got {grown:?}, expected {expected}");

@@ -1,14 +1,14 @@
-//! The result in a sentence or two.
+//! Verdict of a report: two or three sentences.
 
 use super::failure::{FailureMode, Verdict};
 use super::html::percent;
 use crate::evaluation::found::Evaluation;
 use crate::metrics::PSNR_CAP_DB;
 
-/// Mean PSNR, dB, from which a loss is called by the words beside it. From 50 dB on, the root mean square
-/// error is less than one step of 255; at 40 dB under three, at 30 eight, at 24 sixteen.
+/// Words of the verdict, with the least mean PSNR in dB for each. The root mean square error is below one step of 255
+/// from 50 dB on, below three at 40 dB, eight at 30 dB, sixteen at 24 dB.
 const WORDS: [(f64, &str); 6] = [
-    (PSNR_CAP_DB, "gives the same pictures as the original"),
+    (PSNR_CAP_DB, "renders exactly as the original does"),
     (50.0, "differs from the original by less than a screen can show"),
     (40.0, "looks like the original"),
     (30.0, "differs from the original visibly, side by side"),
@@ -16,14 +16,14 @@ const WORDS: [(f64, &str); 6] = [
     (f64::NEG_INFINITY, "no longer looks like the original"),
 ];
 
-/// Says how much smaller the model is, how much of it is seen, and which failure modes are.
+/// Returns the verdict: how much smaller the model is, how visible the loss is, and which failure modes show.
 pub(super) fn verdict(found: &Evaluation, modes: &[FailureMode]) -> String {
     let mean = found.loss.overall;
     let of = |part: u64, whole: u64| percent(part as f64, whole as f64);
     let words =
         WORDS.iter().find(|(from, _)| mean.psnr >= *from).map_or("cannot be compared with the original", |w| w.1);
     let mut text = format!(
-        "With {} of the Gaussians and {} of the bytes, the model {words} ({:.1} dB on average over {} picture{}",
+        "With {} of the Gaussians and {} of the bytes, the model {words} ({:.1} dB on average over {} render{}",
         of(found.count.compressed as u64, found.count.original as u64),
         of(found.bytes.compressed, found.bytes.original),
         mean.psnr,

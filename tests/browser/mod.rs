@@ -1,5 +1,5 @@
-//! A headless Chromium, driven through its debugging pipe: real mouse, real keys, and every request,
-//! console message and exception seen. See the Chrome DevTools Protocol.
+//! A headless Chromium, driven through its debugging pipe (Chrome DevTools Protocol): real mouse, keys and fingers, and
+//! a record of every request, console message and exception.
 
 #![allow(dead_code, reason = "every test crate compiles this module and uses a part of it")]
 
@@ -15,10 +15,10 @@ use tempfile::TempDir;
 
 const NAMES: [&str; 5] =
     ["chromium-headless-shell", "chromium", "chromium-browser", "google-chrome", "google-chrome-stable"];
-/// A browser that says nothing for so long is stuck.
+/// Longest wait for an answer of the browser.
 const PATIENCE: Duration = Duration::from_secs(60);
 
-/// The browser to use: `SPLATSIEVE_BROWSER`, else one that is installed, as one must be.
+/// Returns the browser to use: `SPLATSIEVE_BROWSER`, else an installed one. Panics if there is none.
 pub(crate) fn installed() -> PathBuf {
     if let Some(given) = std::env::var_os("SPLATSIEVE_BROWSER") {
         return PathBuf::from(given);
@@ -36,7 +36,7 @@ pub(crate) struct Browser {
     from: Receiver<Value>,
     session: String,
     last: u64,
-    /// What the browser told without being asked, in order.
+    /// Events of the browser, in order.
     pub(crate) events: Vec<Value>,
     _home: TempDir,
 }
@@ -47,7 +47,7 @@ impl Browser {
         Browser::with(program, &["--disable-gpu"])
     }
 
-    /// The same with WebGL, computed by the processor where there is no graphics card.
+    /// Starts `program` with WebGL, computed by the processor where there is no graphics card.
     pub(crate) fn start_drawing(program: &Path) -> Browser {
         Browser::with(program, &["--use-angle=swiftshader", "--enable-unsafe-swiftshader"])
     }
@@ -116,7 +116,7 @@ impl Browser {
         }
     }
 
-    /// The value of an expression in the page; of a promise what it comes to.
+    /// Returns the value of an expression in the page. Waits for a promise.
     pub(crate) fn value(&mut self, expression: &str) -> Value {
         let parameters = json!({ "expression": expression, "returnByValue": true, "awaitPromise": true });
         let found = self.ask("Runtime.evaluate", parameters);
@@ -137,6 +137,41 @@ impl Browser {
         send("mouseReleased", points[points.len() - 1], 0);
     }
 
+    /// Puts fingers on the screen at the points of the first list, moves them over the other lists, and takes them
+    /// away.
+    pub(crate) fn touch(&mut self, steps: &[Vec<[f64; 2]>]) {
+        let mut send = |kind: &str, points: &[[f64; 2]]| {
+            let points: Vec<Value> =
+                points.iter().enumerate().map(|(id, [x, y])| json!({ "x": x, "y": y, "id": id })).collect();
+            self.ask("Input.dispatchTouchEvent", json!({ "type": kind, "touchPoints": points }));
+        };
+        send("touchStart", &steps[0]);
+        for points in &steps[1..] {
+            send("touchMove", points);
+        }
+        send("touchEnd", &[]);
+    }
+
+    /// Shows the page on a screen of this size, in pixels, in light or dark colors.
+    pub(crate) fn screen(&mut self, width: u32, height: u32, scheme: &str) {
+        let is_phone = width < 600;
+        let device = json!({ "width": width, "height": height, "deviceScaleFactor": 1, "mobile": is_phone });
+        self.ask("Emulation.setDeviceMetricsOverride", device);
+        let features = json!([{ "name": "prefers-color-scheme", "value": scheme }]);
+        self.ask("Emulation.setEmulatedMedia", json!({ "features": features }));
+    }
+
+    /// Returns the serious violations of accessibility rules that axe-core finds, whose script is `axe`.
+    pub(crate) fn serious_violations(&mut self, axe: &str) -> Vec<String> {
+        self.ask("Runtime.evaluate", json!({ "expression": axe }));
+        let found = self.value(
+            "axe.run(document, { resultTypes: ['violations'] }).then(found => found.violations\
+             .filter(rule => ['serious', 'critical'].includes(rule.impact))\
+             .map(rule => `${rule.id}: ${rule.nodes.map(node => node.html.slice(0, 200)).join(' | ')}`))",
+        );
+        serde_json::from_value(found).unwrap()
+    }
+
     /// Presses and lets go of a key that writes nothing.
     pub(crate) fn key(&mut self, name: &str, code: u32) {
         for kind in ["rawKeyDown", "keyUp"] {
@@ -145,8 +180,7 @@ impl Browser {
         }
     }
 
-    /// Everything that a page without faults and without needs does not do: exceptions, messages, and
-    /// requests for anything but itself and what it holds.
+    /// Returns the faults of the page: exceptions, messages, and requests for anything but itself and its data URIs.
     pub(crate) fn complaints(&self) -> Vec<String> {
         let complaint = |event: &Value| {
             let about = &event["params"];

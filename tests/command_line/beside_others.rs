@@ -121,7 +121,7 @@ fn signal_removes_partial_files_and_sets_exit_code() {
         for (arguments, input) in [
             ("compress - -o out --scratch-dir scratch", half),
             ("convert - out.gseq", half),
-            ("demo --gaussians 100000 --frames 400 -o demo", &[]),
+            ("test-scene --gaussians 100000 --frames 400 -o demo", &[]),
         ] {
             fs::create_dir(workplace.path("scratch")).unwrap();
             let mut child = start_program(&workplace, arguments);
@@ -186,7 +186,7 @@ fn overwrite_keeps_files_of_other_programs() {
     // Frames of the earlier result that the new result does not have are removed.
     workplace.done("convert {tiny} frames --as ply-sequence");
     fs::write(workplace.path("frames/notes.txt"), "precious").unwrap();
-    workplace.done("demo --gaussians 400 --frames 3 -o shorter");
+    workplace.done("test-scene --gaussians 400 --frames 3 -o shorter");
     workplace.done("convert shorter/scene.gseq frames --as ply-sequence --overwrite");
     let plys = fs::read_dir(workplace.path("frames")).unwrap().map(|entry| entry.unwrap().path());
     assert_eq!(plys.filter(|path| path.extension().is_some_and(|e| e == "ply")).count(), 3);
@@ -201,7 +201,7 @@ fn overwrite_keeps_files_of_other_programs() {
 #[ignore = "needs time"]
 fn killed_run_leaves_old_or_new_output_and_foreign_files() {
     let workplace = Workplace::new();
-    workplace.done("demo --gaussians 400 --frames 3 -o shorter");
+    workplace.done("test-scene --gaussians 400 --frames 3 -o shorter");
     workplace.done("convert shorter/scene.gseq old --as ply-sequence");
     let start = Instant::now();
     workplace.done("convert {tiny} new --as ply-sequence");

@@ -432,7 +432,7 @@ fn results_go_to_stdout_and_quiet_silences_stderr() {
         ("recipe --preset paper", "[merge]"),
         ("completions bash", "splatsieve"),
         ("completions zsh", "splatsieve"),
-        ("demo --gaussians 400 --frames 4", "body"),
+        ("test-scene --gaussians 400 --frames 4", "body"),
     ] {
         let run = workplace.run(&format!("{arguments} --quiet"));
         assert_eq!(run.code, 0, "{arguments}: {}", run.stderr);
@@ -458,9 +458,9 @@ fn results_go_to_stdout_and_quiet_silences_stderr() {
 #[test]
 fn demo_without_output_names_no_path() {
     let workplace = Workplace::new();
-    let text = workplace.done("demo --gaussians 400 --frames 4 --quiet");
+    let text = workplace.done("test-scene --gaussians 400 --frames 4 --quiet");
     assert!(!text.contains("output  "), "{text}");
-    workplace.done("demo --gaussians 400 --frames 4 --quiet -o demo");
+    workplace.done("test-scene --gaussians 400 --frames 4 --quiet -o demo");
     let summary = fs::read_to_string(workplace.path("demo/summary.json")).unwrap();
     let summary: serde_json::Value = serde_json::from_str(&summary).unwrap();
     assert_eq!(summary.get("output"), None, "{summary}");
@@ -527,7 +527,7 @@ fn closed_stdout_is_no_failure() {
 #[ignore = "needs time"]
 fn stages_print_once_and_undone_merging_is_left_out() {
     let workplace = Workplace::new();
-    workplace.done("demo -o demo");
+    workplace.done("test-scene -o demo");
     let compress = |rest: &str| {
         let run = workplace.run(&format!(
             "compress demo/scene.gseq --cameras demo/cameras.json --ratio {rest} -o out.gseq --overwrite"

@@ -164,7 +164,7 @@ fn every_command_that_reads_frames_keeps_its_memory_limit() {
 #[test]
 fn plan_is_printed_before_refusal_and_bad_sizes_fail() {
     let workplace = Workplace::new();
-    workplace.done("demo --gaussians 1000 --frames 2 -o demo");
+    workplace.done("test-scene --gaussians 1000 --frames 2 -o demo");
     workplace.refused(
         2,
         "compress demo/scene.gseq -o x.gseq --memory 2MiB --explain",

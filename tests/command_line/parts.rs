@@ -308,7 +308,7 @@ fn compressing_in_shards_equals_one_run() {
 #[ignore = "needs time"]
 fn pairs_measured_in_shards_merge_as_in_one_run() {
     let workplace = Workplace::new();
-    workplace.done("--quiet demo -o demo --gaussians 40000 --frames 6 --no-refine");
+    workplace.done("--quiet test-scene -o test-scene --gaussians 40000 --frames 6 --no-refine");
     for name in ["scene.gseq", "cameras.json"] {
         fs::rename(workplace.path("demo").join(name), workplace.path(name)).unwrap();
     }

@@ -34,7 +34,7 @@ fn stderr_text(output: &Output) -> String {
 fn workplace_with_scene(gaussians: usize) -> Workplace {
     let workplace = Workplace::new();
     let output =
-        run_program(&workplace, &format!("demo --gaussians {gaussians} --frames 8 -o scene --quiet --no-refine"));
+        run_program(&workplace, &format!("test-scene --gaussians {gaussians} --frames 8 -o scene --quiet --no-refine"));
     assert!(output.status.success(), "{}", stderr_text(&output));
     workplace
 }

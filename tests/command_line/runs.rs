@@ -49,7 +49,7 @@ fn recipe_beside_a_result_repeats_its_run() {
 fn flags_override_recipes_and_foreign_recipes_are_noted() {
     let workplace = Workplace::new();
     workplace.done("compress {tiny} --cameras {tiny} --ratio 0.5 -o half");
-    workplace.done("demo --gaussians 600 --frames 4 -o demo");
+    workplace.done("test-scene --gaussians 600 --frames 4 -o demo");
     let demo = "demo/scene.gseq --cameras demo/cameras.json --recipe half/recipe.toml";
     let summary = workplace.summary(&format!("{demo} -o other.gseq"));
     assert_eq!(summary["gaussians"], 300);
@@ -62,7 +62,7 @@ fn flags_override_recipes_and_foreign_recipes_are_noted() {
 #[test]
 fn summary_reads_back_and_names_its_schema() {
     let workplace = Workplace::new();
-    workplace.done("demo --gaussians 900 --frames 6 -o demo");
+    workplace.done("test-scene --gaussians 900 --frames 6 -o demo");
     for (k, options) in ["", "--preset strong", "--preset paper", "--prune-only"].iter().enumerate() {
         workplace.done(&format!("compress demo/scene.gseq --cameras demo/cameras.json {options} -o out{k}.gseq"));
         let text = std::fs::read_to_string(workplace.path(&format!("out{k}.gseq.summary.json"))).unwrap();
@@ -140,7 +140,7 @@ fn reads_as_planned(workplace: &Workplace, arguments: &str) -> f64 {
 #[ignore = "needs time"]
 fn presets_read_no_more_than_planned_in_any_memory() {
     let workplace = Workplace::new();
-    workplace.done("demo --gaussians 3000 --frames 64 -o demo");
+    workplace.done("test-scene --gaussians 3000 --frames 64 -o demo");
     for preset in ["default", "paper", "gentle", "strong"] {
         for (k, options) in
             ["", "--memory 48MiB", "--merge-only --memory 48MiB", "--ratio 0.2 --memory 48MiB"].iter().enumerate()

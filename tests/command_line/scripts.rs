@@ -156,7 +156,7 @@ fn python_container_reader_returns_every_bit() {
     let workplace = Workplace::new();
     workplace.done("convert {tiny} zstd.gseq");
     workplace.done("convert {tiny} raw.gseq --raw");
-    workplace.done("demo --gaussians 2500 --frames 70 -o demo");
+    workplace.done("test-scene --gaussians 2500 --frames 70 -o demo");
     workplace.done("convert {tiny} tiny.gseq --max-error position=1e-2,rotation=1e-2,log_scale=1e-2,sh=1e-2");
     workplace.done("convert demo/scene.gseq demo.gseq --max-error position=0.05%,rotation=1e-3,opacity_logit=0.1");
     for (path, frames) in [
@@ -307,7 +307,7 @@ fn scale_script_reports_cost_of_every_size() {
 #[ignore = "needs Python"]
 fn bars_fit_the_terminal_and_leave_no_line_behind() {
     let workplace = Workplace::new();
-    workplace.done("demo --gaussians 2000 --frames 16 -o demo --no-refine");
+    workplace.done("test-scene --gaussians 2000 --frames 16 -o demo --no-refine");
     let program = assert_cmd::cargo::cargo_bin("splatsieve");
     let mut terminal = Command::new(python("pty"));
     terminal.arg(script("terminal.py")).args(["--columns", "60,100,120"]).arg(program);

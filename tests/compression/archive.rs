@@ -203,7 +203,7 @@ fn damaged_and_impossible_archives_are_refused() {
     workplace.refused(1, "convert cut.gsz out", &["cut.gsz", "section blobs", "bytes", "copy it again"]);
     workplace.refused(1, "convert flipped.gsz out", &["flipped.gsz", "checksum"]);
     workplace.refused(1, "info other.gsz", &["other.gsz", "archive"]);
-    workplace.done("demo --gaussians 200 --frames 3 -o demo");
+    workplace.done("test-scene --gaussians 200 --frames 3 -o demo");
     workplace.done("convert demo/scene.gseq curves.splatv");
     workplace.refused(2, "compress curves.splatv --cameras demo/cameras.json -o a.gsz", &["archive", ".gseq"]);
     workplace.refused(

@@ -33,7 +33,7 @@ fn largest_difference(workplace: &Workplace, column: Attributes) -> (f64, bool) 
 #[ignore = "needs time"]
 fn every_attribute_keeps_its_bound_and_names_it() {
     let workplace = Workplace::new();
-    workplace.done("demo --gaussians 3000 --frames 48 -o demo");
+    workplace.done("test-scene --gaussians 3000 --frames 48 -o demo");
     workplace.done("convert demo/scene.gseq exact.gseq");
     workplace.done(&format!("convert demo/scene.gseq within.gseq --max-error {BOUNDS}"));
     workplace.done("info within.gseq --check");

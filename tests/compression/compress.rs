@@ -253,7 +253,7 @@ fn explicit_trajectories_keep_the_bits_of_survivors() {
 fn compressed_bytes_ignore_thread_count() {
     let workplace = Workplace::new();
     // More Gaussians than one block.
-    workplace.done("demo --gaussians 3000 --frames 6 -o demo");
+    workplace.done("test-scene --gaussians 3000 --frames 6 -o demo");
     let mut seen = BTreeSet::new();
     for request in [
         "{tiny} --preset paper -o out",

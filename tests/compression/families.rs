@@ -73,7 +73,7 @@ fn states_before_and_after_writing(
 #[test]
 fn compressed_states_equal_written_states_after_any_delta() {
     let workplace = Workplace::new();
-    workplace.done("demo --gaussians 300 --frames 3 -o demo");
+    workplace.done("test-scene --gaussians 300 --frames 3 -o demo");
     workplace.done("convert demo/scene.gseq frames --as ply-sequence");
     without_sh_head(&tiny(), &workplace.path("free"));
     for (path, kinds) in [

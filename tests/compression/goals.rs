@@ -9,7 +9,7 @@ use serde_json::Value;
 /// Returns a workplace with a generated scene, `demo/scene.gseq`, and its cameras.
 fn with_demo() -> Workplace {
     let workplace = Workplace::new();
-    workplace.done("demo --gaussians 800 --frames 4 -o demo");
+    workplace.done("test-scene --gaussians 800 --frames 4 -o demo");
     workplace
 }
 

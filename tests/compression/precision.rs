@@ -48,7 +48,7 @@ fn observed(curve: &Value, kind: &str) -> f64 {
 #[test]
 fn exact_settings_have_no_error_and_others_converge() {
     let place = Workplace::new();
-    let demo = "demo -o d --gaussians 1000 --frames 5";
+    let demo = "test-scene -o d --gaussians 1000 --frames 5";
     place.done(demo);
     let cameras = read(&fs::read_to_string(place.path("d/cameras.json")).unwrap());
     fs::write(place.path("d/cameras.json"), held_out(&cameras).to_string()).unwrap();
@@ -128,7 +128,7 @@ fn exact_settings_have_no_error_and_others_converge() {
 #[ignore = "needs time"]
 fn precision_runs_equal_compress_at_any_thread_count() {
     let place = Workplace::new();
-    place.done("demo -o d --gaussians 1500 --frames 4");
+    place.done("test-scene -o d --gaussians 1500 --frames 4");
     let found = read(&place.done(
         "precision d/scene.gseq --cameras d/cameras.json -o diagrams --knobs machine,merging --ratio 0.4 --repeat 1 --json",
     ));
@@ -160,7 +160,7 @@ fn precision_runs_equal_compress_at_any_thread_count() {
 #[test]
 fn impossible_settings_are_refused_before_writing() {
     let place = Workplace::new();
-    place.done("demo -o d --gaussians 300 --frames 3");
+    place.done("test-scene -o d --gaussians 300 --frames 3");
     let before = files(&place.path(""));
     for (words, expected) in [
         ("precision d/scene.gseq -o diagrams", "give --cameras"),
@@ -177,7 +177,7 @@ fn impossible_settings_are_refused_before_writing() {
 #[test]
 fn unused_settings_of_a_recipe_are_left_out_by_name() {
     let place = Workplace::new();
-    place.done("demo -o d --gaussians 300 --frames 3");
+    place.done("test-scene -o d --gaussians 300 --frames 3");
     let found = read(&place.done(
         "precision d/scene.gseq --cameras d/cameras.json -o diagrams --preset paper --knobs look,rounds,percentiles,refining \
          --repeat 1 --json",

@@ -14,7 +14,7 @@ fn quality(workplace: &Workplace, original: &str, result: &str, cameras: &str) -
 #[ignore = "needs time"]
 fn refinement_raises_psnr_of_every_input_kind() {
     let workplace = Workplace::new();
-    workplace.done("demo --gaussians 1500 --frames 6 -o demo");
+    workplace.done("test-scene --gaussians 1500 --frames 6 -o demo");
     workplace.done("convert demo/scene.gseq frames --as ply-sequence");
     let tiny = tiny().display().to_string();
     let first = files(&workplace.path("frames")).into_keys().min().unwrap();
@@ -39,7 +39,7 @@ fn refinement_raises_psnr_of_every_input_kind() {
 #[test]
 fn still_without_cameras_is_refined_by_virtual_ones() {
     let workplace = Workplace::new();
-    workplace.done("demo --gaussians 1200 --frames 2 -o demo");
+    workplace.done("test-scene --gaussians 1200 --frames 2 -o demo");
     workplace.done("convert demo/scene.gseq frames --as ply-sequence");
     let first = files(&workplace.path("frames")).into_keys().min().unwrap();
     let first = format!("frames/{}", first.display());
@@ -56,7 +56,7 @@ fn still_without_cameras_is_refined_by_virtual_ones() {
 #[ignore = "needs time"]
 fn ssim_weight_raises_ssim_and_costs_at_most_1_db() {
     let workplace = Workplace::new();
-    workplace.done("demo --gaussians 1500 --frames 6 -o demo");
+    workplace.done("test-scene --gaussians 1500 --frames 6 -o demo");
     let found = ["0", "0.5"].map(|part| {
         workplace.done(&format!(
             "compress demo/scene.gseq --cameras demo/cameras.json --ratio 0.1 --set refine_steps=600 \

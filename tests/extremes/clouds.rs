@@ -192,7 +192,7 @@ fn nonfinite_gaussians_are_refused_dropped_or_kept() {
         ("scale", |g| g.log_scale.plane_mut(0)[7] = f32::INFINITY),
         ("opacity", |g| g.opacity_logit.plane_mut(0)[7] = f32::NAN),
         ("rotation", |g| g.rotation.plane_mut(3)[7] = f32::NAN),
-        ("colour", |g| g.sh.plane_mut(2)[7] = f32::NEG_INFINITY),
+        ("color", |g| g.sh.plane_mut(2)[7] = f32::NEG_INFINITY),
     ];
     for (what, edit) in edits {
         let workplace = Workplace::new();
@@ -202,7 +202,7 @@ fn nonfinite_gaussians_are_refused_dropped_or_kept() {
         workplace.refused(
             1,
             "compress odd.ply -o out.ply",
-            &["odd.ply", "Gaussian 7", "NaN or infinity", "--non-finite"],
+            &["odd.ply", "Gaussian 7", "NaN or infinity", "--set non_finite=drop"],
         );
 
         let summary = workplace.summary("odd.ply -o dropped.ply --set non_finite=drop --merge-only --no-refine");

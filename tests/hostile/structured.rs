@@ -213,7 +213,7 @@ fn a_deflated_pickle_is_refused_without_inflating_it() {
     let entry = || Entry::deflated("a/data.pkl", &b"]".repeat(1 << 20), 25);
     write_zip(&folder.path("a.pt"), [entry()], None);
     assert!(fs::metadata(folder.path("a.pt")).unwrap().len() < 40_000);
-    let parts = ["data.pkl", "stored as it is, as torch.save stores it", "a compressed one", "torch.load"];
+    let parts = ["data.pkl", "an uncompressed file, as torch.save writes it", "a compressed one", "torch.load"];
     info(&folder, "a.pt").refused(1, &parts);
     let model = model_with_network(&folder, entry());
     info(&folder, model).refused(1, &parts);

@@ -176,7 +176,7 @@ fn slow_every_command_survives_broken_streams() {
         "convert scene.gseq out --as ply-sequence --overwrite".to_owned(),
         "convert scene.gseq -".to_owned(),
         "info scene.gseq --repair out.gseq --overwrite".to_owned(),
-        "demo --gaussians 100 --frames 1 --no-refine".to_owned(),
+        "test-scene --gaussians 100 --frames 1 --no-refine".to_owned(),
         "selfcheck --json".to_owned(),
         "man pages".to_owned(),
     ];
@@ -375,7 +375,7 @@ fn slow_outputs_of_all_commands_contain_no_folder_names() {
         "compress {m} --cameras {m} SHORT -o {o}/small.splatv",
         "compress {m} --cameras {m} SHORT -o {o}/small.4dgs",
         "compress {m} --cameras {m} SHORT -o {o}/few --as ply-sequence",
-        "demo -o {o}/demo --gaussians 100 --frames 2 --no-refine",
+        "test-scene -o {o}/test-scene --gaussians 100 --frames 2 --no-refine",
         "convert {m} {o}/scene.splatv --cameras {m}",
         "convert {m} {o}/scene.4dgs --cameras {m}",
         "convert {m} {o}/frames --cameras {m} --as ply-sequence",

@@ -1,7 +1,8 @@
-//! Pages for people: the player and reports.
+//! Pages for people: the player, reports and the demo.
 
 #[path = "../browser/mod.rs"]
 mod browser;
+mod demo;
 #[path = "../models/mod.rs"]
 mod models;
 mod player;

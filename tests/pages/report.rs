@@ -1,4 +1,4 @@
-//! `report` as a user runs it; what a browser makes of the page is tested in `report_browser`.
+//! `report` as a user runs it. `report_browser` tests the page in a browser.
 
 use std::fs;
 use std::path::Path;
@@ -6,11 +6,11 @@ use std::path::Path;
 use crate::scene::{Workplace, files};
 use serde_json::{Value, json};
 
-/// A folder with the demo's scene and cameras in `d`, and `small.gseq` with proxies in it and all that lies
-/// beside it.
+/// Writes the test scene with its cameras into `d`, and compresses it into `small.gseq`, with proxies and companion
+/// files.
 fn compressed() -> Workplace {
     let at = Workplace::new();
-    at.done("demo -o d --gaussians 1200 --frames 5");
+    at.done("test-scene -o d --gaussians 1200 --frames 5");
     at.done("compress d/scene.gseq --cameras d/cameras.json --set choose_by_views=false --no-refine -o small.gseq");
     at
 }
@@ -25,7 +25,7 @@ fn data(at: &Workplace, folder: &str) -> Value {
     serde_json::from_str(&read(&at.path(folder).join("report.json"))).unwrap()
 }
 
-/// What `sweep` writes, of two methods and a knob.
+/// Returns data of a sweep: two methods and one varied parameter.
 fn sweep() -> Value {
     let point = |method: &str, count: usize, psnr: f64| {
         json!({
@@ -53,8 +53,10 @@ fn data_beside_the_page_are_those_of_evaluate_and_of_the_run() {
     at.done("render d/scene.gseq --cameras d/cameras.json --all -o photographs");
     let rest = format!("{MODELS} --ground-truth photographs --max-frames 3");
     let mut expected: Value = serde_json::from_str(&at.done(&format!("evaluate {rest} --json --csv all.csv"))).unwrap();
-    // A report is published: it names no folder.
+    // The files of a report name no folders.
     expected["path"]["original"] = "scene.gseq".into();
+    // Times differ between runs.
+    expected.as_object_mut().unwrap().remove("render_ms");
     fs::write(at.path("sweep.json"), sweep().to_string()).unwrap();
     let said = at.done(&format!("report {rest} --sweep sweep.json -o r"));
     let found = data(&at, "r");
@@ -69,7 +71,7 @@ fn data_beside_the_page_are_those_of_evaluate_and_of_the_run() {
     assert_eq!(read(&at.path("r/trade_off.csv")).lines().count(), 4);
     assert_eq!(read(&at.path("r/knobs.csv")).lines().count(), 3);
     assert_eq!(found["missing"], json!([]));
-    // Scores computed anew are those that decided, and where they are not, that is said.
+    // Scores computed anew equal those of the run; otherwise a note says so.
     assert_eq!(found["notes"], json!([]));
     let recipe = at.path("small.gseq.recipe.toml");
     fs::write(&recipe, read(&recipe).replace("view_stride = 1", "view_stride = 2")).unwrap();
@@ -90,7 +92,7 @@ fn data_beside_the_page_are_those_of_evaluate_and_of_the_run() {
         assert_eq!((sum("dropped"), kept + merged), (dropped, 1200 - dropped), "{}", histogram["name"]);
         assert!(merged > 0 && kept > 0, "{}", histogram["name"]);
     }
-    // The worst picture is the worst of the list.
+    // The first shown render is the worst of the list.
     let psnr = |picture: &Value| picture["loss"]["psnr"].as_f64().unwrap();
     let worst = found["pictures"].as_array().unwrap().iter().map(psnr).fold(f64::INFINITY, f64::min);
     assert_eq!(found["shown"][0]["psnr"].as_f64(), Some(worst));
@@ -113,7 +115,7 @@ fn the_page_is_well_formed_holds_all_it_needs_and_is_light() {
         "Error by memory",
         "S_static",
         "powers of ten",
-        "Time per stage",
+        "Time per step",
         "left out",
         "Thin structures",
     ] {
@@ -121,18 +123,83 @@ fn the_page_is_well_formed_holds_all_it_needs_and_is_light() {
     }
     assert!(!page.contains("<i>odd") && !page.contains("<b>points"), "text of a file became elements");
     assert!(page.len() < 5_000_000, "{} bytes", page.len());
-    // Three images of each of five frames; their figures are those of evaluate.
+    // Each of five frames has three images, with the figures of evaluate.
     let films = data(&at, "r")["films"].as_array().unwrap().clone();
     assert_eq!(page.matches("data:image/jpeg;base64,").count(), films.len() * 5 * 3);
     assert_eq!(films[0]["frames"], json!([0, 1, 2, 3, 4]));
     let shown = &data(&at, "r")["shown"][0];
     assert_eq!(films[0]["psnr"][shown["frame"].as_u64().unwrap() as usize], shown["psnr"]);
-    // Any letters may stand in a picture's base64.
+    // The base64 of an image may contain any letters.
     let written = |part: &str| part.split_once('"').map_or(part, |(_, after)| after).to_owned();
     let words: String = page.split("data:image/png;base64,").map(written).collect();
     for none in ["NaN", "inf<", "inf,", ">-0<"] {
         assert!(!words.contains(none), "{none} is no number");
     }
+}
+
+/// Returns the part of the page before the collapsed details.
+fn overview(page: &str) -> &str {
+    page.split_once("<section id=\"details\">").expect("a page with details").0
+}
+
+#[test]
+fn the_overview_has_a_verdict_and_four_cards_without_symbols() {
+    let at = compressed();
+    at.done("render d/scene.gseq --cameras d/cameras.json --all -o photographs");
+    at.done(&format!("report {MODELS} --ground-truth photographs -o r"));
+    at.done(&format!("report {MODELS} --render-time -o timed"));
+    let page = read(&at.path("r/report.html"));
+    let (top, timed) = (overview(&page), read(&at.path("timed/report.html")));
+    assert_eq!(top.matches("class=\"card\"").count(), 4);
+    for part in
+        ["Gaussians</span>", "Size</span>", "Quality (PSNR)</span>", "Against photographs", "× fewer", "A typical view"]
+    {
+        assert!(top.contains(part), "{part} is missing");
+    }
+    assert!(overview(&timed).contains("Render time</span>"), "no render time");
+    let found = data(&at, "timed");
+    assert!(found["render_time"]["milliseconds"]["original"].as_f64() > Some(0.0), "{}", found["render_time"]);
+    for symbol in ["S_static", "κ", "temporal error"] {
+        assert!(!top.contains(symbol), "{symbol} is in the overview");
+        assert!(page.contains(symbol), "{symbol} is nowhere");
+    }
+    let details = page.matches("<details ").count();
+    assert!(details >= 6 && page.matches("<summary><b>").count() == details, "{details} details");
+}
+
+#[test]
+fn charts_without_differences_are_left_out() {
+    let at = compressed();
+    at.done(&format!("report {MODELS} --max-frames 1 -o r"));
+    let page = read(&at.path("r/report.html"));
+    assert!(page.contains("PSNR by view") && !page.contains("PSNR by frame"), "charts of one frame");
+    assert!(!page.contains("nothing to show"), "an empty chart");
+    at.done(&format!("report {MODELS} -o more"));
+    assert!(read(&at.path("more/report.html")).contains("PSNR by frame"));
+}
+
+#[test]
+fn several_results_stand_side_by_side() {
+    let at = compressed();
+    at.done("compress d/scene.gseq --cameras d/cameras.json --ratio 0.1 --no-refine -o tiny.gseq");
+    let models = "d/scene.gseq small.gseq tiny.gseq --cameras d/cameras.json";
+    let said = at.done(&format!("report {models} -o r"));
+    let (page, found) = (read(&at.path("r/report.html")), data(&at, "r"));
+    balanced(&page);
+    let other = &found["others"][0];
+    assert_eq!(other["evaluation"]["count"]["compressed"], json!(120));
+    let alone = at.done("evaluate d/scene.gseq tiny.gseq --cameras d/cameras.json --json");
+    let alone: Value = serde_json::from_str(&alone).unwrap();
+    assert_eq!(other["evaluation"]["psnr"], alone["psnr"]);
+    for result in [&found, other] {
+        assert!(said.contains(result["verdict"].as_str().unwrap()), "{said}");
+    }
+    assert_eq!(overview(&page).matches("<th scope=\"row\">").count(), 3, "the original and two results");
+    for name in ["small.gseq", "tiny.gseq", "difference of tiny.gseq"] {
+        assert!(overview(&page).contains(&format!(">{name}</option>")), "{name} is on no slider");
+    }
+    at.refused(2, &format!("report {models} --cache w -o other"), &["--cache"]);
+    at.refused(2, "report - small.gseq tiny.gseq --cameras d/cameras.json -o other", &["standard input"]);
 }
 
 #[test]
@@ -147,7 +214,7 @@ fn any_number_of_threads_gives_the_same_bytes() {
 }
 
 #[test]
-fn what_is_not_beside_the_result_is_said_and_any_two_models_can_be_compared() {
+fn absent_files_are_named_and_any_two_models_can_be_compared() {
     let at = compressed();
     fs::copy(at.path("small.gseq"), at.path("alone.gseq")).unwrap();
     at.done("report d/scene.gseq alone.gseq --cameras d/cameras.json -o r");
@@ -159,7 +226,7 @@ fn what_is_not_beside_the_result_is_said_and_any_two_models_can_be_compared() {
     assert_eq!((&found["run"], &found["histograms"]), (&Value::Null, &Value::Null));
     assert_eq!(found["missing"].as_array().unwrap().len(), 3);
     assert!(!at.path("r/stages.csv").exists() && !at.path("r/histograms.csv").exists());
-    // A model beside itself: nothing is lost, and nothing is made of that.
+    // A model compared with itself has no loss and no flags.
     at.done("report d/scene.gseq d/scene.gseq --cameras d/cameras.json --max-frames 1 -o same");
     let same = data(&at, "same");
     assert_eq!(same["evaluation"]["psnr"].as_f64(), Some(100.0));
@@ -187,7 +254,7 @@ fn a_report_replaces_only_a_result_and_wrong_inputs_leave_nothing() {
     assert!(at.path("r/left.txt").exists(), "another's file in an earlier report stays");
 }
 
-/// Confirms that every element of a page is closed, in order.
+/// Checks that every element of a page is closed, in order.
 fn balanced(page: &str) {
     const VOID: [&str; 5] = ["!doctype", "meta", "img", "input", "br"];
     let mut open: Vec<&str> = Vec::new();

@@ -30,10 +30,10 @@ class Bench:
     def __init__(self, folder, program, model, cluster):
         self.folder, self.program, self.cluster = folder, program, cluster
         self.demo = folder / "demo scene"
-        self.here("demo", "-o", self.demo, "--gaussians", 2000, "--frames", 24, "--quiet")
+        self.here("test-scene", "-o", self.demo, "--gaussians", 2000, "--frames", 24, "--quiet")
         self.scene = [model, "--cameras", model, "--no-refine"]
         if model is None:
-            self.here("demo", "-o", folder / "large", "--gaussians", 20000, "--frames", 100, "--quiet")
+            self.here("test-scene", "-o", folder / "large", "--gaussians", 20000, "--frames", 100, "--quiet")
             self.scene = [folder / "large/scene.gseq", "--cameras", folder / "large/cameras.json", "--no-refine"]
         self.plain = {}
 

@@ -1,39 +1,38 @@
-//! The bodies of the demo scene: where each Gaussian is at rest, and how it moves.
+//! The bodies of the test scene: where each Gaussian is at rest, and how it moves.
 
 use std::f64::consts::{FRAC_PI_2, TAU};
 use std::ops::Range;
 
 use glam::{DQuat, DVec2, DVec3};
-use xxhash_rust::xxh3::xxh3_64_with_seed;
 
-use crate::model::SH_C0;
+use super::motion::{
+    BRIGHT, CLOTH_WIDTH, DemoGaussian, DemoMotion, GONE, GaussianRandom, HALF_LIFE, color, facing_y, spread, still,
+};
 
-/// A kind of thing in the demo scene.
+/// Body of the test scene.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum DemoBody {
-    /// Floor and three walls with a chequered texture. Still; inside a tile all of one color, so
-    /// neighbors can merge.
+    /// Floor and three walls with a checkered texture. Still; each tile has one color, so its Gaussians can merge.
     Wall,
-    /// Near-duplicates of wall Gaussians: a tenth of a size beside one, a little smaller, of the same
-    /// color. Still; the first to merge.
+    /// Near-duplicates of wall Gaussians, shifted by a tenth of their size, a little smaller, of the same color. Still;
+    /// the first to merge.
     Double,
-    /// Opaque Gaussians behind the back wall that no camera sees. Still; the first to prune by
-    /// visibility, and not by opacity or size.
+    /// Opaque Gaussians behind the back wall, invisible to every camera. Still; pruned first by visibility, but not by
+    /// opacity or size.
     Buried,
-    /// Tiny faint Gaussians all over the room. Still; the first to prune by coverage.
+    /// Tiny faint Gaussians all over the room. Still; pruned first by coverage.
     Dust,
-    /// An egg that circles and spins as one body: strong motion that is rigid, so merging within it
-    /// keeps the motion.
+    /// Egg that circles and spins: strong but rigid motion, so merging within it keeps the motion.
     Egg,
-    /// A cloth, held at its left edge and waving at the right: neighbors move differently.
+    /// Cloth held at its left edge and waving at the right: neighbors move differently.
     Cloth,
-    /// A cloud whose opacity goes from full to nothing or the reverse. Still: only the variance of the
-    /// opacity and the life span tell it from a wall.
+    /// Cloud whose opacity falls from full to 0 or rises. Still; only the variance of the opacity and the life span
+    /// differ from a wall.
     Fading,
-    /// Sparks that fly and are seen for an eighth of the sequence each, at their own time: disjoint
-    /// lives, no motion while dead.
+    /// Sparks that fly, each visible for an eighth of the sequence at its own time: disjoint life spans, no motion
+    /// outside of them.
     Spark,
-    /// Hanging wires of needles, 25 times longer than thick. Still; small in area and yet seen.
+    /// Hanging wires of needles, 25 times longer than thick. Still; small in area but visible.
     Wire,
 }
 
@@ -51,7 +50,7 @@ impl DemoBody {
         DemoBody::Wire,
     ];
 
-    /// Its name, for tables.
+    /// Returns the name for tables.
     pub const fn name(self) -> &'static str {
         match self {
             DemoBody::Wall => "wall",
@@ -66,7 +65,7 @@ impl DemoBody {
         }
     }
 
-    /// Parts of a thousand Gaussians.
+    /// Returns the body's share of a thousand Gaussians.
     const fn share(self) -> usize {
         match self {
             DemoBody::Wall => 400,
@@ -79,95 +78,10 @@ impl DemoBody {
     }
 }
 
-/// A Gaussian's constants and its law of motion.
-#[derive(Debug, Clone)]
-pub(super) struct DemoGaussian {
-    position: DVec3,
-    rotation: DQuat,
-    opacity_logit: f64,
-    motion: DemoMotion,
-    pub(super) log_scale: [f32; 3],
-    pub(super) sh: [f32; 12],
-}
-
-/// What varies, at one time.
-pub(super) struct Moved {
-    pub(super) position: DVec3,
-    pub(super) rotation: DQuat,
-    pub(super) opacity_logit: f64,
-}
-
-/// How a Gaussian moves; times run from 0 to 1.
-#[derive(Debug, Clone)]
-enum DemoMotion {
-    Still,
-    /// `position` and `rotation` are those in the egg's own frame.
-    Egg,
-    /// Displaced along y by a wave, `along` from 0 (held) to 1 (free).
-    Wave {
-        along: f64,
-    },
-    /// The logit changes at this rate per unit of time.
-    Fade {
-        rate: f64,
-    },
-    /// Seen within `half_life` of `peak`, flying at `velocity` meanwhile.
-    Spark {
-        peak: f64,
-        half_life: f64,
-        velocity: DVec3,
-    },
-}
-
-/// The cloth's size along x, and how far its free edge swings.
-const CLOTH_WIDTH: f64 = 1.2;
-const SWING: f64 = 0.18;
-/// Waves along the cloth, and waves that pass in the sequence.
-const WAVES: f64 = 1.5;
-const PASSES: f64 = 2.0;
-/// Logit at which a spark or a fading Gaussian is as good as gone; 0.01, the usual threshold of life,
-/// is −4.6.
-const GONE: f64 = -6.0;
-/// Logit of the sparks at their peak.
-const BRIGHT: f64 = 3.0;
-/// The sparks' half lives. With 1/16 they span an eighth of the sequence.
-const HALF_LIFE: f64 = 1.0 / 16.0;
-const GRAVITY: f64 = 12.0;
-
-impl DemoGaussian {
-    /// The Gaussian at `time`.
-    pub(super) fn at(&self, time: f64) -> Moved {
-        let DemoGaussian { mut position, mut rotation, mut opacity_logit, .. } = *self;
-        match self.motion {
-            DemoMotion::Still => {}
-            DemoMotion::Egg => {
-                let (sin, cos) = (0.75 * TAU * time).sin_cos();
-                let spin = DQuat::from_axis_angle(DVec3::new(1.0, 1.0, 3.0).normalize(), TAU * time);
-                position = DVec3::new(0.6 * cos, 0.2 + 0.4 * sin, 0.7) + spin * position;
-                rotation = spin * rotation;
-            }
-            DemoMotion::Wave { along } => {
-                let (sin, cos) = (TAU * (WAVES * along - PASSES * time)).sin_cos();
-                position.y += SWING * along * sin;
-                let slope = SWING * (sin + along * TAU * WAVES * cos) / CLOTH_WIDTH;
-                rotation = DQuat::from_rotation_z(slope.atan()) * rotation;
-            }
-            DemoMotion::Fade { rate } => opacity_logit += rate * time,
-            DemoMotion::Spark { peak, half_life, velocity } => {
-                let away = (time - peak) / half_life;
-                opacity_logit = BRIGHT + (GONE - BRIGHT) * (away * away).min(1.5);
-                let flown = (time - (peak - half_life)).clamp(0.0, 2.0 * half_life);
-                position += velocity * flown - DVec3::Z * (0.5 * GRAVITY * flown * flown);
-            }
-        }
-        Moved { position, rotation, opacity_logit }
-    }
-}
-
-/// Which Gaussian belongs to which body.
+/// Ranges of the bodies' Gaussians.
 #[derive(Debug, Clone)]
 pub(super) struct BodyLayout {
-    /// Where each body starts, and where the last ends.
+    /// First id of each body, then the count.
     starts: [usize; DemoBody::ALL.len() + 1],
 }
 
@@ -187,7 +101,7 @@ impl BodyLayout {
         self.starts[at]..self.starts[at + 1]
     }
 
-    /// Gaussian `id`, less than the count.
+    /// Returns Gaussian `id`, less than the count.
     pub(super) fn part(&self, id: usize) -> DemoGaussian {
         let body = DemoBody::ALL[self.starts.partition_point(|&start| start <= id) - 1];
         let members = self.members(body);
@@ -208,7 +122,7 @@ impl BodyLayout {
 
     fn double(&self, k: usize, n: usize, dice: GaussianRandom) -> DemoGaussian {
         let walls = self.members(DemoBody::Wall);
-        // A scene of two Gaussians has a double and no wall.
+        // A scene of two Gaussians has a double but no wall.
         let original = (k as u128 * walls.len() as u128 / n as u128) as usize;
         let mut part = wall(original, walls.len().max(1), GaussianRandom((walls.start + original) as u64));
         let size = f64::from(part.log_scale[0]).exp();
@@ -217,58 +131,6 @@ impl BodyLayout {
         part.opacity_logit -= 1.0;
         part
     }
-}
-
-/// Numbers that belong to one Gaussian: hashed from its id, so that no order of drawing matters.
-#[derive(Clone, Copy)]
-struct GaussianRandom(u64);
-
-impl GaussianRandom {
-    /// Number `channel`, from 0 to 1.
-    fn unit(self, channel: u64) -> f64 {
-        const BITS: u32 = f64::MANTISSA_DIGITS;
-        (xxh3_64_with_seed(&self.0.to_le_bytes(), channel) >> (64 - BITS)) as f64 / (1u64 << BITS) as f64
-    }
-
-    /// Number `channel`, from −1 to 1.
-    fn signed(self, channel: u64) -> f64 {
-        2.0 * self.unit(channel) - 1.0
-    }
-
-    /// Number `channel`, from `low` to `high`.
-    fn between(self, channel: u64, low: f64, high: f64) -> f64 {
-        low + (high - low) * self.unit(channel)
-    }
-}
-
-/// Channels of [`GaussianRandom`] that several bodies use: the bodies' own start at 0.
-const TINT: u64 = 100;
-const SHEEN: u64 = 200;
-
-fn still(position: DVec3, rotation: DQuat, scale: [f64; 3], opacity_logit: f64, sh: [f32; 12]) -> DemoGaussian {
-    let log_scale = scale.map(|s| s.ln() as f32);
-    DemoGaussian { position, rotation, opacity_logit, motion: DemoMotion::Still, log_scale, sh }
-}
-
-/// Coefficients for a color in [0, 1], with a tint of its own and a slight change with direction.
-fn color(rgb: [f64; 3], dice: GaussianRandom) -> [f32; 12] {
-    std::array::from_fn(|at| match at {
-        0..3 => ((rgb[at] + 0.02 * dice.signed(TINT) - 0.5) / SH_C0) as f32,
-        _ => (0.04 * dice.signed(SHEEN + at as u64)) as f32,
-    })
-}
-
-/// Point `k` of a sequence that fills the unit square evenly however many are taken (R2: Roberts,
-/// "The unreasonable effectiveness of quasirandom sequences", 2018).
-fn spread(k: usize) -> DVec2 {
-    const PLASTIC: f64 = 1.324_717_957_244_746;
-    let k = k as f64;
-    DVec2::new((0.5 + k / PLASTIC).fract(), (0.5 + k / (PLASTIC * PLASTIC)).fract())
-}
-
-/// Rotates the thin axis z to ∓y.
-fn facing_y() -> DQuat {
-    DQuat::from_rotation_x(FRAC_PI_2)
 }
 
 fn wall(k: usize, n: usize, dice: GaussianRandom) -> DemoGaussian {

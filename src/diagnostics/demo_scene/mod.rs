@@ -1,13 +1,15 @@
-//! A small dynamic scene made from nothing: for trying the program without files, and for tests.
+//! Two generated dynamic scenes: [`Playground`] for `splatsieve demo`, and [`Scene`] for tests.
 //!
-//! It holds what trained scenes hold and this program is about, each in a [`DemoBody`] whose motion is
-//! known in closed form: a room with needless Gaussians in it, things that move rigidly and not,
-//! things that fade and flash, thin things. Every value is a function of the Gaussian's number, the
-//! scene's size and the time, so nothing is stored and any block can be read on its own.
+//! The test scene has one [`DemoBody`] for each property of trained scenes that the program handles, with motion in
+//! closed form: a room with needless Gaussians, rigid and non-rigid motion, fading and flashing, thin structures.
+//! Every value is a function of the Gaussian's number, the scene's size and the time, so nothing is stored and any
+//! block can be read on its own.
 //!
 //! Memory: at most 192 bytes per Gaussian of an open block.
 
 mod bodies;
+mod motion;
+mod playground;
 
 #[cfg(test)]
 mod tests;
@@ -19,22 +21,23 @@ use glam::DVec3;
 use crate::error::{Error, Result};
 use crate::model::{Attributes, Camera, Gaussians, Rig, SequenceInfo, Shot, Split};
 use crate::source::{BlockReader, FrameSource, Ids};
-use bodies::{BodyLayout, DemoGaussian};
+use bodies::BodyLayout;
+use motion::DemoGaussian;
 
 pub use bodies::DemoBody;
+pub use playground::Playground;
 
-/// Degree of the scene's spherical harmonics: view-dependent enough to exercise the code, small
-/// enough to keep the scene so.
+/// SH degree of both scenes: enough to depend on the view, and few coefficients.
 const SH_DEGREE: usize = 1;
 
-/// Cameras of [`Scene::rig`].
+/// Number of cameras of [`Scene::rig`].
 const CAMERAS: u32 = 6;
-/// The camera that is held out: an inner one, so that its view is between the others'.
+/// Camera of the test view: an inner one, so that its view lies between training views.
 const HELD_OUT: u32 = 2;
 
-/// The scene, in units in which its room is 4 wide, 4 deep and 2.5 high, z up, open towards −y.
+/// The test scene: a room 4 units wide, 4 deep and 2.5 high, z up, open toward −y.
 ///
-/// With more Gaussians the surfaces are made of smaller ones, with more frames the same motion is
+/// With more Gaussians the surfaces consist of smaller ones, with more frames the same motion is
 /// sampled more finely. A Gaussian's values depend on the scene's count.
 ///
 /// ```
@@ -57,7 +60,7 @@ impl Scene {
     /// Usual number of frames.
     pub const FRAMES: usize = 48;
 
-    /// The scene as `count` Gaussians at `frames` times from 0 to 1; either may be any number.
+    /// Returns the scene as `count` Gaussians at `frames` times from 0 to 1; either may be any number.
     pub fn new(count: usize, frames: usize) -> Scene {
         let last = frames.saturating_sub(1).max(1) as f64;
         let info = SequenceInfo {
@@ -69,14 +72,13 @@ impl Scene {
         Scene { layout: BodyLayout::new(count), info }
     }
 
-    /// The Gaussians of a body, which are consecutive; bodies follow one another in the order of
-    /// [`DemoBody::ALL`].
+    /// Returns the ids of a body's Gaussians. Bodies follow one another in the order of [`DemoBody::ALL`].
     pub fn members(&self, body: DemoBody) -> Range<usize> {
         self.layout.members(body)
     }
 
-    /// Six cameras before the open side of the room, 256×192 pixels, each at every frame; the third
-    /// is for testing.
+    /// Returns six cameras in front of the open side of the room, 256×192 pixels, each at every frame; the third is
+    /// for testing.
     pub fn rig(&self) -> Rig {
         let camera = |view: u32| {
             let eye = DVec3::new(-1.7 + 0.68 * f64::from(view), -4.2, 1.2 + 0.4 * f64::from(view % 2));
@@ -112,6 +114,7 @@ impl FrameSource for Scene {
     }
 }
 
+/// Reader of consecutive or listed Gaussians of a generated scene.
 struct Reader<'a> {
     times: &'a [f64],
     parts: Vec<DemoGaussian>,
@@ -147,4 +150,24 @@ impl BlockReader for Reader<'_> {
         }
         Ok(())
     }
+}
+
+/// Returns the cameras of `rig` as a `cameras.json` of 3DGS: camera-to-world rotations, every camera at every frame.
+pub fn cameras_json(rig: &Rig) -> String {
+    let camera = |(id, camera): (usize, &Camera)| {
+        let to_world = camera.rotation.transpose();
+        let rows = [0, 1, 2].map(|row| to_world.row(row).to_array());
+        serde_json::json!({
+            "id": id,
+            "img_name": format!("view_{id:02}"),
+            "width": camera.width,
+            "height": camera.height,
+            "position": camera.center().to_array(),
+            "rotation": rows,
+            "fx": camera.fx,
+            "fy": camera.fy,
+        })
+    };
+    let all: Vec<serde_json::Value> = rig.cameras.iter().enumerate().map(camera).collect();
+    format!("{:#}\n", serde_json::Value::from(all))
 }

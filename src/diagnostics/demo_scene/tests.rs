@@ -1,4 +1,4 @@
-//! The demo scene is what its bodies claim.
+//! Properties of the bodies of the test scene.
 
 use super::*;
 use crate::model::AttributeValues;
@@ -11,7 +11,7 @@ fn frame(scene: &Scene, ids: Ids<'_>, frame: usize) -> Gaussians {
     out
 }
 
-/// A body at every frame.
+/// Returns a body at every frame.
 fn film(scene: &Scene, body: DemoBody) -> Vec<Gaussians> {
     let members = scene.members(body);
     (0..scene.info().times.len()).map(|t| frame(scene, Ids::Range(members.clone()), t)).collect()
@@ -138,8 +138,8 @@ fn cloth_is_held_at_one_edge_and_bends_at_the_other() {
         film.iter().map(apart).fold(f64::MIN, f64::max) - film.iter().map(apart).fold(f64::MAX, f64::min)
     };
     assert!((0..n).any(|i| stretch(i, right) > 0.05), "distances change: no rigid motion does that");
-    // Between two close Gaussians the surface runs across the mean of their thin axes: what is left
-    // is y‴d²/12, 0.02 at 0.05 apart.
+    // Between two close Gaussians the surface is normal to the mean of their thin axes up to y‴d²/12, 0.02 at a
+    // distance of 0.05.
     let state = &film[5];
     let normal = |i: usize| {
         let [w, x, y, z] = state.rotation.row::<4>(i).map(f64::from);

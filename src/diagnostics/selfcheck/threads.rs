@@ -4,8 +4,8 @@ use std::fs;
 
 use super::case::{Case, LargestError};
 use super::made::clouds::{camera, scene};
-use crate::diagnostics::demo;
-use crate::diagnostics::demo::DemoOptions;
+use crate::diagnostics::test_scene;
+use crate::diagnostics::test_scene::TestSceneOptions;
 use crate::error::{Error, Result};
 use crate::files::atomic::{Replace, ScratchFolder};
 use crate::memory_plan::Budget;
@@ -35,7 +35,7 @@ fn run_on(threads: usize) -> Result<(Vec<u8>, Gradients)> {
         let mut recipe = Recipe::preset("default")?;
         // Few steps are enough to run all code of refinement.
         recipe.refine.refine_steps = 10;
-        demo::run(&DemoOptions {
+        test_scene::run(&TestSceneOptions {
             gaussians: 400,
             frames: 6,
             kept: Target::Ratio(0.5),

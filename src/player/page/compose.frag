@@ -1,10 +1,10 @@
 #version 300 es
-// The finished pictures on the canvas: one, two under a wipe, or what differs between them.
+// Copies finished images to the canvas: one, two with a border between them, or their difference.
 precision highp float;
 
 uniform highp sampler2D left;
 uniform highp sampler2D right;
-uniform vec2 corner;      // of this picture on the canvas
+uniform vec2 corner;      // of this image on the canvas
 uniform float cut;        // column from which the right one is shown
 uniform float gain;       // above 0: their difference, times this
 out vec4 paint;

@@ -1,5 +1,5 @@
-// Draws models with WebGL 2: a pass that projects every Gaussian, one that blends their rectangles back to front into a picture of
-// half floats, and one that puts pictures on the canvas.
+// Draws models with WebGL 2. A first pass projects every Gaussian, a second blends their rectangles back to front into an image of
+// half floats, and a third copies images to the canvas.
 
 const TEXELS = 2048; // Gaussians across a texture, as in the worker
 
@@ -7,7 +7,7 @@ class Painter {
     constructor(canvas) {
         const gl = this.gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false });
         if (!gl) throw new Error("This browser does not offer WebGL 2, with which the scene is drawn.");
-        // Thin layers add up: eight bits would lose them.
+        // Many faint layers add up, which eight bits would lose.
         const floats = gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float");
         this.format = floats ? gl.RGBA16F : gl.RGBA8;
         this.splat = this.program("quad", "splat");
@@ -64,7 +64,7 @@ class Painter {
         });
     }
 
-    /// Picture `place`, of this size.
+    /// Returns image `place`, of this size.
     picture(place, width, height) {
         const gl = this.gl;
         let picture = this.pictures[place];
@@ -80,7 +80,7 @@ class Painter {
         return picture;
     }
 
-    /// Paints `figure` as `sight` sees it into picture `place`.
+    /// Draws `figure` from the camera `sight` into image `place`.
     paint(figure, place, sight, background) {
         const gl = this.gl, [width, height] = sight.size;
         figure.project(sight);
@@ -101,7 +101,7 @@ class Painter {
         return picture;
     }
 
-    /// Resolves when everything asked for so far is drawn: a slow machine would else be asked for more and more.
+    /// Resolves when all requested frames are drawn, so that requests do not pile up on a slow machine.
     finished() {
         const gl = this.gl, sync = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
         gl.flush();
@@ -115,7 +115,7 @@ class Painter {
         });
     }
 
-    /// Puts two pictures on the canvas from column `x` on, the right one from column `cut` of theirs; with `gain` what differs.
+    /// Copies two images to the canvas from column `x` on, the right one from its column `cut` on; with `gain` their difference.
     put(left, right, x, cut, gain) {
         const gl = this.gl, { program, at } = this.compose;
         gl.bindFramebuffer(gl.FRAMEBUFFER, null);
@@ -130,7 +130,7 @@ class Painter {
     }
 }
 
-/// One model on the graphics card.
+/// Model on the graphics card.
 class Figure {
     constructor(painter, track) {
         const gl = painter.gl;
@@ -158,7 +158,7 @@ class Figure {
         gl.vertexAttribDivisor(0, 1);
     }
 
-    /// Takes what the worker says.
+    /// Takes an answer of the worker.
     take(message) {
         const gl = this.painter.gl;
         for (const name of ["place", "turn", "extent"]) {
@@ -175,7 +175,7 @@ class Figure {
         this.visible = message.order.length;
     }
 
-    /// Footprints of all Gaussians.
+    /// Computes the footprints of all Gaussians.
     project({ rows, eye, focal, principal, size, near }) {
         const { painter, track } = this, gl = painter.gl, { program, at } = this.program;
         gl.bindFramebuffer(gl.FRAMEBUFFER, this.target);

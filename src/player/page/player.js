@@ -1,5 +1,5 @@
-// The page: what is shown of which moment from where, and everything a person may do about it. One picture is in the making
-// at a time: the workers are asked for a moment, and when all have answered it is drawn.
+// The player: the models, the time and the camera that are shown, and the controls. One frame is prepared at a time: the
+// workers are asked for a time, and the frame is drawn when all have answered.
 
 const el = (id) => document.getElementById(id);
 const FRAMES_PER_SECOND = 30; // at speed 1
@@ -39,7 +39,7 @@ class Model {
             this.worker.postMessage({ kind: "show", time, sight: { row: rows[2], eye, near } });
         });
     }
-    /// The last time up to which every frame is there.
+    /// Last time up to which every frame has arrived.
     get until() {
         const { groups, times } = this.track;
         let place = 0;
@@ -66,14 +66,14 @@ const player = {
         if (stage.files.length) load(0);
         requestAnimationFrame(tick);
     },
-    /// A chunk of a model's frames, as a script brings it.
+    /// Takes a chunk of a model's frames from a script.
     chunk(model, place, text) {
         document.currentScript?.remove();
         models[model]?.worker.postMessage({ kind: "chunk", place, text });
     },
-    /// Resolves when everything has arrived and the picture is that of the controls.
+    /// Resolves when everything has arrived and the image on the canvas matches the controls.
     settled: () => new Promise((resolve) => { waiting.push(resolve); isDirty = true; }),
-    /// The canvas: width, height, and red, green, blue from its top left on, in base64.
+    /// Returns the canvas: width, height, and red, green, blue from its top left on, in base64.
     pixels() {
         draw();
         const { gl } = painter, { width, height } = gl.canvas, rgba = new Uint8Array(4 * width * height);
@@ -86,7 +86,7 @@ const player = {
     },
 };
 
-/// Chunks that lie beside the page, one after the other: a page from a disk may load scripts, and nothing else.
+/// Loads the chunks beside the page, one after the other. A page from a disk may load scripts, and nothing else.
 function load(place) {
     if (place === stage.files.length) return;
     const script = document.createElement("script");
@@ -104,11 +104,11 @@ function arrivals() {
     return here === wanted;
 }
 
-// Where from.
+// Camera.
 
 const distance = () => Math.hypot(...plus(focus, camera.eye, -1));
 
-/// From where one camera stood; turning is about the point in the middle of its picture that is as far as the scene's middle.
+/// Takes the place of a camera. The camera then turns around the point on its axis that is as far away as the scene's middle.
 function lookFrom(look) {
     camera = { ...look, rows: look.rotation.map((row) => [...row]), eye: [...look.eye] };
     const away = dot(plus(stage.middle, look.eye, -1), look.rotation[2]);
@@ -116,7 +116,7 @@ function lookFrom(look) {
     isDirty = true;
 }
 
-/// From outside, where nobody stood.
+/// Returns a camera outside of the scene, for scenes without cameras.
 function overview() {
     const up = unit(stage.up);
     const aside = unit(Math.abs(up[0]) < 0.9 ? plus([1, 0, 0], up, -up[0]) : plus([0, 1, 0], up, -up[1]));
@@ -127,7 +127,7 @@ function overview() {
     return { size: [800, 600], focal: [800, 800], principal: [400, 300], near: 0.01 * stage.extent, rotation: [right, down, ahead], eye };
 }
 
-/// Turns everything about the focus.
+/// Turns the camera around the focus.
 function turn(axis, angle) {
     const c = Math.cos(angle), s = Math.sin(angle), along = (v) => dot(axis, v) * (1 - c);
     const rotated = (v) => [
@@ -140,7 +140,7 @@ function turn(axis, angle) {
 function orbit(across, down) {
     turn(unit(stage.up), -across);
     const up = unit(stage.up), pitch = Math.asin(Math.max(-1, Math.min(1, dot(camera.rows[2], up))));
-    // Not over the pole, where left and right would change places.
+    // The camera stops before the pole, where left and right would change places.
     const wanted = Math.max(-1.5, Math.min(1.5, pitch - down));
     turn(camera.rows[0], Math.abs(pitch) > 1.5 ? -down : wanted - pitch);
     changed();
@@ -165,17 +165,17 @@ function changed() {
     isDirty = true;
 }
 
-// What is drawn.
+// Drawing.
 
 const mode = () => models.length < 2 ? "original" : el("show").value;
 const seen = () => ({ original: [0], compressed: [1] })[mode()] ?? [0, 1];
 
-/// Size of one picture on the canvas in CSS pixels, and how much larger it is than the camera's.
+/// Returns the size of one image on the canvas in CSS pixels, and its scale relative to the camera's pixels.
 function fit() {
     const width = el("stage").clientWidth / (mode() === "beside" ? 2 : 1), height = el("stage").clientHeight;
     return { width, height, scale: Math.min(width / camera.size[0], height / camera.size[1]) };
 }
-/// The camera's numbers for one picture of the canvas.
+/// Returns the camera's numbers for one image of the canvas.
 function sight() {
     let { width, height } = fit();
     const dense = exact ? 1 : Math.min(devicePixelRatio || 1, 2) * coarse;
@@ -188,7 +188,7 @@ function sight() {
         principal: camera.principal.map((p, k) => (p - camera.size[k] / 2) * scale + [width, height][k] / 2),
     };
 }
-let current; // the sight that the workers sorted for
+let current; // the camera numbers that the workers sorted for
 function draw() {
     const { canvas } = painter.gl, [width, height] = current.size;
     const wide = mode() === "beside" ? 2 * width : width;
@@ -204,7 +204,7 @@ function draw() {
 async function refresh() {
     isBusy = true;
     isDirty = false;
-    // Of what has not arrived yet the last that has.
+    // Frames that have not arrived yet are replaced by the last one that has.
     const until = Math.min(...seen().map((place) => models[place].until));
     if (until > -Infinity) {
         const at = Math.min(time, until), from = sight();
@@ -212,6 +212,7 @@ async function refresh() {
         current = from;
         draw();
         await painter.finished();
+        el("poster")?.remove();
         rate();
         if (!isDirty && !playing && arrivals()) {
             isDirty = false;
@@ -222,10 +223,10 @@ async function refresh() {
     isBusy = false;
 }
 
-/// Pictures per second; where they are few, those that move are drawn coarser.
+/// Shows the frames per second. Where they are few, moving frames are drawn coarser.
 function rate() {
     const now = performance.now();
-    // Who looks at something still waits for nothing.
+    // A still image needs no speed.
     drawn = now - moved < 1000 ? [...drawn.filter((t) => now - t < 8000).slice(-8), now] : [];
     const gaps = drawn.length - 1, mean = (now - drawn[0]) / gaps;
     if (gaps > 1) el("rate").textContent = `${(1000 / mean).toFixed(mean > 100 ? 1 : 0)} fps`;
@@ -256,7 +257,7 @@ function tick(now) {
     if (isDirty && !isBusy) refresh().catch(fail);
 }
 
-// What a person does.
+// Controls.
 
 function clock() {
     const model = models.reduce((a, b) => b.track.times.length > a.track.times.length ? b : a);
@@ -281,7 +282,7 @@ function step(by) {
 function play(on) {
     playing = on && span[1] > span[0];
     drawn = [];
-    el("play").textContent = playing ? "❚❚" : "▶";
+    document.documentElement.classList.toggle("playing", playing);
     el("play").setAttribute("aria-label", playing ? "Pause" : "Play");
     isDirty = true;
 }
@@ -299,14 +300,14 @@ function jump(value) {
 }
 function layOut() {
     const both = ["wipe", "beside", "difference"].includes(mode());
-    el("gaining").hidden = mode() !== "difference";
+    el("gain").hidden = mode() !== "difference";
     el("cut").hidden = mode() !== "wipe";
     const label = (id, model) => {
         el(id).replaceChildren();
         if (!model) return;
         const { track } = model, less = [];
         if (track.times.length < model.frames) less.push(`${track.times.length} of ${model.frames} frames`);
-        if (track.sh_degree < model.degree) less.push(`harmonics of degree ${track.sh_degree} of ${model.degree}`);
+        if (track.sh_degree < model.degree) less.push(`SH degree ${track.sh_degree} of ${model.degree}`);
         const small = document.createElement("small");
         small.textContent = [`${count(track.count)} Gaussians`, bytes(model.bytes), ...less].join(" · ");
         el(id).append(models.length > 1 ? model.role : model.name, small);
@@ -318,11 +319,12 @@ function layOut() {
 
 function setUp() {
     document.title = models.map((model) => model.name).join(" → ") + " – splatsieve";
-    el("showing").hidden = models.length < 2;
-    el("timing").hidden = span[1] <= span[0];
+    el("show").hidden = models.length < 2;
+    el("timing").hidden = el("speed").hidden = span[1] <= span[0];
+    el("full").hidden = !document.fullscreenEnabled;
     Object.assign(el("scrub"), { min: span[0], max: span[1] });
-    el("camera").append(new Option("free", ""), ...stage.cameras.map((look, k) =>
-        new Option(`view ${look.view} · ${look.split}${look.time == null ? "" : ` · t ${Number(look.time.toPrecision(3))}`}`, k)));
+    el("camera").append(new Option("Free camera", ""), ...stage.cameras.map((look, k) =>
+        new Option(`View ${look.view} · ${look.split}${look.time == null ? "" : ` · t ${Number(look.time.toPrecision(3))}`}`, k)));
     home = stage.cameras[0] ?? overview();
     jump(stage.cameras.length ? 0 : "");
     setCut(0.5);
@@ -335,9 +337,12 @@ function setUp() {
     obey();
 }
 
-/// #camera=VIEW&time=T&frame=K&show=MODE&cut=PART&paused&exact: as links and tests want it; exact is in the camera's own pixels.
+/// Obeys #camera=VIEW&time=T&frame=K&show=MODE&cut=PART&paused&exact of a link; exact draws in the camera's own pixels.
+/// With ?embed or #embed the page shows the scene without controls.
 function obey() {
     const asked = new URLSearchParams(location.hash.slice(1));
+    const isEmbedded = asked.has("embed") || new URLSearchParams(location.search).has("embed");
+    document.documentElement.classList.toggle("embed", isEmbedded);
     if (asked.has("show")) el("show").value = asked.get("show");
     if (asked.has("cut")) setCut(Number(asked.get("cut")));
     if (asked.has("camera")) {
@@ -352,26 +357,47 @@ function obey() {
     layOut();
 }
 
+/// Returns a number with one significant digit.
+const about = (x) => x < 1e-6 ? x.toExponential(0) : String(Number(x.toPrecision(1)));
+
+const KEYS = [
+    ["space", "play or pause"], [", .", "one frame back or on"], ["[ ]", "slower or faster"], ["arrows", "turn; with shift: move"],
+    ["+ −", "closer or further away"], ["c C", "next or previous camera"], ["v", "next way to compare"], ["0", "back to the first camera"],
+    ["f", "full screen"], ["?", "this help"],
+];
+
+/// Fills the help: keys, gestures and facts about the models.
 function facts() {
     const list = document.createElement("dl");
     const fact = (term, text) => {
         const [dt, dd] = [document.createElement("dt"), document.createElement("dd")];
-        dt.textContent = term;
+        dt.append(term);
         dd.textContent = text;
         list.append(dt, dd);
     };
-    fact("Mouse", "drag to turn, right or shift drag to move, wheel to come closer");
-    fact("Touch", "one finger turns, two move and pinch");
-    fact("Keys", "space plays, , and . step a frame, [ and ] change the speed, arrows turn (shift: move), + and − come closer and go away, "
-        + "c and C go through the cameras, v through what is shown, 0 goes back to the start");
-    for (const { role, name, track, bytes: size, frames, degree } of models) {
-        const { steps } = track;
-        fact(role, `${name}: ${count(track.count)} Gaussians, ${bytes(size)}; ${track.times.length} of ${frames} frames, harmonics of degree ${track.sh_degree} of ${degree}`);
-        fact("Values here are off by at most", `${steps.position / 2} in positions, ${steps.rotation / 2} in unit quaternions, ${steps.log_scale / 2} in logarithms of scales, `
-            + `${steps.opacity / 2} in opacities, ${steps.sh / 2} in harmonics; between frames they change evenly`);
+    for (const [key, text] of KEYS) {
+        const kbd = document.createElement("kbd");
+        kbd.textContent = key;
+        fact(kbd, text);
     }
+    fact("Mouse", "drag to turn, right or shift drag to move, wheel to come closer");
+    fact("Touch", "one finger turns, two fingers move and pinch");
+    for (const { role, name, track, bytes: size, frames, degree } of models) {
+        fact(role[0].toUpperCase() + role.slice(1), `${name}: ${count(track.count)} Gaussians, ${bytes(size)}; `
+            + `${track.times.length} of ${frames} frames, SH degree ${track.sh_degree} of ${degree}`);
+    }
+    const { steps } = models[0].track, part = about(50 * steps.position / stage.extent);
+    fact("Rounding here", `at most ${part}% of the scene's size in positions, ${about(steps.rotation / 2)} in unit quaternions, `
+        + `${about(100 * Math.expm1(steps.log_scale / 2))}% in scales, ${about(steps.opacity / 2)} in opacities, `
+        + `${about(steps.sh / 2)} in SH coefficients; between frames the values change evenly`);
     fact("Made by", stage.tool);
     el("facts").replaceChildren(list);
+}
+
+/// Enters or leaves full screen.
+function toggleFull() {
+    if (document.fullscreenElement) document.exitFullscreen();
+    else document.documentElement.requestFullscreen().catch(() => {});
 }
 
 function listen() {
@@ -413,7 +439,9 @@ function listen() {
     });
     handle.addEventListener("pointerup", () => { handle.onpointermove = null; });
 
-    el("controls").onsubmit = () => false;
+    el("ask").onclick = () => el("help").showModal();
+    el("close").onclick = () => el("help").close();
+    el("full").onclick = toggleFull;
     el("play").onclick = () => play(!playing);
     el("scrub").oninput = () => { play(false); seek(Number(el("scrub").value)); };
     el("show").onchange = layOut;
@@ -421,7 +449,7 @@ function listen() {
     el("camera").onchange = () => el("camera").value !== "" && jump(el("camera").value);
     new ResizeObserver(() => { isDirty = true; }).observe(el("stage"));
     addEventListener("keydown", (event) => {
-        if (event.ctrlKey || event.metaKey || event.altKey || /SELECT|INPUT/.test(event.target.tagName)) return;
+        if (event.ctrlKey || event.metaKey || event.altKey || el("help").open || /SELECT|INPUT/.test(event.target.tagName)) return;
         const next = (select, by) => {
             select.selectedIndex = (select.selectedIndex + by + select.options.length) % select.options.length;
             select.dispatchEvent(new Event("change"));
@@ -436,12 +464,12 @@ function listen() {
             select.selectedIndex = Math.max(0, Math.min(select.options.length - 1, select.selectedIndex + by));
         };
         const keys = {
-            " ": () => event.target.tagName === "BUTTON" || event.target.tagName === "SUMMARY" ? false : play(!playing),
+            " ": () => event.target.tagName === "BUTTON" ? false : play(!playing),
             ",": () => step(-1), ".": () => step(1), "[": () => speed(-1), "]": () => speed(1),
             ArrowLeft: () => move(-1, 0), ArrowRight: () => move(1, 0), ArrowUp: () => move(0, -1), ArrowDown: () => move(0, 1),
             "+": () => zoom(0.9), "=": () => zoom(0.9), "-": () => zoom(1 / 0.9),
             c: () => next(el("camera"), 1), C: () => next(el("camera"), -1), v: () => models.length > 1 && next(el("show"), 1),
-            0: () => jump(stage.cameras.length ? 0 : ""),
+            0: () => jump(stage.cameras.length ? 0 : ""), f: toggleFull, "?": () => el("help").showModal(),
         };
         if (!keys[event.key] || keys[event.key]() === false) return;
         event.preventDefault();

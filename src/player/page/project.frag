@@ -1,6 +1,6 @@
 #version 300 es
-// From one Gaussian per texel to its footprint in the picture, as crates/splat-render/src/project.rs and color.rs have it: the same near
-// plane, widening, cut of the directions, tiles that 3 sigma reach, and smallest alpha.
+// Computes the footprint of one Gaussian per texel, as crates/splat-render/src/project.rs and color.rs do: same near plane, widening,
+// clamping of the directions, tiles within 3 sigma, and smallest alpha.
 precision highp float;
 precision highp int;
 precision highp isampler2DArray;
@@ -13,7 +13,7 @@ uniform float harmonicStep;
 uniform mat3 rows;                  // column k is row k of the rotation from world to camera
 uniform vec3 eye;
 uniform vec2 focal;
-uniform vec2 principal;             // where the optical axis lands when pixel centres are integers
+uniform vec2 principal;             // where the optical axis lands when pixel centers are integers
 uniform vec2 slopeLimit;
 uniform vec2 size;
 uniform float near;
@@ -58,7 +58,7 @@ vec3 shade(ivec2 at, vec3 d) {
     return max(0.5 + harmonicStep * sum, 0.0);
 }
 
-// Pixels [x, y) of a row: those of the tiles that `radius` reaches, and of them those that `half_` reaches.
+// Returns the pixels [x, y) of a row that lie in tiles within `radius` and within `half_`.
 vec2 span(float at, float radius, float half_, float end) {
     float start = max(floor((at - radius) / TILE) * TILE, ceil(at - half_));
     float stop = min(floor((at + radius + TILE - 1.0) / TILE) * TILE, floor(at + half_) + 1.0);

@@ -1,5 +1,5 @@
 #version 300 es
-// One rectangle of pixels per Gaussian, in the order of `id`.
+// Places one rectangle of pixels per Gaussian, in the order of `id`.
 precision highp float;
 precision highp int;
 precision highp usampler2D;
@@ -21,6 +21,6 @@ void main() {
     fade = uintBitsToFloat(bounds.xy);
     ink = uintBitsToFloat(texelFetch(colour, at, 0).xyz);
     vec2 corner = vec2((gl_VertexID & 1) == 0 ? from.x : to.x, gl_VertexID < 2 ? from.y : to.y);
-    // Pictures run down, the window runs up.
+    // Rows of an image run down, rows of the window run up.
     gl_Position = vec4(2.0 * corner.x / size.x - 1.0, 1.0 - 2.0 * corner.y / size.y, 0.0, 1.0);
 }

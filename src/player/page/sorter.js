@@ -1,14 +1,14 @@
 "use strict";
-// One model in a worker: unpacks its chunks (src/player/track.rs says what they hold), makes the state of a moment, sorts it
-// by depth. One answer for each "show".
+// Model in a worker: unpacks its chunks (format: src/player/track.rs), computes the state at a time and sorts it by depth. Each
+// "show" gets one answer.
 
 const WIDTH = 2048;          // texels across
-const KEPT = 400e6;          // bytes of unpacked groups that stay
+const KEPT = 400e6;          // maximum bytes of unpacked groups in memory
 let track, moving, base, rows;
 const packed = new Map();    // chunk -> its bytes
-const groups = new Map();    // chunk -> its unpacked components, the last used last
+const groups = new Map();    // chunk -> its unpacked components, the most recently used last
 let keptBytes = 0;
-let last = {};               // what the page has already
+let last = {};               // values that the page has already
 let turn = Promise.resolve();
 
 onmessage = ({ data }) => {
@@ -43,7 +43,7 @@ async function inflated(bytes) {
     return new Uint8Array(await new Response(stream).arrayBuffer());
 }
 
-/// Components as planes, frame by frame; null for one that never leaves its first value.
+/// Returns components as planes, frame by frame; null for a constant component.
 async function unpack(packedBytes, components, frames) {
     const bytes = await inflated(packedBytes);
     const count = track.count, size = count * frames;
@@ -89,7 +89,7 @@ async function group(place) {
     return found;
 }
 
-/// The points of `component` at `frame`, and where they begin.
+/// Returns the points of `component` at `frame`, and their offset.
 async function frameAt(frame) {
     if (frame === 0) return (component) => [base[component], 0];
     const place = track.groups.findIndex((first) => first > frame);
@@ -101,7 +101,7 @@ async function frameAt(frame) {
     };
 }
 
-/// The two frames around a time, and how far it is from the first to the second.
+/// Returns the two frames around a time, and the position of the time between them.
 function around(time) {
     const times = track.times;
     let after = times.findIndex((t) => t > time);
@@ -111,7 +111,7 @@ function around(time) {
     return part < 1e-9 ? [after - 1, after - 1, 0] : [after - 1, after, part];
 }
 
-/// Columns that are other than those of the last answer, as texels; between frames they change evenly.
+/// Returns the attributes that differ from the last answer, as texels. Between frames they are interpolated linearly.
 async function stateAt(time) {
     const [a, b, part] = around(time);
     if (last.a === a && last.b === b && last.part === part) return {};
@@ -122,7 +122,7 @@ async function stateAt(time) {
         const [p, i0] = from(component), [q, j0] = to(component);
         for (let i = 0; i < track.count; i++) out[start + 4 * i] = (p[i0 + i] + part * (q[j0 + i] - p[i0 + i])) * step;
     };
-    // What does not change with time is sent once.
+    // Constant attributes are sent once.
     const isNew = (first) => last.a === undefined || moving.includes(first);
     if (isNew(0) || isNew(10)) {
         changed.place = texels(Float32Array, 1);
@@ -149,8 +149,8 @@ async function stateAt(time) {
 
 const bits = new Uint32Array(1), number = new Float32Array(bits.buffer);
 
-/// Gaussians before the near plane, the furthest first, those of equal depth in the order that the rasteriser has, reversed:
-/// a radix sort over both halves of the depth's bits, which are in order as numbers are above 0.
+/// Returns the Gaussians in front of the near plane, the furthest first. Equal depths have the rasterizer's order, reversed. A radix
+/// sort over both halves of the depth's bits works because the bits of positive numbers are in their order.
 function sorted({ row, eye, near }) {
     const { count } = track, place = last.place;
     const keys = new Uint32Array(count), ids = new Uint32Array(count), spare = new Uint32Array(count);

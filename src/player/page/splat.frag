@@ -1,5 +1,5 @@
 #version 300 es
-// Alpha of one Gaussian at one pixel, as crates/splat-render/src/blend.rs has it; blended back to front.
+// Computes alpha of one Gaussian at one pixel, as crates/splat-render/src/blend.rs does; blended back to front.
 precision highp float;
 
 uniform vec2 size;

@@ -1,4 +1,4 @@
-//! Every mode fires on a scene that was hurt that way, and on none that was hurt another way.
+//! Every failure mode is flagged in a scene with that damage, and in no scene with another damage.
 
 use glam::DVec3;
 
@@ -15,7 +15,7 @@ use crate::recipe::Recipe;
 use crate::report::traits::{shares, traits};
 use crate::source::FrameSource;
 
-/// The demo scene with its scores and traits.
+/// Test scene with its scores and traits.
 struct Looked {
     made: Scene,
     scored: Scored,
@@ -38,7 +38,7 @@ fn looked() -> Looked {
 }
 
 impl Looked {
-    /// Part of the visible members of a body that have a trait.
+    /// Returns the share of the visible members of a body that have a trait.
     fn part(&self, body: DemoBody, kind: GaussianKind) -> f64 {
         let rows = self.scored.rows().unwrap();
         let members: Vec<usize> = self.made.members(body).filter(|&i| rows.c[i] > 0.0).collect();
@@ -46,7 +46,7 @@ impl Looked {
         with as f64 / members.len().max(1) as f64
     }
 
-    /// The verdicts on a result that lacks the Gaussians `lost`.
+    /// Returns the verdicts on a result without the Gaussians `lost`.
     fn without(&self, lost: impl Fn(usize) -> bool) -> [FailureMode; 3] {
         let rig = self.made.rig();
         let all: Vec<u32> = (0..self.traits.len() as u32).collect();

@@ -1,0 +1,123 @@
+//! `splatsieve test-scene`: generates the test scene, compresses it and counts what happened to each kind of Gaussian.
+//!
+//! Tests and `scripts/digests.py` make their inputs with it.
+
+use std::fmt::Write as _;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use crate::diagnostics::demo_scene::{self, DemoBody, cameras_json};
+use crate::error::{Error, Result};
+use crate::files::atomic::{Kind, MARKER, Replace, ScratchFolder, StagedFolder, check_target};
+use crate::files::container::Container;
+use crate::memory_plan::Budget;
+use crate::model::Split;
+use crate::models::trajectories::write_sequence;
+use crate::outputs::kind::OutputKind;
+use crate::outputs::kind::check_folder_name;
+use crate::pipeline::summary::Detail;
+use crate::pipeline::summary::Summary;
+use crate::pipeline::{Request, Target, compress_scene, set_limits_within_budget};
+use crate::progress::Events;
+use crate::recipe::Recipe;
+use crate::scene::{InputOptions, Scene};
+
+/// Options of [`run`].
+#[derive(Debug)]
+pub struct TestSceneOptions {
+    /// Number of Gaussians of the scene.
+    pub gaussians: usize,
+    /// Number of frames of the scene.
+    pub frames: usize,
+    /// Number of Gaussians that stay.
+    pub kept: Target,
+    /// Recipe of the compression.
+    pub recipe: Recipe,
+    /// Folder for `scene.gseq`, `cameras.json` and `compressed.gseq`; `None`: a temporary one, which is removed.
+    pub output: Option<PathBuf>,
+    /// Policy for an existing output.
+    pub overwrite: Replace,
+    /// Memory limit.
+    pub memory: Budget,
+    /// Receiver of the events of the run.
+    pub events: Events,
+}
+
+/// Result of [`run`].
+#[derive(Debug)]
+pub struct TestSceneReport {
+    /// Summary of the compression.
+    pub summary: Summary,
+    /// Gaussians of every body: all, kept as they were or as leaders, merged away.
+    pub bodies: Vec<(DemoBody, usize, usize, usize)>,
+}
+
+/// Generates the scene, packs it and compresses it.
+///
+/// # Errors
+/// A number of survivors that is impossible; errors of the compression; a failed write.
+pub fn run(options: &TestSceneOptions) -> Result<TestSceneReport> {
+    options.kept.count(options.gaussians)?;
+    let Some(output) = &options.output else {
+        return run_in(ScratchFolder::new(&std::env::temp_dir())?.path(), options);
+    };
+    check_folder_name(output, "test-scene")?;
+    check_target(output, Kind::Folder, &[], options.overwrite)?;
+    let staged = StagedFolder::new(output, options.overwrite)?;
+    let report = run_in(staged.path(), options)?;
+    staged.commit()?;
+    Ok(report)
+}
+
+fn run_in(folder: &Path, options: &TestSceneOptions) -> Result<TestSceneReport> {
+    let made = demo_scene::Scene::new(options.gaussians, options.frames);
+    let packed = folder.join("scene.gseq");
+    write_sequence(&made, OutputKind::Gseq, &packed, 1, &options.events)?;
+    let rig = made.rig();
+    let cameras = folder.join("cameras.json");
+    fs::write(&cameras, cameras_json(&rig)).map_err(Error::io("write", &cameras))?;
+
+    let input = Box::new(Container::open(&packed)?);
+    let mut scene = Scene::new(PathBuf::from("scene.gseq"), input, rig, Some(Split::Train))?;
+    scene.events = options.events.clone();
+    let plain = InputOptions { memory: options.memory, events: options.events.clone(), ..InputOptions::default() };
+    let request = Request {
+        target: Some(options.kept),
+        ..Request::new(plain, folder.join("compressed.gseq"), options.recipe.clone())
+    };
+    set_limits_within_budget(&mut scene, &request)?;
+    let (mut summary, map) = compress_scene(&scene, &request)?;
+    // The folder is still under its temporary name.
+    summary.output.clear();
+    let marker = folder.join(MARKER);
+    fs::write(&marker, summary.json()).map_err(Error::io("write", &marker))?;
+
+    let mut leaders = vec![false; summary.gaussians];
+    let bodies = DemoBody::ALL
+        .iter()
+        .map(|&body| {
+            let members = made.members(body);
+            // The first Gaussian with a place of the output counts as kept, others with the same place as merged.
+            let kept = members
+                .clone()
+                .filter(|&id| map[id].is_some_and(|new| !std::mem::replace(&mut leaders[new as usize], true)));
+            let kept = kept.count();
+            let merged = members.clone().filter(|&id| map[id].is_some()).count() - kept;
+            (body, members.len(), kept, merged)
+        })
+        .collect();
+    Ok(TestSceneReport { summary, bodies })
+}
+
+impl TestSceneReport {
+    /// Returns the summary and a table of the bodies, for a person.
+    pub fn text(&self) -> String {
+        let mut out = self.summary.text(Detail::Most);
+        // Writing to a String cannot fail.
+        let _ = writeln!(out, "\n  {:<12} {:>9} {:>9} {:>9} {:>9}", "body", "Gaussians", "kept", "merged", "pruned");
+        for &(body, all, kept, merged) in &self.bodies {
+            let _ = writeln!(out, "  {:<12} {all:>9} {kept:>9} {merged:>9} {:>9}", body.name(), all - kept - merged);
+        }
+        out
+    }
+}

@@ -1,0 +1,99 @@
+//! Poster: the first render of a scene, shown by the page until the scene itself is drawn.
+
+use std::io;
+
+use base64::Engine;
+use base64::engine::general_purpose::STANDARD;
+
+use crate::error::{Error, Result};
+use crate::files::image::write::jpeg_bytes;
+use crate::limits::Limits;
+use crate::memory_plan::{MemoryPart, SHARED_VIEW_BYTES_PER_GAUSSIAN};
+use crate::model::{Camera, FrameView, Rig};
+use crate::passes::{Batch, RenderedSource, show};
+use crate::render;
+use crate::source::FrameSource;
+
+/// Maximum number of pixels of a poster.
+const MAX_PIXELS: f64 = 160_000.0;
+/// JPEG quality of a poster, of 100.
+const QUALITY: u8 = 80;
+
+/// Renders `source` from the first camera of `rig`, at the camera's time, else at the first frame. Returns a data URI;
+/// `None` without cameras.
+///
+/// # Errors
+/// A frame that cannot be read.
+pub fn poster(source: &dyn FrameSource, rig: &Rig, background: [f32; 3], limits: &Limits) -> Result<Option<String>> {
+    let Some(shot) = rig.shots.first() else { return Ok(None) };
+    let times = &source.info().times;
+    let away = |frame: &usize| shot.time.map_or(0.0, |time| (times[*frame] - time).abs());
+    let Some(frame) = (0..times.len()).min_by(|a, b| away(a).total_cmp(&away(b))) else { return Ok(None) };
+    let camera = smaller(&rig.cameras[shot.camera as usize]);
+    let picture = FrameView { frame, view: shot.view, camera: 0 };
+    let mut uri = None;
+    show([RenderedSource::all(source)], &[camera], &[picture], Batch::of_frame(limits), |views| {
+        for view in views {
+            let bytes = jpeg_bytes(&view.render(0, background), QUALITY)
+                .map_err(|error: io::Error| Error::internal(format!("the poster cannot be written: {error}")))?;
+            uri = Some(format!("data:image/jpeg;base64,{}", STANDARD.encode(bytes)));
+        }
+        Ok(())
+    })?;
+    Ok(uri)
+}
+
+/// Returns the memory of a poster: bytes per Gaussian, and bytes of the render itself.
+pub fn memory() -> [MemoryPart; 2] {
+    // Three channels of f32, their bytes, and the JPEG.
+    [("poster", SHARED_VIEW_BYTES_PER_GAUSSIAN), ("poster", render::STRIP_BYTES as u64 + 16 * MAX_PIXELS as u64)]
+}
+
+/// Returns `camera` with renders of at most [`MAX_PIXELS`].
+fn smaller(camera: &Camera) -> Camera {
+    let pixels = f64::from(camera.width) * f64::from(camera.height);
+    let scale = (MAX_PIXELS / pixels).sqrt().min(1.0);
+    let side = |pixels: u32| (f64::from(pixels) * scale).floor().max(1.0);
+    let (width, height) = (side(camera.width), side(camera.height));
+    // Sides are whole pixels, so both directions have scales of their own.
+    let (across, down) = (width / f64::from(camera.width), height / f64::from(camera.height));
+    Camera {
+        width: width as u32,
+        height: height as u32,
+        fx: across * camera.fx,
+        fy: down * camera.fy,
+        cx: across * camera.cx,
+        cy: down * camera.cy,
+        ..camera.clone()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::DVec3;
+
+    use super::*;
+    use crate::diagnostics::demo_scene::Scene;
+
+    #[test]
+    fn a_poster_is_a_jpeg_of_few_pixels() {
+        let scene = Scene::new(400, 3);
+        let mut rig = scene.rig();
+        let uri = poster(&scene, &rig, [0.0; 3], &Limits::NONE).unwrap().unwrap();
+        let bytes = STANDARD.decode(uri.strip_prefix("data:image/jpeg;base64,").unwrap()).unwrap();
+        assert_eq!(bytes[..2], [0xff, 0xd8]);
+        rig.shots.clear();
+        assert!(poster(&scene, &rig, [0.0; 3], &Limits::NONE).unwrap().is_none());
+    }
+
+    #[test]
+    fn a_large_camera_is_made_smaller_and_keeps_its_field_of_view() {
+        let camera = Camera::look_at(DVec3::new(0.0, -3.0, 1.0), DVec3::ZERO, 1.0, (1920, 1080));
+        let small = smaller(&camera);
+        assert!(f64::from(small.width * small.height) <= MAX_PIXELS, "{}x{}", small.width, small.height);
+        let angle = |camera: &Camera| f64::from(camera.width) / camera.fx;
+        assert!((angle(&small) - angle(&camera)).abs() < 1e-9);
+        let tiny = Camera::look_at(DVec3::new(0.0, -3.0, 1.0), DVec3::ZERO, 1.0, (64, 48));
+        assert_eq!((smaller(&tiny).width, smaller(&tiny).height), (64, 48));
+    }
+}

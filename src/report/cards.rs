@@ -1,0 +1,185 @@
+//! The head of the page: the verdict, and what changed in four cards or, of several results, in one table.
+
+use super::analysis::Analysis;
+use super::findings::ResultData;
+use super::html::{bytes, count, db, escape, figure, percent};
+use crate::evaluation::found::Both;
+use crate::models::Size;
+
+/// Returns the names, the verdict, and the cards.
+pub(super) fn header(results: &[Analysis], names: &[String]) -> String {
+    let found = &results[0].data.evaluation;
+    let original = escape(&found.path.original);
+    let mut out = String::new();
+    match results {
+        [result] => {
+            out += &format!(
+                "<p class=\"paths\">{original} → {}</p>\n<h1>What compression cost</h1>\n<p class=\"verdict\">{}</p>\n",
+                escape(&found.path.compressed),
+                escape(&result.data.verdict)
+            );
+            out += &cards(&result.data);
+        }
+        _ => {
+            out += &format!(
+                "<p class=\"paths\">{original} → {}</p>\n<h1>What compression cost</h1>\n",
+                escape(&names.join(", "))
+            );
+            for (result, name) in results.iter().zip(names) {
+                out += &format!("<p class=\"verdict\"><b>{}</b> {}</p>\n", escape(name), escape(&result.data.verdict));
+            }
+            out += &table(results, names);
+        }
+    }
+    out += &format!(
+        "<p class=\"note\">Compared on {} renders of {} frame{} from {} camera{}: {}. PSNR has peak 1 and is averaged \
+         over renders; higher is better. From 40 dB on, two renders look alike.</p>\n",
+        count(found.cameras.pairs),
+        found.loss.per_frame.len(),
+        plural(found.loss.per_frame.len()),
+        found.cameras.cameras,
+        plural(found.cameras.cameras),
+        escape(&found.cameras.origin)
+    );
+    out
+}
+
+fn plural(number: usize) -> &'static str {
+    if number == 1 { "" } else { "s" }
+}
+
+/// A card: label, value before, value after, and a line of more.
+fn card(label: &str, before: &str, after: &str, more: &str) -> String {
+    format!(
+        "<div class=\"card\"><span class=\"label\">{label}</span><span class=\"change\"><span>{before}</span> \
+         <i aria-label=\"to\">→</i> <b>{after}</b></span><small>{more}</small></div>\n"
+    )
+}
+
+/// Returns the four cards of a result: Gaussians, size, quality, and photographs, render time or SSIM.
+fn cards(result: &ResultData) -> String {
+    let found = &result.evaluation;
+    let (counts, sizes, mean) = (found.count, found.bytes, found.loss.overall);
+    let mut out = String::from("<div class=\"cards\">\n");
+    out += &card(
+        "Gaussians",
+        &count(counts.original),
+        &count(counts.compressed),
+        &times_fewer(counts.original as f64, counts.compressed as f64, "fewer", "more"),
+    );
+    let parts: String = size_parts(&found.size)
+        .iter()
+        .map(|(part, before, after)| format!("<br>{}: {} → {}", escape(part), bytes(*before), bytes(*after)))
+        .collect();
+    let smaller = times_fewer(sizes.original as f64, sizes.compressed as f64, "smaller", "larger");
+    out += &card("Size", &bytes(sizes.original), &bytes(sizes.compressed), &(smaller + &parts));
+    let views = format!("SSIM {:.4}, against the original’s renders", mean.ssim);
+    out += &card("Quality (PSNR)", "exact", &db(mean.psnr), &views);
+    out += &match (&found.ground_truth, result.render_time) {
+        (Some(truth), _) => {
+            let (before, after) = (truth.original.overall, truth.compressed.overall);
+            let change = after.psnr - before.psnr;
+            let more = format!("{change:+.2} dB, SSIM {:.4} → {:.4}", before.ssim, after.ssim);
+            card("Against photographs (PSNR)", &db(before.psnr), &db(after.psnr), &more)
+        }
+        (None, Some(time)) => {
+            let Both { original, compressed } = time.milliseconds;
+            let more = times_fewer(original, compressed, "faster", "slower") + " per render, on this processor";
+            card("Render time", &milliseconds(original), &milliseconds(compressed), &more)
+        }
+        (None, None) => {
+            let more = "structural similarity to the original’s renders; 1 is the same";
+            card("Similarity (SSIM)", "1", &format!("{:.4}", mean.ssim), more)
+        }
+    };
+    out + "</div>\n"
+}
+
+/// Returns for example "10.0× fewer (10%)".
+fn times_fewer(before: f64, after: f64, fewer: &str, more: &str) -> String {
+    if before == after {
+        return "unchanged".to_owned();
+    }
+    match before > after {
+        true if after > 0.0 => format!("{:.1}× {fewer} ({})", before / after, percent(after, before)),
+        true => "nothing left".to_owned(),
+        false => format!("{} {more}", percent(after - before, before)),
+    }
+}
+
+fn milliseconds(value: f64) -> String {
+    format!("{value:.1} ms")
+}
+
+/// Returns the parts that both models have, if there are several: name, bytes before, bytes after.
+pub(super) fn size_parts(size: &Both<Size>) -> Vec<(&'static str, u64, u64)> {
+    let parts = size.original.named().into_iter().zip(size.compressed.named());
+    let parts: Vec<_> = parts.map(|((name, before), (_, after))| (name, before, after)).collect();
+    // Parts below a hundredth of the whole are left out.
+    let least = size.compressed.whole() / 100;
+    let both: Vec<_> = parts.into_iter().filter(|&(_, before, after)| before > 0 && after > least).collect();
+    if both.len() > 1 { both } else { Vec::new() }
+}
+
+/// Returns a table with a row for the original and one for each result.
+fn table(results: &[Analysis], names: &[String]) -> String {
+    let first = &results[0].data.evaluation;
+    let has_photographs = results.iter().all(|result| result.data.evaluation.ground_truth.is_some());
+    let has_times = results.iter().all(|result| result.data.render_time.is_some());
+    let mut heads = vec!["Model", "Gaussians", "Size", "PSNR", "SSIM", "Worst view"];
+    heads.extend(has_photographs.then_some("Photographs"));
+    heads.extend(has_times.then_some("Render time"));
+    let mut rows = vec![vec![
+        escape(&first.path.original),
+        count(first.count.original),
+        bytes(first.bytes.original),
+        "exact".to_owned(),
+        "1".to_owned(),
+        "exact".to_owned(),
+    ]];
+    rows[0]
+        .extend(first.ground_truth.as_ref().filter(|_| has_photographs).map(|truth| db(truth.original.overall.psnr)));
+    let time = results[0].data.render_time.filter(|_| has_times);
+    rows[0].extend(time.map(|time| milliseconds(time.milliseconds.original)));
+    for (result, name) in results.iter().zip(names) {
+        let found = &result.data.evaluation;
+        let share = |part: f64, whole: f64| format!("<small>{}</small>", percent(part, whole));
+        let worst = found.loss.per_view.iter().map(|view| view.means.psnr).fold(f64::INFINITY, f64::min);
+        let mut row = vec![
+            escape(name),
+            count(found.count.compressed) + &share(found.count.compressed as f64, found.count.original as f64),
+            bytes(found.bytes.compressed) + &share(found.bytes.compressed as f64, found.bytes.original as f64),
+            db(found.loss.overall.psnr),
+            figure(found.loss.overall.ssim),
+            db(worst),
+        ];
+        let truth = found.ground_truth.as_ref().filter(|_| has_photographs);
+        row.extend(truth.map(|truth| db(truth.compressed.overall.psnr)));
+        let time = result.data.render_time.filter(|_| has_times);
+        row.extend(time.map(|time| milliseconds(time.milliseconds.compressed)));
+        rows.push(row);
+    }
+    let mut out = String::from("<table class=\"results\">\n<thead><tr>");
+    out += &heads.iter().map(|head| format!("<th scope=\"col\">{head}</th>")).collect::<String>();
+    out += "</tr></thead>\n<tbody>\n";
+    for row in rows {
+        let mut cells = row.iter().zip(&heads);
+        let name = cells.next().map_or(String::new(), |(name, _)| format!("<th scope=\"row\">{name}</th>"));
+        let cells: String = cells.map(|(cell, head)| format!("<td data-label=\"{head}\">{cell}</td>")).collect();
+        out += &format!("<tr>{name}{cells}</tr>\n");
+    }
+    out + "</tbody>\n</table>\n"
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn changes_are_told_as_factors_and_growth_as_such() {
+        assert_eq!(times_fewer(20_880.0, 2_088.0, "fewer", "more"), "10.0× fewer (10%)");
+        assert_eq!(times_fewer(10.0, 10.0, "fewer", "more"), "unchanged");
+        assert_eq!(times_fewer(10.0, 12.0, "smaller", "larger"), "20% larger");
+        assert_eq!(times_fewer(10.0, 0.0, "fewer", "more"), "nothing left");
+    }
+}

@@ -1,0 +1,319 @@
+//! The collapsed part of the page: every figure, the stages of the run, the scores, the notes and the data files.
+
+use super::analysis::Analysis;
+use super::chart::{Bars, ChartAxis, Stack};
+use super::document::{figure_of, heading, links, list};
+use super::findings::ResultData;
+use super::histogram::Histogram;
+use super::html::{bytes, count, db, escape, figure, percent};
+use super::run::RunFiles;
+use super::{cards, compare, failure_section, precision, quality, trade_off};
+use crate::evaluation::found::{Comparison, QualityMeans};
+use crate::evaluation::precision::PrecisionDiagram;
+use crate::evaluation::trade_off::TradeOff;
+use crate::journal::records::StageRecord;
+use crate::pipeline::summary::Summary;
+
+/// Returns the collapsed sections. Each has a plain label and one line of explanation.
+pub(super) fn details(
+    results: &[Analysis],
+    names: &[String],
+    sweep: Option<&TradeOff>,
+    precision: Option<&PrecisionDiagram>,
+) -> String {
+    let each = |section: &dyn Fn(&Analysis, &str) -> String| -> String {
+        let of = |(number, result): (usize, &Analysis)| {
+            let body = section(result, &names[number]);
+            if body.is_empty() { body } else { heading(names, number) + &body }
+        };
+        results.iter().enumerate().map(of).collect()
+    };
+    let numbers = each(&|result, name| numbers(&result.data, name)) + &quality::other_charts(results, names);
+    let run = |result: &Analysis| result.run.summary.as_ref().map(|(summary, _)| summary.clone());
+    let sections = [
+        ("numbers", "All figures", "Every measure: on average, and in the worst frame and view.", numbers),
+        (
+            "renders",
+            "More renders",
+            "The worst render of the worst camera and of the worst frame.",
+            compare::other_sliders(results, names),
+        ),
+        (
+            "weak",
+            "Known weak spots",
+            "Fast motion, thin structures and small changes of appearance suffer first when a model is compressed.",
+            each(&|result, _| failure_section::modes(&result.data.failure_modes, &result.close)),
+        ),
+        (
+            "stages",
+            "Time and memory of the run",
+            "Duration of each step of the compression, and its memory.",
+            each(&|r, _| stages(&r.run)),
+        ),
+        (
+            "scores",
+            "Scores of the Gaussians",
+            "Values by which the run decided which Gaussians stay: those of kept, dropped and merged ones.",
+            each(&|result, _| score_histograms(&result.data)),
+        ),
+        (
+            "notes",
+            "Notes and skipped steps",
+            "Remarks of the run, and steps that this scene did not need.",
+            each(&|result, _| skipped(&result.data, &result.run)),
+        ),
+        (
+            "sweep",
+            "Other sizes",
+            "Quality against size, time and memory, measured by a sweep.",
+            each(&|result, _| run(result).map_or(String::new(), |summary| searched(&summary)))
+                + &swept(&results[0], sweep),
+        ),
+        (
+            "precision",
+            "Error against run time",
+            "Gain in precision from more work, for each step of the compression.",
+            precision.map_or(String::new(), precision::section),
+        ),
+        ("data", "Data files", "Everything on this page, for other programs.", data(results, sweep, precision)),
+    ];
+    sections
+        .into_iter()
+        .filter(|section| !section.3.is_empty())
+        .map(|(id, label, about, body)| {
+            format!("<details id=\"{id}\">\n<summary><b>{label}</b> <span>{about}</span></summary>\n{body}</details>\n")
+        })
+        .collect()
+}
+
+/// Returns a remark on absent data.
+fn absent(text: &str) -> String {
+    format!("<p class=\"note\">{text}</p>\n")
+}
+
+/// Returns the tables of all measures, of the render times and of the parts of the size.
+fn numbers(result: &ResultData, name: &str) -> String {
+    let found = &result.evaluation;
+    let mut out = format!(
+        "<div class=\"scroll\" tabindex=\"0\" role=\"region\" aria-label=\"Measures of {}\"><table class=\"wide\">\n\
+         <tr><th>measure</th><th>average</th><th>worst frame</th><th>worst view</th></tr>\n",
+        escape(name)
+    );
+    out += &measures("compressed to original", &found.loss);
+    if let Some(truth) = &found.ground_truth {
+        out += &measures("compressed to photographs", &truth.compressed);
+        out += &measures("original to photographs", &truth.original);
+    }
+    out += "</table></div>\n";
+    out += "<p class=\"note\">PSNR and SSIM: higher is better. Temporal error, the root mean square error of frame-to-frame \
+            differences, and FLIP, the difference that a person would see: lower is better.</p>\n";
+    if let Some(time) = result.render_time {
+        out += &format!(
+            "<p class=\"note\">Render time on this processor, all threads, mean of {} renders: {:.2} ms before, {:.2} ms \
+             after.</p>\n",
+            time.renders, time.milliseconds.original, time.milliseconds.compressed
+        );
+    }
+    let parts = cards::size_parts(&found.size);
+    if !parts.is_empty() {
+        out +=
+            "<table class=\"wide\">\n<tr><th>part of the size</th><th>before</th><th>after</th><th>share</th></tr>\n";
+        for (name, before, after) in parts {
+            out += &format!(
+                "<tr><td>{}</td><td>{}</td><td>{}</td><td>{}</td></tr>\n",
+                escape(name),
+                bytes(before),
+                bytes(after),
+                percent(after as f64, before as f64)
+            );
+        }
+        out += "</table>\n";
+    }
+    out
+}
+
+/// Value of a measure, its text, and whether larger values are better.
+type Measure = (&'static str, fn(&QualityMeans) -> Option<f64>, fn(f64) -> String, bool);
+
+/// Returns a row per measure of `of`: the average, the worst frame and the worst view.
+fn measures(name: &str, of: &Comparison) -> String {
+    const MEASURES: [Measure; 4] = [
+        ("PSNR", |means| Some(means.psnr), db, true),
+        ("SSIM", |means| Some(means.ssim), |value| format!("{value:.4}"), true),
+        ("temporal error", |means| means.temporal, figure, false),
+        ("FLIP", |means| means.flip, |value| format!("{value:.4}"), false),
+    ];
+    let mut out = String::new();
+    for (measure, value, text, is_larger_better) in MEASURES {
+        let Some(average) = value(&of.overall) else { continue };
+        let worse = |a: &f64, b: &f64| if is_larger_better { a.total_cmp(b) } else { b.total_cmp(a) };
+        let frames = of.per_frame.iter().filter_map(|frame| Some((value(&frame.means)?, frame.frame)));
+        let views = of.per_view.iter().filter_map(|view| Some((value(&view.means)?, view.view)));
+        let frame =
+            frames.min_by(|a, b| worse(&a.0, &b.0)).map(|(worst, frame)| format!("{} (frame {frame})", text(worst)));
+        let view = views.min_by(|a, b| worse(&a.0, &b.0)).map(|(worst, view)| format!("{} (view {view})", text(worst)));
+        out += &format!(
+            "<tr><td>{measure}, {name}</td><td>{}</td><td>{}</td><td>{}</td></tr>\n",
+            text(average),
+            frame.unwrap_or_default(),
+            view.unwrap_or_default()
+        );
+    }
+    out
+}
+
+fn stages(run: &RunFiles) -> String {
+    let Some((summary, _)) = &run.summary else {
+        return absent(
+            "There is no summary of a run beside the compressed model; <code>splatsieve compress</code> writes one.",
+        );
+    };
+    let mut out = String::from(
+        "<table class=\"wide figures\">\n<tr><th>step</th><th>Gaussians in</th><th>out</th><th>time</th><th>peak memory so far</th></tr>\n",
+    );
+    for stage in &summary.stages {
+        let memory = stage.peak_memory_bytes.map_or("–".to_owned(), |of| format!("{:.0} MiB", of as f64 / 1048576.0));
+        out += &format!(
+            "<tr><td>{}</td><td>{}</td><td>{}</td><td>{:.2} s</td><td>{memory}</td></tr>\n",
+            escape(&stage.name),
+            count(stage.gaussians_in),
+            count(stage.gaussians_out),
+            stage.seconds
+        );
+    }
+    let total: f64 = summary.stages.iter().map(|stage| stage.seconds).sum();
+    out += &format!("<tr><th>together</th><td></td><td></td><th>{total:.2} s</th><td></td></tr>\n</table>\n");
+    let seconds = stage_bars(summary, "Time per step", "seconds", |stage| Some((1e3 * stage.seconds).round() / 1e3));
+    let mib = |stage: &StageRecord| Some(stage.peak_memory_bytes? as f64 / 1048576.0);
+    let memory = stage_bars(summary, "Largest memory up to the end of each step", "MiB", mib);
+    if seconds.is_empty() && memory.is_empty() {
+        return out;
+    }
+    out + &format!("<div class=\"charts\">\n{seconds}{memory}</div>\n")
+}
+
+/// Returns a chart of one value per stage; empty for fewer than two.
+fn stage_bars(summary: &Summary, title: &str, label: &str, value: impl Fn(&StageRecord) -> Option<f64>) -> String {
+    let bars: Vec<(String, f64)> =
+        summary.stages.iter().filter_map(|stage| Some((stage.name.clone(), value(stage)?))).collect();
+    if bars.len() < 2 {
+        return String::new();
+    }
+    let chart = Bars { title: title.to_owned(), label: label.to_owned(), bars, is_fitted: false };
+    figure_of(title, &chart.svg())
+}
+
+/// Returns the histograms of the scores; those whose values are all alike as a line of text.
+fn score_histograms(result: &ResultData) -> String {
+    let Some(histograms) = &result.histograms else {
+        return absent(
+            "Which Gaussians were dropped is not known: there is no index map beside the compressed model that fits.",
+        );
+    };
+    let mut out = String::from(
+        "<p class=\"note\">Number of Gaussians of the original by value: kept ones at the bottom of each bar, then dropped \
+         ones, then those merged into others. StatisticAccess go by powers of ten, but shares of the frames from none to all; 0 has \
+         no place among powers of ten, and Gaussians at 0 are counted in the legend. Where kept and dropped ones lie apart, \
+         the value decides; where they overlap, something else render_blended. S is the whole score, C the coverage, W the visible \
+         coverage, D the motion, κ the rigidity, V the variation, in the symbols of the paper.</p>\n<div class=\"charts\">\n",
+    );
+    let mut alike = Vec::new();
+    for of in histograms {
+        let bins = of.bins.kept.len().max(of.bins.dropped.len()).max(of.bins.merged.len());
+        let filled =
+            |bin: usize| [&of.bins.kept, &of.bins.dropped, &of.bins.merged].iter().any(|bins| bins.get(bin) > Some(&0));
+        if (0..bins).filter(|&bin| filled(bin)).count() > 1 {
+            out += &figure_of(&format!("{} ({})", of.meaning, of.name), &histogram(of));
+        } else {
+            let zero = of.zero.kept + of.zero.dropped + of.zero.merged;
+            let value = of.edges.first().map_or(String::new(), |edge| format!(", the others near {}", figure(*edge)));
+            alike.push(format!("{} ({}): all values are alike, {} at 0{value}", of.meaning, of.name, count(zero)));
+        }
+    }
+    out + "</div>\n" + &list(&alike)
+}
+
+fn histogram(of: &Histogram) -> String {
+    let with = |name: &str, zero: usize, bins: &[usize]| {
+        let more = if zero > 0 { format!(" (and {} at 0)", count(zero)) } else { String::new() };
+        (format!("{name}{more}"), bins.to_vec())
+    };
+    Stack {
+        title: format!("{} of kept, dropped and merged Gaussians", of.meaning),
+        x: match of.log {
+            true => ChartAxis { label: of.name.to_owned(), log: true, from_zero: false },
+            false => ChartAxis { label: format!("{}, part of the frames", of.name), ..ChartAxis::default() },
+        },
+        edges: of.edges.clone(),
+        groups: vec![
+            with("kept", of.zero.kept, &of.bins.kept),
+            with("dropped", of.zero.dropped, &of.bins.dropped),
+            with("merged", of.zero.merged, &of.bins.merged),
+        ],
+    }
+    .svg()
+}
+
+/// Returns the skipped steps with their reasons, the percentiles of the score's terms, and all notes.
+fn skipped(result: &ResultData, run: &RunFiles) -> String {
+    let mut out = String::new();
+    if let Some((summary, _)) = &run.summary {
+        let mut rows: Vec<[String; 2]> =
+            summary.left_out.iter().map(|left| [escape(&left.what), escape(&left.reason())]).collect();
+        if rows.is_empty() {
+            rows.push(["nothing".to_owned(), "every step and term had something to do".to_owned()]);
+        }
+        out += "<table class=\"wide words\">\n<tr><th>left out</th><th>why</th></tr>\n";
+        for [what, why] in rows {
+            out += &format!("<tr><td>{what}</td><td>{why}</td></tr>\n");
+        }
+        out += "</table>\n<table class=\"wide\">\n<tr><th>term of the scores</th><th>1st percentile</th><th>99th</th><th>use</th></tr>\n";
+        for term in &summary.terms {
+            let grades = if term.active { "grades" } else { "only splits" };
+            out += &format!(
+                "<tr><td>{}</td><td>{}</td><td>{}</td><td>{grades}</td></tr>\n",
+                escape(&term.name),
+                figure(term.p1),
+                figure(term.p99)
+            );
+        }
+        out += "</table>\n";
+    }
+    let mut notes: Vec<&String> = result.notes.iter().collect();
+    notes.extend(run.summary.iter().flat_map(|(summary, _)| &summary.notes));
+    notes.extend(&result.missing);
+    out += &list(notes);
+    if out.is_empty() { absent("Nothing is known of the run.") } else { out }
+}
+
+/// Returns the chart of the sizes that a run tried, if it searched for one.
+fn searched(summary: &Summary) -> String {
+    summary.goal.as_ref().map_or(String::new(), trade_off::search)
+}
+
+fn swept(first: &Analysis, sweep: Option<&TradeOff>) -> String {
+    match sweep {
+        Some(found) => trade_off::section(found),
+        None => absent(&format!(
+            "Curves of quality against size, time and memory come from a sweep: <code>splatsieve sweep {} --cameras F</code> \
+             writes <code>sweep.json</code>, which <code>report</code> takes as <code>--sweep FILE</code>.",
+            escape(&first.data.evaluation.path.original)
+        )),
+    }
+}
+
+fn data(results: &[Analysis], sweep: Option<&TradeOff>, precision: Option<&PrecisionDiagram>) -> String {
+    let first = &results[0];
+    let mut names = vec!["report.json", "pictures.csv", "failure_modes.csv"];
+    names.extend(first.data.histograms.as_ref().map(|_| "histograms.csv"));
+    names.extend(first.run.summary.as_ref().map(|_| "stages.csv"));
+    names.extend(sweep.map(|_| "trade_off.csv"));
+    names.extend(sweep.filter(|of| !of.knobs.is_empty()).map(|_| "knobs.csv"));
+    names.extend(precision.map(|_| "precision.csv"));
+    let of_first = if results.len() > 1 { " The CSV files are those of the first result." } else { "" };
+    format!(
+        "<p>Beside this page: {}.{of_first}</p>\n<p class=\"note\">Made by {}.</p>\n",
+        links(&names),
+        escape(&first.data.evaluation.tool)
+    )
+}
