@@ -25,6 +25,7 @@ use crate::cache::{CacheKey, Completion};
 use crate::error::{Error, Result};
 use crate::evaluation::found::{Both, Comparison, Evaluation, ImageScore, PictureScores, TruthComparison};
 use crate::files::atomic::{Kind, Replace, StagedFile, check_target};
+use crate::journal::records::RenderTime;
 use crate::limits::Limits;
 use crate::memory_plan::{Budget, Plan, ResourceEstimate, Workload};
 use crate::metrics::{self, flip, psnr, ssim, temporal_error};
@@ -85,7 +86,7 @@ pub(crate) fn evaluate_whole(options: &EvaluateOptions) -> Result<Evaluation> {
     let mut side = ModelPair::open(options)?;
     side.keep_to(options.original.memory, needs)?;
     let mut evaluation = side.evaluate()?;
-    evaluation.render_ms = render_times(&side.scene, side.compressed.source(), &side.pictures)?;
+    evaluation.render_ms = side.render_time()?;
     if let Some(csv) = &options.csv {
         let staged = StagedFile::new(csv, options.overwrite)?;
         fs::write(staged.path(), evaluation.csv()).map_err(Error::io("write", csv))?;
@@ -367,22 +368,12 @@ impl ModelPair {
         Ok(found)
     }
 
-    /// Passes each of `pictures`, by frame, of the scene's cameras to `visit`, one after the other, with the states of
-    /// the original and of the compressed model.
+    /// Returns the time of rendering a view of either model; the values differ between runs.
     ///
     /// # Errors
-    /// A source that cannot be read; those of `visit`.
-    pub(crate) fn each(
-        &self,
-        pictures: &[FrameView],
-        mut visit: impl FnMut(&ViewStates<'_, 2>) -> Result<()>,
-    ) -> Result<()> {
-        self.show(pictures, |views| views.iter().try_for_each(&mut visit))
-    }
-
-    /// Color behind the scene, red, green, blue in [0, 1].
-    pub(crate) fn background(&self) -> [f32; 3] {
-        self.background
+    /// Fails if frames cannot be read.
+    pub fn render_time(&self) -> Result<Option<RenderTime>> {
+        render_times(&self.scene, self.compressed.source(), &self.pictures)
     }
 
     /// Gaussians of the compressed model.

@@ -83,9 +83,9 @@ fn cards(result: &ResultData) -> String {
             card("Against photographs (PSNR)", &db(before.psnr), &db(after.psnr), &more)
         }
         (None, Some(time)) => {
-            let Both { original, compressed } = time.milliseconds;
-            let more = times_fewer(original, compressed, "faster", "slower") + " per render, on this processor";
-            card("Render time", &milliseconds(original), &milliseconds(compressed), &more)
+            let more =
+                times_fewer(time.before, time.after, "faster", "slower") + " per view, one thread of this machine";
+            card("Render time", &milliseconds(time.before), &milliseconds(time.after), &more)
         }
         (None, None) => {
             let more = "structural similarity to the original’s renders; 1 is the same";
@@ -140,7 +140,7 @@ fn table(results: &[Analysis], names: &[String]) -> String {
     rows[0]
         .extend(first.ground_truth.as_ref().filter(|_| has_photographs).map(|truth| db(truth.original.overall.psnr)));
     let time = results[0].data.render_time.filter(|_| has_times);
-    rows[0].extend(time.map(|time| milliseconds(time.milliseconds.original)));
+    rows[0].extend(time.map(|time| milliseconds(time.before)));
     for (result, name) in results.iter().zip(names) {
         let found = &result.data.evaluation;
         let share = |part: f64, whole: f64| format!("<small>{}</small>", percent(part, whole));
@@ -156,7 +156,7 @@ fn table(results: &[Analysis], names: &[String]) -> String {
         let truth = found.ground_truth.as_ref().filter(|_| has_photographs);
         row.extend(truth.map(|truth| db(truth.compressed.overall.psnr)));
         let time = result.data.render_time.filter(|_| has_times);
-        row.extend(time.map(|time| milliseconds(time.milliseconds.compressed)));
+        row.extend(time.map(|time| milliseconds(time.after)));
         rows.push(row);
     }
     let mut out = String::from("<table class=\"results\">\n<thead><tr>");

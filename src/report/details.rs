@@ -109,9 +109,9 @@ fn numbers(result: &ResultData, name: &str) -> String {
             differences, and FLIP, the difference that a person would see: lower is better.</p>\n";
     if let Some(time) = result.render_time {
         out += &format!(
-            "<p class=\"note\">Render time on this processor, all threads, mean of {} renders: {:.2} ms before, {:.2} ms \
+            "<p class=\"note\">Render time per view, median on one thread of this machine: {:.2} ms before, {:.2} ms \
              after.</p>\n",
-            time.renders, time.milliseconds.original, time.milliseconds.compressed
+            time.before, time.after
         );
     }
     let parts = cards::size_parts(&found.size);

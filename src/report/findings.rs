@@ -5,11 +5,11 @@ use serde::Serialize;
 use super::failure::FailureMode;
 use super::film::FilmPanel;
 use super::histogram::Histogram;
-use super::render_time::RenderTime;
 use super::shown::Choice;
 use crate::evaluation::found::{Evaluation, PictureScores};
 use crate::evaluation::precision::PrecisionDiagram;
 use crate::evaluation::trade_off::TradeOff;
+use crate::journal::records::RenderTime;
 
 /// Content of `report.json`. The first result's values stand at the top level.
 #[derive(Debug, Serialize)]

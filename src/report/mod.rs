@@ -22,7 +22,6 @@ mod html;
 mod page;
 pub mod precision;
 mod quality;
-mod render_time;
 pub mod run;
 pub mod shown;
 mod tables;
@@ -51,7 +50,6 @@ use crate::pruning::score::{SCORED_BYTES, Scored, UserOverrides};
 use crate::recipe::{NonFinite, Recipe};
 use crate::scene::Scene;
 pub use findings::{ReportData, ResultData};
-pub use render_time::RenderTime;
 
 use analysis::Analysis;
 use failure::{FailureMode, KindMembers, judge, observe};
@@ -176,8 +174,7 @@ fn analyze(options: &EvaluateOptions, wanted: Option<&[Choice]>, render_time: bo
     let choices = wanted.map_or_else(|| choices(&evaluation), |wanted| scores_at(&evaluation, wanted));
     let (shown, close) = show_again(&side, &choices, &failure_modes, &traits)?;
     let films = film::films(&side, &shown)?;
-    let places: Vec<usize> = choices.iter().map(|choice| choice.place).collect();
-    let render_time = render_time.then(|| render_time::measure(&side, &places)).transpose()?;
+    let render_time = if render_time { side.render_time()? } else { None };
 
     notes.extend(evaluation.notes.iter().cloned());
     let work_notes = evaluation.work_notes.iter().cloned().chain(side.scene.work.take_notes()).collect();
