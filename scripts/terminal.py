@@ -19,7 +19,7 @@ import unicodedata
 
 ROWS = 500
 # A bar's line, as opposed to what a run says.
-BAR = re.compile(r"\d+%.* (pictures|states|steps|points|frames|settings|Gaussians)\b")
+BAR = re.compile(r"\d+%.* (views|states|steps|points|frames|settings|Gaussians)\b")
 
 
 class Screen:

@@ -33,7 +33,7 @@ pub const QUALITY: u8 = 80;
 /// A film of the page.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct FilmPanel {
-    /// Why its view was chosen: "worst picture", ...
+    /// Why its view was chosen: "worst render", ...
     pub why: Vec<String>,
     /// View number.
     pub view: u32,
@@ -76,7 +76,7 @@ pub fn films(side: &ModelPair, shown: &[ShownImage]) -> Result<Vec<FilmPanel>> {
     let mut cameras = Vec::new();
     for (k, ShownImage { choice, factor, .. }) in shown.iter().enumerate() {
         let FrameView { view, camera, .. } = side.picture(choice.place);
-        let wanted = k == 0 || choice.why.iter().any(|why| why == "median picture");
+        let wanted = k == 0 || choice.why.iter().any(|why| why == "median render");
         if every < 2 || !wanted || cameras.contains(&camera) || films.len() == VIEWS {
             continue;
         }
@@ -112,6 +112,6 @@ pub fn films(side: &ModelPair, shown: &[ShownImage]) -> Result<Vec<FilmPanel>> {
 /// A picture as a JPEG inside a URI.
 fn data_uri(image: &Image) -> Result<String> {
     let bytes = jpeg_bytes(image, QUALITY)
-        .map_err(|e: io::Error| Error::internal(format!("a picture cannot be shown: {e}")))?;
+        .map_err(|e: io::Error| Error::internal(format!("a render cannot be shown: {e}")))?;
     Ok(format!("data:image/jpeg;base64,{}", STANDARD.encode(bytes)))
 }

@@ -96,7 +96,7 @@ fn header(report: &ReportData) -> String {
         out += &card("SSIM to photographs", format!("{:.4}", after.ssim), format!("the original {:.4}", before.ssim));
     }
     out += &format!(
-        "</div>\n<p class=\"note\">{} pictures of {} frames, {} cameras: {}. PSNR has peak 1 and is averaged over \
+        "</div>\n<p class=\"note\">{} views of {} frames, {} cameras: {}. PSNR has peak 1 and is averaged over \
          pictures; the temporal error is the root mean square of what frame-to-frame differences differ by.</p>\n",
         count(found.cameras.pairs),
         found.loss.per_frame.len(),
@@ -285,7 +285,7 @@ fn failure_modes(modes: &[FailureMode], close: &[Close]) -> String {
     for (number, mode) in modes.iter().enumerate() {
         let (class, word) = match mode.verdict {
             Verdict::Absent => ("none", "not in this scene"),
-            Verdict::Unseen => ("none", "hardly in any picture"),
+            Verdict::Unseen => ("none", "hardly in any view"),
             Verdict::Untouched => ("good", "nothing lost"),
             Verdict::Passed => ("good", "does not show"),
             Verdict::Flagged => ("bad", "shows"),

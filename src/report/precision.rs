@@ -59,7 +59,7 @@ pub(super) fn section(found: &PrecisionDiagram) -> String {
 /// What all of it was measured on, and the notes.
 fn conditions(found: &PrecisionDiagram) -> String {
     let said = format!(
-        "<p class=\"note\">{} Gaussians × {} frames; {} pictures of {} frames looked at, judged by {}: {}. Every setting \
+        "<p class=\"note\">{} Gaussians × {} frames; scoring on {} views of {} frames, judged on {}: {}. Every setting \
          keeps {} Gaussians. {} threads; medians of up to {} runs, fewer where they took {} s.</p>\n",
         count(found.gaussians),
         count(found.frames),
@@ -170,7 +170,7 @@ fn table(curve: &PrecisionCurve) -> String {
         })
         .collect();
     said.extend(curve.enough.map(|enough| {
-        format!("from {} on it adds less than a tenth of the model's own error to pictures", figure(enough))
+        format!("from {} on it adds less than a tenth of the model's own error to renders", figure(enough))
     }));
     out += &list(&said);
     out + "</details>\n"

@@ -27,7 +27,7 @@ const MAX_FACTOR: u32 = 64;
 /// A picture chosen to be looked at.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Choice {
-    /// Why: "worst picture", "median picture", ...
+    /// Why: "worst render", "median render", ...
     pub why: Vec<String>,
     /// Index into the evaluation's pictures.
     #[serde(skip)]
@@ -58,10 +58,10 @@ pub fn choices(found: &Evaluation) -> Vec<Choice> {
     let of_view = lowest(&mut (0..pictures.len()).filter(|&i| Some(pictures[i].view) == view));
     let of_frame = lowest(&mut (0..pictures.len()).filter(|&i| Some(pictures[i].frame) == frame));
     let wanted = [
-        ("worst picture", by_psnr.first().copied()),
+        ("worst render", by_psnr.first().copied()),
         ("worst view", of_view),
         ("worst frame", of_frame),
-        ("median picture", by_psnr.get(by_psnr.len().saturating_sub(1) / 2).copied()),
+        ("median render", by_psnr.get(by_psnr.len().saturating_sub(1) / 2).copied()),
     ];
     let mut chosen: Vec<Choice> = Vec::new();
     for (why, place) in wanted {
@@ -122,7 +122,7 @@ pub fn show(choice: &Choice, taken: &RenderedViews) -> Result<ShownImage> {
 /// A picture without pixels.
 pub fn data_uri(image: &Image) -> Result<String> {
     let bytes = image_bytes(image, ImageFormat::Png)
-        .map_err(|e: io::Error| Error::internal(format!("a picture cannot be shown: {e}")))?;
+        .map_err(|e: io::Error| Error::internal(format!("a render cannot be shown: {e}")))?;
     Ok(format!("data:image/png;base64,{}", STANDARD.encode(bytes)))
 }
 

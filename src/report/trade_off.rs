@@ -39,7 +39,7 @@ pub(super) fn section(found: &TradeOff) -> String {
     let paired = curves(found).iter().any(|curve| curve.paired);
     let pair = if paired { " Hollow, in the same colour: the same method without refining." } else { "" };
     let mut out = format!(
-        "<p class=\"note\">{}: {} Gaussians, {}; {} pictures, {} threads{runs}. Lines go from few Gaussians to \
+        "<p class=\"note\">{}: {} Gaussians, {}; {} views, {} threads{runs}. Lines go from few Gaussians to \
          many.{pair}</p>\n<div class=\"charts\">\n",
         escape(&found.path),
         count(found.gaussians),

@@ -23,7 +23,7 @@ pub(super) fn verdict(found: &Evaluation, modes: &[FailureMode]) -> String {
     let words =
         WORDS.iter().find(|(from, _)| mean.psnr >= *from).map_or("cannot be compared with the original", |w| w.1);
     let mut text = format!(
-        "With {} of the Gaussians and {} of the bytes, the model {words} ({:.1} dB on average over {} picture{}",
+        "With {} of the Gaussians and {} of the bytes, the model {words} ({:.1} dB on average over {} view{}",
         of(found.count.compressed as u64, found.count.original as u64),
         of(found.bytes.compressed, found.bytes.original),
         mean.psnr,
