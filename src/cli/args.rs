@@ -16,11 +16,15 @@ use self::values::{parse_box, parse_bytes, parse_color, parse_decibels, parse_ra
 use super::recipe_flags::RecipeFlags;
 use splatsieve::outputs::bounds::MaxError;
 
-/// Headings of the groups of options in the help.
+/// Heading of the options for cameras in the help.
 const CAMERAS: &str = "Cameras";
+/// Heading of the options for the target size or quality.
 const HOW_SMALL: &str = "How small";
+/// Heading of the options that keep or drop Gaussians.
 const WHAT_STAYS: &str = "What is kept";
+/// Heading of the options for threads, memory and progress.
 const MACHINE: &str = "Machine";
+/// Heading of the options for the cache folder and shards.
 const CACHE: &str = "Resuming and sharing a run";
 
 /// Makes trained dynamic (4D) Gaussian-splatting models much smaller. Needs no GPU and no training code; your renderer opens the result
@@ -38,7 +42,7 @@ pub(super) struct Cli {
     pub(super) quiet: bool,
 }
 
-/// The commands.
+/// Commands with their arguments.
 #[derive(Debug, Subcommand)]
 pub(super) enum CommandArgs {
     /// Write a smaller model that your renderer opens
@@ -100,7 +104,7 @@ impl CommandArgs {
     }
 }
 
-/// `compress`
+/// Arguments of `compress`.
 #[derive(Debug, Args)]
 pub(super) struct Compress {
     #[command(flatten)]
@@ -175,8 +179,8 @@ pub(super) struct OutputSize {
     pub(super) max_loss: Option<f64>,
     /// Folder with photographs of the test views, for --max-loss
     ///
-    /// Files as the cameras name them, else tNNN_vNN.png. A quarter of them is kept apart from the search and gives the figure
-    /// that is reported.
+    /// Files as the cameras name them, else tNNN_vNN.png. A quarter of them is not used in the search and gives the
+    /// reported value.
     #[arg(long, help_heading = HOW_SMALL, value_name = "FOLDER", requires = "max_loss")]
     pub(super) ground_truth: Option<PathBuf>,
 }
@@ -217,7 +221,7 @@ pub(super) enum OutputKindArg {
     Spz,
 }
 
-/// `score`
+/// Arguments of `score`.
 #[derive(Debug, Args)]
 pub(super) struct ScoreArgs {
     #[command(flatten)]
@@ -234,7 +238,7 @@ pub(super) struct ScoreArgs {
     pub(super) recipe: RecipeFlags,
 }
 
-/// `render`
+/// Arguments of `render`.
 #[derive(Debug, Args)]
 #[command(group(clap::ArgGroup::new("wanted").args(["frame", "all", "video"]).required(true)))]
 pub(super) struct Render {
@@ -339,7 +343,7 @@ pub(super) struct CompareArgs {
     pub(super) flip: bool,
 }
 
-/// `report`
+/// Arguments of `report`.
 #[derive(Debug, Args)]
 pub(super) struct ReportArgs {
     #[command(flatten)]
@@ -359,7 +363,7 @@ pub(super) struct ReportArgs {
     pub(super) earlier: Earlier,
 }
 
-/// `evaluate`
+/// Arguments of `evaluate`.
 #[derive(Debug, Args)]
 pub(super) struct Evaluate {
     #[command(flatten)]
@@ -376,7 +380,7 @@ pub(super) struct Evaluate {
     pub(super) json: bool,
 }
 
-/// `view`
+/// Arguments of `view`.
 #[derive(Debug, Args)]
 pub(super) struct ViewArgs {
     #[command(flatten)]
@@ -416,7 +420,7 @@ pub(super) fn default_page_limit() -> u64 {
     parse_bytes(DEFAULT_PAGE).expect("a size")
 }
 
-/// `convert`
+/// Arguments of `convert`.
 #[derive(Debug, Args)]
 pub(super) struct Convert {
     #[command(flatten)]
@@ -460,7 +464,7 @@ pub(super) struct Convert {
     pub(super) earlier: Earlier,
 }
 
-/// `info`
+/// Arguments of `info`.
 #[derive(Debug, Args)]
 pub(super) struct InfoArgs {
     #[command(flatten)]
@@ -478,7 +482,7 @@ pub(super) struct InfoArgs {
     pub(super) earlier: Earlier,
 }
 
-/// `cache`
+/// Arguments of `cache`.
 #[derive(Debug, Args)]
 pub(super) struct CacheFolder {
     /// Folder that was given to --cache
@@ -491,7 +495,7 @@ pub(super) struct CacheFolder {
     pub(super) json: bool,
 }
 
-/// `demo`
+/// Arguments of `demo`.
 #[derive(Debug, Args)]
 pub(super) struct Demo {
     /// Folder for the scene and the results [default: a temporary one]
@@ -514,7 +518,7 @@ pub(super) struct Demo {
     pub(super) recipe: RecipeFlags,
 }
 
-/// `selfcheck`
+/// Arguments of `selfcheck`.
 #[derive(Debug, Args)]
 pub(super) struct Selfcheck {
     /// Print JSON
@@ -522,7 +526,7 @@ pub(super) struct Selfcheck {
     pub(super) json: bool,
 }
 
-/// `recipe`
+/// Arguments of `recipe`.
 #[derive(Debug, Args)]
 pub(super) struct RecipeArgs {
     /// `default`, `paper` (with a description of every parameter), `gentle` or `strong`
@@ -530,7 +534,7 @@ pub(super) struct RecipeArgs {
     pub(super) preset: String,
 }
 
-/// `completions`
+/// Arguments of `completions`.
 #[derive(Debug, Args)]
 pub(super) struct Completions {
     /// Shell to complete for
@@ -538,7 +542,7 @@ pub(super) struct Completions {
     pub(super) shell: clap_complete::Shell,
 }
 
-/// `man`
+/// Arguments of `man`.
 #[derive(Debug, Args)]
 pub(super) struct Man {
     /// Output folder

@@ -91,6 +91,7 @@ pub(in crate::cli) struct Earlier {
 }
 
 impl Earlier {
+    /// Returns the policy as the library takes it.
     pub(in crate::cli) fn replace(&self) -> Replace {
         if self.overwrite { Replace::Existing } else { Replace::Never }
     }
@@ -139,7 +140,7 @@ pub(in crate::cli) struct Cameras {
     pub(in crate::cli) split: Option<SplitArg>,
 }
 
-/// When frames are tracked.
+/// Condition under which frames are tracked.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub(in crate::cli) enum LinkArg {
     /// Only where the number of Gaussians changes or their order is not the same

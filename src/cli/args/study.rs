@@ -9,7 +9,7 @@ use super::{Background, CameraFile, Earlier, Input, RecipeFlags};
 use splatsieve::diagnostics::precision::Knob;
 use splatsieve::evaluation::method::Method;
 
-/// `sweep`
+/// Arguments of `sweep`.
 #[derive(Debug, Args)]
 pub(in crate::cli) struct Sweep {
     #[command(flatten)]
@@ -49,7 +49,7 @@ pub(in crate::cli) struct Sweep {
     pub(in crate::cli) json: bool,
 }
 
-/// `precision`
+/// Arguments of `precision`.
 #[derive(Debug, Args)]
 pub(in crate::cli) struct PrecisionArgs {
     #[command(flatten)]
