@@ -27,7 +27,8 @@ const MACHINE: &str = "Machine";
 /// Heading of the options for the cache folder and shards.
 const CACHE: &str = "Resuming and sharing a run";
 
-/// Makes trained dynamic (4D) Gaussian-splatting models much smaller. Needs no GPU and no training code; your renderer opens the result
+/// Makes trained dynamic (4D) Gaussian-splatting models much smaller. Needs no GPU and no training code; your renderer
+/// opens the result
 #[derive(Debug, Parser)]
 #[command(name = "splatsieve", version, about, max_term_width = 110)]
 pub(super) struct Cli {
@@ -115,8 +116,8 @@ pub(super) struct Compress {
     /// Format of the output [default: by its name]
     #[arg(long = "as", value_enum, value_name = "FORMAT")]
     pub(super) kind: Option<OutputKindArg>,
-    /// PSNR of an archive (NAME.gsz) against the result before quantization, such as 45dB [default: 9 dB above the PSNR of the result
-    /// against the original, which costs about 0.5 dB; at most 50dB]
+    /// PSNR of an archive (NAME.gsz) against the result before quantization, such as 45dB [default: 9 dB above the PSNR
+    /// of the result against the original, which costs about 0.5 dB; at most 50dB]
     #[arg(long, value_name = "DB", help_heading = HOW_SMALL, hide_short_help = true, value_parser = parse_decibels)]
     pub(super) archive_psnr: Option<f64>,
     #[command(flatten)]
@@ -255,8 +256,8 @@ pub(super) struct Render {
     /// Render every view of the split into a folder, as tNNN_vNN files
     #[arg(long)]
     pub(super) all: bool,
-    /// Write a video with one image per frame: NAME.png or NAME.apng (animated PNG, lossless), NAME.gif, or NAME.mp4 or NAME.webm
-    /// (needs ffmpeg), from --view [default: the first] or along --path
+    /// Write a video with one image per frame: NAME.png or NAME.apng (animated PNG, lossless), NAME.gif, or NAME.mp4 or
+    /// NAME.webm (needs ffmpeg), from --view [default: the first] or along --path
     #[arg(long, value_name = "FILE")]
     pub(super) video: Option<PathBuf>,
     /// Move the camera of --video through these views, such as 0,2,5 [default: all views of the split]
@@ -425,8 +426,8 @@ pub(super) fn default_page_limit() -> u64 {
 pub(super) struct Convert {
     #[command(flatten)]
     pub(super) input: Input,
-    /// NAME.gseq, .ply, .splatv, .4dgs or .spz; a folder (the model in an archive, a PLY per frame of a sequence, or a model
-    /// of the input's own format); - for a frame stream on standard output (format/STREAM.md)
+    /// NAME.gseq, .ply, .splatv, .4dgs or .spz; a folder (the model in an archive, a PLY per frame of a sequence, or a
+    /// model of the input's own format); - for a frame stream on standard output (format/STREAM.md)
     #[arg(value_name = "OUTPUT", required_unless_present = "output_option")]
     pub(super) output: Option<PathBuf>,
     /// The output, as other commands name it
@@ -445,8 +446,9 @@ pub(super) struct Convert {
     #[arg(long = "as", value_name = "FORMAT", value_enum)]
     pub(super) kind: Option<OutputKindArg>,
     /// Maximum error of an attribute in a .gseq: `position=1e-3` in the attribute's unit (scene units, components of
-    /// quaternions, logs of scales, opacity logits, SH coefficients) or `position=0.01%` of the scene's extent; attributes that are
-    /// not named keep every bit. Every value is checked as it is written, and the file states its bounds
+    /// quaternions, logs of scales, opacity logits, SH coefficients) or `position=0.01%` of the scene's extent;
+    /// attributes that are not named keep every bit. Every value is checked as it is written, and the file states its
+    /// bounds
     #[arg(long, value_name = "ATTRIBUTE=BOUND", value_delimiter = ',', conflicts_with = "raw")]
     pub(super) max_error: Vec<MaxError>,
     /// Store the tiles of a .gseq uncompressed, for use in place

@@ -141,11 +141,12 @@ pub(super) fn command() -> Command {
     command.help_template(TOP_TEMPLATE).after_help(groups.join("\n") + "\nOptions:")
 }
 
-/// Writes one manual page for the program and one for each command to `folder`, all or none. Returns the number of pages.
-/// Replaces earlier pages and keeps other files in the folder.
+/// Writes one manual page for the program and one for each command to `folder`, all or none. Returns the number of
+/// pages. Replaces earlier pages and keeps other files in the folder.
 ///
 /// # Errors
-/// Fails if the folder cannot be created or written, or if a file with the name of a page is not a page of this program.
+/// Fails if the folder cannot be created or written, or if a file with the name of a page is not a page of this
+/// program.
 pub(super) fn write_pages(folder: &Path) -> Result<usize> {
     let pages = pages()?;
     let is_missing = |folder: &&Path| !folder.as_os_str().is_empty() && !folder.exists();

@@ -10,8 +10,8 @@ fn stderr() -> io::Stderr {
     io::stderr()
 }
 
-/// Writes `text` and a line feed to standard error, with control characters replaced by their codes. Ignores failures to
-/// write: the exit code still tells how the run ended.
+/// Writes `text` and a line feed to standard error, with control characters replaced by their codes. Ignores failures
+/// to write: the exit code still tells how the run ended.
 pub(super) fn tell(text: &str) {
     let line = format!("{}\n", printable(text));
     let mut stderr = stderr().lock();

@@ -51,8 +51,8 @@ pub(super) fn write(bytes: &[u8]) -> Result<()> {
 /// # Errors
 /// Fails as [`print`]. A failure to write to standard error is ignored.
 pub(super) fn print_clap(error: &clap::Error) -> Result<()> {
-    // The text contains escape sequences for colors, so it cannot be filtered here; the caller ensures that it quotes no
-    // argument with control characters.
+    // The text contains escape sequences for colors, so it cannot be filtered here; the caller ensures that it quotes
+    // no argument with control characters.
     let done = error.print().and_then(|()| if error.use_stderr() { Ok(()) } else { stdout().flush() });
     if error.use_stderr() { Ok(()) } else { done.map_err(Error::io("write", Path::new(NAME))) }
 }
@@ -70,8 +70,8 @@ pub(super) fn is_terminal() -> bool {
     stdout().is_terminal()
 }
 
-/// Returns a JSON text in which every character that [`printable`] replaces is escaped. Such characters occur only inside
-/// its strings.
+/// Returns a JSON text in which every character that [`printable`] replaces is escaped. Such characters occur only
+/// inside its strings.
 fn json_escaped(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
     for c in text.chars() {

@@ -1,9 +1,9 @@
-//! Progress on standard error. On a terminal, every task has a bar with rate and time left; nested tasks have bars below it.
-//! In a log, a task prints a line when it ends and at most one line per minute before; a nested task prints none when it
-//! ends.
+//! Progress on standard error. On a terminal, every task has a bar with rate and time left; nested tasks have bars
+//! below it. In a log, a task prints a line when it ends and at most one line per minute before; a nested task prints
+//! none when it ends.
 //!
-//! A line wider than the terminal would not be erased completely when it is redrawn. Therefore lines are composed from the
-//! parts that fit.
+//! A line wider than the terminal would not be erased completely when it is redrawn. Therefore lines are composed from
+//! the parts that fit.
 
 use std::fmt::Write as _;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
@@ -37,7 +37,7 @@ pub(super) struct Display {
 /// State shared by the display and its tasks.
 #[derive(Debug)]
 struct Shared {
-    /// All bars; a nested task has its line below.
+    /// Bars of all running tasks; the bar of a nested task is below that of the outer task.
     bars: MultiProgress,
     /// Number of running tasks in a log.
     logs: AtomicUsize,
@@ -158,7 +158,8 @@ struct RunPosition {
 }
 
 impl RunPosition {
-    /// Marks the stage `name` as running and returns its name with its number, `[k/n] name`. Returns other names unchanged.
+    /// Marks the stage `name` as running and returns its name with its number, `[k/n] name`. Returns other names
+    /// unchanged.
     fn enter(&mut self, name: &str, now: Instant) -> String {
         let Some(place) = self.stages.iter().position(|(stage, _)| *stage == name) else { return name.to_owned() };
         if self.current.is_none_or(|(stage, _)| stage != place) {
@@ -167,8 +168,8 @@ impl RunPosition {
         format!("[{}/{}] {name}", place + 1, self.stages.len())
     }
 
-    /// Estimates the seconds until the end of the run, if the current task takes `step` more seconds. The expected times of
-    /// the current and later stages are scaled by actual over expected time of the stages before.
+    /// Estimates the seconds until the end of the run, if the current task takes `step` more seconds. The expected
+    /// times of the current and later stages are scaled by actual over expected time of the stages before.
     fn left(&self, step: f64, now: Instant) -> f64 {
         let Some((place, since)) = self.current else { return step };
         let expected = |stages: &[(&str, f64)]| stages.iter().map(|(_, seconds)| seconds).sum::<f64>();
@@ -206,8 +207,8 @@ impl<'a> BarSnapshot<'a> {
         BarSnapshot { name, unit, done, total, per_second: state.per_sec(), left, run }
     }
 
-    /// Returns a line of at most `columns` columns. The name is always shown; the other parts are added while they fit, in
-    /// this order: percentage, time left, count, rate, time left of the run, bar.
+    /// Returns a line of at most `columns` columns. The name is always shown; the other parts are added while they fit,
+    /// in this order: percentage, time left, count, rate, time left of the run, bar.
     fn line(&self, columns: usize) -> String {
         let BarSnapshot { name, unit, done, total, per_second, left, run } = self;
         let is_shown = |seconds: &&f64| **seconds >= 1.0;
@@ -380,7 +381,7 @@ mod tests {
     }
 
     #[test]
-    fn a_bar_is_never_longer_than_its_room_says_most_in_most_and_no_time_of_no_seconds() {
+    fn bar_lines_fit_the_columns_and_hide_times_below_a_second() {
         let snapshot = BarSnapshot {
             name: "[3/9] rounds",
             unit: "views",

@@ -4,8 +4,8 @@ use splat_platform::{TruncatedMapMessage, end_on_signals, report_cut_short_maps}
 use splatsieve::error::ErrorKind;
 use splatsieve::files::atomic::withdraw_all;
 
-/// Installs the handlers. A signal that ends the process then removes unfinished outputs first. A mapped input file that is
-/// truncated ends the process with a message that names the file.
+/// Installs the handlers. A signal that ends the process then removes unfinished outputs first. A mapped input file
+/// that is truncated ends the process with a message that names the file.
 pub(super) fn install() {
     end_on_signals(withdraw_all, |signal| ErrorKind::Interrupted { signal }.exit_code());
     report_cut_short_maps(TruncatedMapMessage {

@@ -30,7 +30,8 @@ pub fn is_archive(path: &Path) -> Result<bool> {
     Ok(head == MAGIC)
 }
 
-/// Writes the model in the archive at `path` to `output`: a model folder, or a PLY file if the archive was made from one.
+/// Writes the model in the archive at `path` to `output`: a model folder, or a PLY file if the archive was made from
+/// one.
 ///
 /// # Errors
 /// Fails if the archive is damaged or needs more than `memory`, or if the output exists already or cannot be written.

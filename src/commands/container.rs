@@ -59,12 +59,12 @@ impl Storing {
     }
 }
 
-/// Packs any input into a container. The container of a stream holds no digest of its source, because the digest is known
-/// only after the header of the container is written.
+/// Packs any input into a container. The container of a stream holds no digest of its source, because the digest is
+/// known only after the header of the container is written.
 ///
 /// # Errors
-/// Fails if the input cannot be read, if the output exists already or cannot be written, or if a bound is relative to the
-/// extent of a stream, which is known only at its end.
+/// Fails if the input cannot be read, if the output exists already or cannot be written, or if a bound is relative to
+/// the extent of a stream, which is known only at its end.
 pub fn pack(
     input: &InputOptions,
     output: &Path,

@@ -56,8 +56,8 @@ pub fn is_container(output: &Path, requested: Option<OutputKind>) -> bool {
     OutputKind::from_path(output, requested, OutputKind::Model) == OutputKind::Gseq
 }
 
-/// Writes `input` to `output` in the format `requested`; `None`: by the name of the output. The format of a folder is the input's own
-/// model format, or one PLY per frame for a sequence.
+/// Writes `input` to `output` in the format `requested`; `None`: by the name of the output. The format of a folder is
+/// the input's own model format, or one PLY per frame for a sequence.
 ///
 /// # Errors
 /// Fails if the input cannot be read or cannot be written in this format, or if the output exists already.

@@ -71,8 +71,8 @@ pub struct Rendered {
 /// Memory: one frame state, and per thread one render with its footprints ([`crate::scene::pictures::need`]).
 ///
 /// # Errors
-/// Fails if input or cameras cannot be read, if a selected view does not exist, or if the output exists already or cannot
-/// be written. Leaves no partial output.
+/// Fails if input or cameras cannot be read, if a selected view does not exist, or if the output exists already or
+/// cannot be written. Leaves no partial output.
 pub fn render(options: &RenderOptions) -> Result<Completion<Rendered>> {
     Completion::from_result(render_whole(options))
 }

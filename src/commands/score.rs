@@ -17,8 +17,8 @@ use crate::scene::InputOptions;
 /// Writes statistics and scores of every Gaussian as `.npz` or `.csv`, according to the extension of `output`.
 ///
 /// # Errors
-/// Fails if the recipe is invalid, if `output` has another extension, or if the input cannot be read or the output cannot
-/// be written.
+/// Fails if the recipe is invalid, if `output` has another extension, or if the input cannot be read or the output
+/// cannot be written.
 pub fn score(input: &InputOptions, output: &Path, recipe: &Recipe, overwrite: Replace) -> Result<ScoreReport> {
     recipe.validate().map_err(Error::usage)?;
     let extension = output.extension().and_then(|e| e.to_str()).unwrap_or("").to_ascii_lowercase();

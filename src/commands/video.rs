@@ -70,9 +70,9 @@ pub struct Filmed {
 /// Renders a video of an input, one image per frame in order. Along a path through a still, the camera moves instead.
 ///
 /// # Errors
-/// Fails if inputs or cameras cannot be read, if a selected view does not exist, if the models have different frames, if the
-/// views have different sizes, if the output cannot be written, or if the encoder is missing or fails. Leaves no partial
-/// output.
+/// Fails if inputs or cameras cannot be read, if a selected view does not exist, if the models have different frames,
+/// if the views have different sizes, if the output cannot be written, or if the encoder is missing or fails. Leaves no
+/// partial output.
 pub fn video(options: &VideoOptions) -> Result<Filmed> {
     let output = options.output.as_path();
     let format = FilmFormat::from_path(output)?;
@@ -92,7 +92,8 @@ pub fn video(options: &VideoOptions) -> Result<Filmed> {
     let beside = options.beside.as_deref().map(|path| open_compressed(path, &scene, &options.input)).transpose()?;
     let models = 1 + u64::from(beside.is_some());
     scene.keep_to(options.input.memory, |work, limits: &Limits| -> Vec<ResourceEstimate> {
-        // Per pixel and model: the render, the joined frame (12), its bytes (3) and, for a GIF, the samples of its palette (5).
+        // Per pixel and model: the render, the joined frame (12), its bytes (3) and, for a GIF, the samples of its
+        // palette (5).
         let mut estimate = pictures::need(work, limits, NAME, models, models * 12);
         estimate.fixed.push(("frame", models * work.pixels * (12 + 3 + 5)));
         vec![estimate]
@@ -116,8 +117,8 @@ pub fn video(options: &VideoOptions) -> Result<Filmed> {
     Ok(Filmed { frames: views.len(), size, notes: scene.notes })
 }
 
-/// If the frames differ from the times of the cameras (`has_other_frames`), removes the times of the shots in `opened`, so
-/// that every camera can show every frame, and returns the shots with their times.
+/// If the frames differ from the times of the cameras (`has_other_frames`), removes the times of the shots in `opened`,
+/// so that every camera can show every frame, and returns the shots with their times.
 fn shots_with_times(opened: &mut OpenedInput, has_other_frames: bool) -> Option<Vec<Shot>> {
     let rig = opened.rig.as_mut().filter(|_| has_other_frames)?;
     let own = rig.shots.clone();

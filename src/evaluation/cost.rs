@@ -58,8 +58,8 @@ impl Repeats {
         Repeats { most, enough: f64::INFINITY }
     }
 
-    /// Runs `work` repeatedly and returns the value of the last run with the cost of all runs. Calls `clear` between two
-    /// runs, outside the measurement.
+    /// Runs `work` repeatedly and returns the value of the last run with the cost of all runs. Calls `clear` between
+    /// two runs, outside the measurement.
     ///
     /// # Errors
     /// Fails if `work` or `clear` fails.

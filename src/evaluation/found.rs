@@ -175,7 +175,8 @@ impl QualityMeans {
 }
 
 impl Comparison {
-    /// Averages the score that `score` selects from each view, over the views that have it. Returns `None` if none has it.
+    /// Averages the score that `score` selects from each view, over the views that have it. Returns `None` if none has
+    /// it.
     ///
     /// `pictures` is sorted by frame.
     pub fn from_pictures(

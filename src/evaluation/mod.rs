@@ -1,8 +1,8 @@
 //! Evaluation: compares renders of the original and the compressed model with each other and with photographs.
 //!
 //! Frames are read one by one. Memory holds one frame state of each model, and one render of each per thread. For the
-//! temporal error, the last images of every view that occurs again are kept: 12 bytes per pixel for two images per view,
-//! or three with photographs. A shard first renders the last images of its views again.
+//! temporal error, the last images of every view that occurs again are kept: 12 bytes per pixel for two images per
+//! view, or three with photographs. A shard first renders the last images of its views again.
 
 pub mod baseline;
 pub mod cost;
@@ -69,8 +69,8 @@ pub struct EvaluateOptions {
 /// Renders both models from the selected views and compares them.
 ///
 /// # Errors
-/// Fails if inputs, cameras or photographs cannot be read, if the models have different frames, or if the CSV file cannot
-/// be written.
+/// Fails if inputs, cameras or photographs cannot be read, if the models have different frames, or if the CSV file
+/// cannot be written.
 pub fn evaluate(options: &EvaluateOptions) -> Result<Completion<Evaluation>> {
     Completion::from_result(evaluate_whole(options))
 }
@@ -184,7 +184,7 @@ impl ModelPair {
         Ok(())
     }
 
-    /// Compares all views; with a cache folder, joins the results of shards, and ends a run of one shard after its part.
+    /// Compares all views. With a cache folder, joins the results of shards; a run of one shard stores its shard and ends.
     ///
     /// # Errors
     /// Fails if a frame or a photograph cannot be read, or if the cache folder cannot be used.
@@ -194,8 +194,8 @@ impl ModelPair {
         Ok(evaluation)
     }
 
-    /// Compares all views as the first stage of a longer run: like [`ModelPair::evaluate`], but a run of one shard goes on to
-    /// the next stage.
+    /// Compares all views as the first stage of a longer run: like [`ModelPair::evaluate`], but a run of one shard goes
+    /// on to the next stage if the results of all shards are in the cache.
     ///
     /// # Errors
     /// Fails as [`ModelPair::evaluate`].
@@ -217,8 +217,8 @@ impl ModelPair {
         Ok((self.evaluation(scores)?, observed))
     }
 
-    /// Returns the values of `observe` for every view, like [`ModelPair::observe`], without scores. Runs as the stage `name`,
-    /// which shards can divide.
+    /// Returns the values of `observe` for every view, like [`ModelPair::observe`], without scores. Runs as the stage
+    /// `name`, which shards can divide.
     ///
     /// # Errors
     /// Fails if a frame or a photograph cannot be read, or if the cache folder cannot be used.
@@ -243,7 +243,8 @@ impl ModelPair {
         })
     }
 
-    /// Computes one value per view with `compute`, as the stage `name`, which shards can divide. Returns the values in order.
+    /// Computes one value per view with `compute`, as the stage `name`, which shards can divide. Returns the values in
+    /// order.
     fn compute_sharded<T: Serialize + DeserializeOwned>(
         &self,
         name: &str,
@@ -317,8 +318,8 @@ impl ModelPair {
         Ok(CacheKey::new(&(compressed, photographs, &self.views, self.background, self.flip)))
     }
 
-    /// Renders the views with the indices `places` in [`Evaluation::pictures`] again and passes them to `see`, each with the
-    /// frame state of the original. Keeping all renders would take memory that grows with frames and views.
+    /// Renders the views with the indices `places` in [`Evaluation::pictures`] again and passes them to `see`, each
+    /// with the frame state of the original. Keeping all renders would take memory that grows with frames and views.
     ///
     /// # Errors
     /// Fails if a frame or a photograph cannot be read.
@@ -346,8 +347,8 @@ impl ModelPair {
         self.views[place]
     }
 
-    /// Renders `pictures` with both models and returns the values of `see`, in order. The first image is of the original. The
-    /// views may be any views of the cameras of the scene.
+    /// Renders `pictures` with both models and returns the values of `see`, in order. The first image is of the
+    /// original. The views may be any views of the cameras of the scene.
     ///
     /// # Errors
     /// Fails if a frame cannot be read or if `see` fails.
@@ -379,8 +380,8 @@ impl ModelPair {
         show(subjects, &self.scene.rig.cameras, pictures, Batch::one_frame(&self.scene.limits), visit)
     }
 
-    /// Computes the scores and the values of `observe` for the views in `range`. For the temporal error, first renders the
-    /// last images of these views before `range` again.
+    /// Computes the scores and the values of `observe` for the views in `range`. For the temporal error, first renders
+    /// the last images of these views before `range` again.
     fn scores<O: Send>(
         &self,
         range: Range<usize>,
@@ -446,7 +447,8 @@ impl ModelPair {
     }
 }
 
-/// Returns, for every view that occurs in `range`, its last occurrence among the first `start` of `all`, in their order.
+/// Returns, for every view that occurs in `range`, its last occurrence among the first `start` of `all`, in their
+/// order.
 fn previous_views(all: &[FrameView], start: usize, range: &[FrameView]) -> Vec<FrameView> {
     let mut views: HashSet<u32> = range.iter().map(|picture| picture.view).collect();
     let mut last: Vec<FrameView> =

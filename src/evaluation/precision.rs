@@ -33,7 +33,8 @@ pub struct PrecisionDiagram {
     pub kept: usize,
     /// Number of threads, except where the number of threads is varied.
     pub threads: usize,
-    /// Maximum number of runs of each setting; fewer where the runs so far took [`PrecisionDiagram::enough`] seconds in all.
+    /// Maximum number of runs of each setting; fewer where the runs so far took [`PrecisionDiagram::enough`] seconds in
+    /// all.
     pub runs: usize,
     /// Total time of the runs of one setting after which it is not run again, seconds.
     pub enough: f64,
@@ -153,8 +154,8 @@ pub fn meaning(error: &str) -> String {
 }
 
 impl PrecisionCurve {
-    /// Returns a curve of `marks` with the observed orders of all errors; `expected` lists the orders that theory predicts.
-    /// Infinite errors are removed.
+    /// Returns a curve of `marks` with the observed orders of all errors; `expected` lists the orders that theory
+    /// predicts. Infinite errors are removed.
     pub fn new(
         name: &str,
         against: &str,

@@ -112,7 +112,7 @@ fn db(value: f64) -> String {
 
 /// The slider: all images lie on one another, and which two are seen is a matter of classes.
 fn compare(shown: &[ShownImage]) -> String {
-    let mut out = String::from("<div class=\"bar\" role=\"group\" aria-label=\"picture\">\n");
+    let mut out = String::from("<div class=\"bar\" role=\"group\" aria-label=\"render\">\n");
     for (number, picture) in shown.iter().enumerate() {
         let choice = &picture.choice;
         out += &format!(
@@ -162,7 +162,7 @@ fn compare(shown: &[ShownImage]) -> String {
     }
     out += "<span class=\"tag tag-left\"></span><span class=\"tag tag-right\"></span><i id=\"handle\"></i>\n</div>\n\
             <input id=\"cut\" type=\"range\" min=\"0\" max=\"100\" step=\"0.5\" value=\"50\" \
-            aria-label=\"how much of the left picture is seen\">\n<p class=\"note\" id=\"caption\"></p>\n";
+            aria-label=\"how much of the left render is shown\">\n<p class=\"note\" id=\"caption\"></p>\n";
     out
 }
 
