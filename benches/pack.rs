@@ -73,7 +73,7 @@ fn benches(criterion: &mut Criterion) {
         let path = folder.path().join("scene.gseq");
         let [raw_path, within_path] = ["raw.gseq", "within.gseq"].map(|name| folder.path().join(name));
         write(&scene, &path, Compression::Zstd(LEVEL));
-        write(&scene, &raw_path, Compression::StoredParams);
+        write(&scene, &raw_path, Compression::Raw);
         let bounds: Vec<MaxError> =
             Attributes::all().iter().map(|column| format!("{}=1e-3", column.name()).parse().unwrap()).collect();
         write(&scene, &within_path, Packing::within(Bounds::from_errors(&bounds, || Ok(1.0)).unwrap(), 15));

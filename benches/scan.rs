@@ -109,7 +109,7 @@ fn benches(criterion: &mut Criterion) {
     let folder = tempfile::tempdir().unwrap();
     let one_thread = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
     let dynamic = Attributes::all().difference(Attributes::SH);
-    for (kind, compression) in [("packed", Compression::Zstd(1)), ("raw", Compression::StoredParams)] {
+    for (kind, compression) in [("packed", Compression::Zstd(1)), ("raw", Compression::Raw)] {
         for (name, varying) in [("position", Attributes::POSITION), ("all_but_sh", dynamic)] {
             let source = Curves(SequenceInfo { count: GAUSSIANS, times: times.clone(), sh_degree: 0, varying });
             let path = folder.path().join(format!("{kind}_{name}.gseq"));
@@ -286,7 +286,7 @@ fn read_ahead(criterion: &mut Criterion) {
     let folder = tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).unwrap();
     let varying = Attributes::all().difference(Attributes::SH);
     let source = Curves(SequenceInfo { count: GAUSSIANS, times, sh_degree: 0, varying });
-    for (kind, compression) in [("packed", Compression::Zstd(1)), ("raw", Compression::StoredParams)] {
+    for (kind, compression) in [("packed", Compression::Zstd(1)), ("raw", Compression::Raw)] {
         let path = folder.path().join(format!("{kind}.gseq"));
         pack(&source, &path, compression);
         let container = Container::open(&path).unwrap();

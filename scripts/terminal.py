@@ -19,7 +19,7 @@ import unicodedata
 
 ROWS = 500
 # Line of a progress bar, in contrast to other output of a run.
-BAR = re.compile(r"\d+%.* (pictures|states|steps|points|frames|settings|Gaussians)\b")
+BAR = re.compile(r"\d+%.* (views|states|steps|points|frames|settings|Gaussians)\b")
 
 
 class Screen:

@@ -28,7 +28,7 @@ fn status(line: &str) -> usize {
 fn reading_raw_tiles_keeps_no_pages_resident() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("raw.gseq");
-    write_container(&Scene::new(COUNT, FRAMES), &path, Compression::StoredParams, BTreeMap::new(), |_| ()).unwrap();
+    write_container(&Scene::new(COUNT, FRAMES), &path, Compression::Raw, BTreeMap::new(), |_| ()).unwrap();
     let file = fs::metadata(&path).unwrap().len() as usize;
     let container = Container::open(&path).unwrap();
     let varying = container.info().varying;

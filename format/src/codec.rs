@@ -33,7 +33,7 @@ use crate::layout::MAX_TILE_BYTES;
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Compression {
     /// Raw f32 values, which readers use in place from the map.
-    StoredParams,
+    Raw,
     /// Lossless filter and zstd at this level. A tile that does not shrink is stored raw.
     Zstd(i32),
     /// Values that differ from the original by at most `max_error`, compressed by zstd at `level`. A tile that does not
@@ -51,7 +51,7 @@ pub enum Compression {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Encoding {
     /// Little-endian f32.
-    StoredParams,
+    Raw,
     /// Residuals of a prediction from `order` earlier frames, shuffled and compressed by zstd.
     Filtered {
         /// Number of earlier frames used by the prediction: 0, 1 or 2.
@@ -67,7 +67,7 @@ pub enum Encoding {
 impl fmt::Display for Encoding {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Encoding::StoredParams => write!(f, "as it is"),
+            Encoding::Raw => write!(f, "as it is"),
             Encoding::Filtered { order } => write!(f, "predicted, order {order}"),
             Encoding::Bounded { order } => write!(f, "within a bound, order {order}"),
         }
@@ -176,11 +176,11 @@ pub fn encode_tile(values: &[f32], frames: u32, width: u32, len: u32, compressio
             let shuffled = filter(bits, plane, order);
             match zstd::bulk::compress(&shuffled, level) {
                 Ok(bytes) if bytes.len() < shuffled.len() => (Encoding::Filtered { order }, bytes),
-                Ok(_) => (Encoding::StoredParams, raw_bytes(bits)),
+                Ok(_) => (Encoding::Raw, raw_bytes(bits)),
                 Err(error) => return Err(failed(level, error)),
             }
         }
-        _ => (Encoding::StoredParams, raw_bytes(bits)),
+        _ => (Encoding::Raw, raw_bytes(bits)),
     };
     let checksum = xxh3_64(&bytes);
     Ok(EncodedTile { frames, width, len, constant, encoding, max_error: 0.0, stats: stats(bits), checksum, bytes })
@@ -239,7 +239,7 @@ impl TileDecoder {
                 self.order = order;
                 (bytes, 4 * frames * plane)
             }
-            Encoding::StoredParams => return Err("raw values".to_owned()),
+            Encoding::Raw => return Err("raw values".to_owned()),
         };
         self.shuffled.resize(max_bytes, 0);
         // The target has a fixed size, so a zstd frame that decompresses to more is refused, whatever size it declares.

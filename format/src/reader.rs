@@ -281,7 +281,7 @@ impl Reader {
     /// this way.
     pub fn tile<'a>(&'a self, at: TileId, buffer: &'a mut TileBuffer) -> Result<Tile<'a>> {
         let (index, tile) = self.record(at)?;
-        if tile.encoding == Encoding::StoredParams && cfg!(target_endian = "little") {
+        if tile.encoding == Encoding::Raw && cfg!(target_endian = "little") {
             let bytes = self.file.in_place(tile.offset, tile.stored_bytes.into())?;
             self.verify_in_place(index, &tile, bytes)?;
             self.count(1, bytes.len());
@@ -416,7 +416,7 @@ pub(crate) fn read_tile(file: &MappedFile, layout: &Layout, tile: &TileRecord, b
     read_stored(file, tile, stored)?;
     values.resize(tile.value_count(layout), 0.0);
     match tile.encoding {
-        Encoding::StoredParams => {
+        Encoding::Raw => {
             for (value, bytes) in values.iter_mut().zip(stored.as_chunks().0) {
                 *value = f32::from_le_bytes(*bytes);
             }

@@ -85,7 +85,7 @@ impl Record {
         match self {
             Record::Tile(tile) => {
                 let (encoding, order) = match tile.encoding {
-                    Encoding::StoredParams => (0, 0),
+                    Encoding::Raw => (0, 0),
                     Encoding::Filtered { order } => (1, order),
                     Encoding::Bounded { order } => (2, order),
                 };
@@ -133,7 +133,7 @@ impl Record {
         let record = match &bytes[..4] {
             b"TILE" => {
                 let encoding = match (bytes[16], bytes[17]) {
-                    (0, 0) => Encoding::StoredParams,
+                    (0, 0) => Encoding::Raw,
                     (1, order @ 0..=2) => Encoding::Filtered { order },
                     (2, order @ 1..=2) => Encoding::Bounded { order },
                     (encoding, order) => {
@@ -197,7 +197,7 @@ impl TileRecord {
         let raw = 4 * self.value_count(layout) as u64;
         let stored = u64::from(self.stored_bytes);
         let legal = match self.encoding {
-            Encoding::StoredParams => stored == raw,
+            Encoding::Raw => stored == raw,
             Encoding::Filtered { .. } | Encoding::Bounded { .. } => (1..raw).contains(&stored),
         };
         let exact = layout.columns[self.id.column as usize].max_error == 0.0;

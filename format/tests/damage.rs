@@ -37,7 +37,7 @@ fn flipped_bit_anywhere_is_an_error() {
     let folder = scene::folder();
     let path = folder.path().join("a");
     let scenes = [
-        ((small_scene(), small_scene()), Compression::StoredParams),
+        ((small_scene(), small_scene()), Compression::Raw),
         ((small_scene(), small_scene()), Compression::Zstd(1)),
         (bounded_scene(&path), Compression::Zstd(1)),
     ];
@@ -59,7 +59,7 @@ fn cut_file_is_an_error_and_recover_saves_whole_blocks() {
     let folder = scene::folder();
     let [path, saved] = ["a", "saved"].map(|name| folder.path().join(name));
     let scene = small_scene();
-    for compression in [Compression::StoredParams, Compression::Zstd(1)] {
+    for compression in [Compression::Raw, Compression::Zstd(1)] {
         scene.write(&path, compression, |_| ());
         let good = fs::read(&path).unwrap();
         let per_block = scene.tiles().len() / 3;
@@ -159,7 +159,7 @@ fn forged_index_entries_are_refused() {
     let folder = scene::folder();
     let path = folder.path().join("a");
     let scene = Scene::new(layout(9, 9, 2, &[3, 1]), 4, 11);
-    scene.write(&path, Compression::StoredParams, |_| ());
+    scene.write(&path, Compression::Raw, |_| ());
     let good = fs::read(&path).unwrap();
     let first = Reader::open(&path).unwrap().tile_info(scene.tiles()[0]).unwrap().offset;
     fs::write(&path, forge(&good, 2, |_| ())).unwrap();
@@ -201,7 +201,7 @@ fn forged_index_entries_are_refused() {
 fn shrinking_mapped_file_is_an_error() {
     let folder = scene::folder();
     let path = folder.path().join("a");
-    for compression in [Compression::StoredParams, Compression::Zstd(1)] {
+    for compression in [Compression::Raw, Compression::Zstd(1)] {
         let scene = Scene::new(layout(5000, 5000, 2, &[3]), 4, 5);
         scene.write(&path, compression, |_| ());
         let reader = Reader::open(&path).unwrap();
@@ -215,7 +215,7 @@ fn shrinking_mapped_file_is_an_error() {
         fs::OpenOptions::new().write(true).open(&path).unwrap().set_len(4096).unwrap();
         for (in_place, mut frames) in loaded {
             let next = match compression {
-                Compression::StoredParams => reader.read_frame(&mut frames, 1, &mut vec![0.0; 15_000]),
+                Compression::Raw => reader.read_frame(&mut frames, 1, &mut vec![0.0; 15_000]),
                 // A compressed tile that was loaded is in memory, so load it again.
                 _ => reader.load(at, &mut buffer, &mut frames, in_place.then_some(&mut touched)),
             };

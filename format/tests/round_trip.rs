@@ -25,7 +25,7 @@ proptest! {
         let folder = scene::folder();
         let path = folder.path().join("a.gseq");
         let scene = Scene::new(layout(gaussians, gaussian_block, frame_block, &widths), frames, seed);
-        let compression = if raw { Compression::StoredParams } else { Compression::Zstd(1) };
+        let compression = if raw { Compression::Raw } else { Compression::Zstd(1) };
         let digest = scene.write(&path, compression, |ids| if !ids.is_empty() { let by = rotate % ids.len(); ids.rotate_left(by) });
         let reader = Reader::open(&path).unwrap();
         scene.compare(&reader, frames).unwrap();
@@ -104,7 +104,7 @@ fn digest_ignores_write_order_but_bytes_do_not() {
 fn bytes_of_version_1_are_unchanged() {
     let folder = scene::folder();
     let path = folder.path().join("a");
-    Scene::new(layout(30, 8, 3, &[3, 2, 1]), 7, 5).write(&path, Compression::StoredParams, |_| ());
+    Scene::new(layout(30, 8, 3, &[3, 2, 1]), 7, 5).write(&path, Compression::Raw, |_| ());
     let bytes = fs::read(&path).unwrap();
     assert_eq!(bytes[..12], *b"\x89GSEQ\r\n\x1a\x01\0\0\0");
     assert_eq!((bytes.len(), xxh3_64(&bytes)), (9752, 2_483_963_558_680_014_291));
@@ -115,7 +115,7 @@ fn a_column_that_never_changes_is_stored_once() {
     let folder = scene::folder();
     let path = folder.path().join("a");
     let scene = Scene::new(layout(100, 100, 2, &[1, 48]), 8, 5);
-    scene.write(&path, Compression::StoredParams, |_| ());
+    scene.write(&path, Compression::Raw, |_| ());
     let reader = Reader::open(&path).unwrap();
     let infos: Vec<_> =
         (0..4).map(|frame_block| reader.tile_info(TileId { column: 1, frame_block, ..AT }).unwrap()).collect();
@@ -135,7 +135,7 @@ fn motion_that_returns_to_its_start_is_kept() {
         scene.bits[0] = (0..frames * 100).map(|i| place(i).to_bits()).collect();
         scene
     };
-    for compression in [Compression::StoredParams, Compression::Zstd(1)] {
+    for compression in [Compression::Raw, Compression::Zstd(1)] {
         turning().write(&path, compression, |_| ());
         turning().compare(&Reader::open(&path).unwrap(), frames).unwrap();
     }
@@ -172,7 +172,7 @@ fn one_encoded_frame_serves_frame_blocks_of_any_length() {
     let folder = scene::folder();
     let path = folder.path().join("a");
     let mut writer = Writer::create(&path, layout(2, 2, 3, &[1])).unwrap();
-    let tile = encode_tile(&[1.0, 2.0], 1, 1, 2, Compression::StoredParams).unwrap();
+    let tile = encode_tile(&[1.0, 2.0], 1, 1, 2, Compression::Raw).unwrap();
     for times in [&[0.0, 1.0, 2.0][..], &[3.0]] {
         let frame_block = writer.append_times(times).unwrap();
         writer.write_tile(TileId { frame_block, ..AT }, &tile).unwrap();
@@ -187,7 +187,7 @@ fn threads_share_a_reader() {
     let folder = scene::folder();
     let path = folder.path().join("a");
     let scene = Scene::new(layout(40, 8, 2, &[3, 1, 1]), 6, 5);
-    for compression in [Compression::StoredParams, Compression::Zstd(1)] {
+    for compression in [Compression::Raw, Compression::Zstd(1)] {
         scene.write(&path, compression, |_| ());
         let reader = Reader::open(&path).unwrap();
         std::thread::scope(|threads| {
@@ -203,11 +203,11 @@ fn raw_tiles_are_aligned_and_used_in_place() {
     let folder = scene::folder();
     let path = folder.path().join("a");
     let scene = Scene::new(layout(7, 3, 2, &[3]), 4, 5);
-    scene.write(&path, Compression::StoredParams, |_| ());
+    scene.write(&path, Compression::Raw, |_| ());
     let reader = Reader::open(&path).unwrap();
     for id in scene.tiles() {
         let info = reader.tile_info(id).unwrap();
-        assert_eq!((info.encoding, info.offset % 64), (Encoding::StoredParams, 0));
+        assert_eq!((info.encoding, info.offset % 64), (Encoding::Raw, 0));
         let mut buffers = [TileBuffer::default(), TileBuffer::default()];
         let [a, b] = buffers.each_mut().map(|buffer| reader.tile(id, buffer).unwrap().values().as_ptr());
         assert_eq!(a, b, "two buffers, one place");
@@ -219,7 +219,7 @@ fn every_stored_byte_read_is_counted_once() {
     let folder = scene::folder();
     let path = folder.path().join("a");
     let scene = Scene::new(layout(7, 3, 2, &[3, 1]), 5, 5);
-    for compression in [Compression::StoredParams, Compression::Zstd(1)] {
+    for compression in [Compression::Raw, Compression::Zstd(1)] {
         scene.write(&path, compression, |_| ());
         let reader = Reader::open(&path).unwrap();
         assert_eq!(reader.tiles_read(), TileReadCounts::default(), "opening reads no tile");
@@ -251,7 +251,7 @@ fn final_name_appears_only_at_the_end() {
     let path = folder.path().join("a");
     let scene = Scene::new(layout(5, 2, 2, &[3]), 4, 5);
     let mut writer = Writer::create(&path, scene.layout.clone()).unwrap();
-    scene.fill(&mut writer, Compression::StoredParams, |_| ());
+    scene.fill(&mut writer, Compression::Raw, |_| ());
     let names: Vec<_> = fs::read_dir(folder.path()).unwrap().map(|entry| entry.unwrap().file_name()).collect();
     assert!(names.len() == 1 && names[0].to_string_lossy().ends_with(".tmp"), "{names:?}");
     drop(writer);
@@ -263,7 +263,7 @@ fn invalid_calls_are_refused_and_writer_stays_usable() {
     let folder = scene::folder();
     let path = folder.path().join("a");
     let mut writer = Writer::create(&path, layout(2, 2, 3, &[1])).unwrap();
-    let tile = encode_tile(&[1.0, 2.0, 3.0, 4.0], 2, 1, 2, Compression::StoredParams).unwrap();
+    let tile = encode_tile(&[1.0, 2.0, 3.0, 4.0], 2, 1, 2, Compression::Raw).unwrap();
     assert!(matches!(writer.write_tile(AT, &tile), Err(Error::Usage(_))), "before its time stamps");
     for times in [&[][..], &[f64::NAN], &[0.0, 0.0], &[1.0, 0.5], &[0.0, 1.0, 2.0, 3.0]] {
         assert!(matches!(writer.append_times(times), Err(Error::Usage(_))), "{times:?}");
@@ -271,7 +271,7 @@ fn invalid_calls_are_refused_and_writer_stays_usable() {
     writer.append_times(&[0.0, 1.0]).unwrap();
     assert!(matches!(writer.append_times(&[2.0]), Err(Error::Usage(_))), "after a short block");
     assert!(writer.write_tile(TileId { column: 1, ..AT }, &tile).is_err());
-    assert!(writer.write_tile(AT, &encode_tile(&[1.0, 2.0], 2, 1, 1, Compression::StoredParams).unwrap()).is_err());
+    assert!(writer.write_tile(AT, &encode_tile(&[1.0, 2.0], 2, 1, 1, Compression::Raw).unwrap()).is_err());
     writer.write_tile(AT, &tile).unwrap();
     assert!(writer.write_tile(AT, &tile).is_err(), "twice");
     writer.finish().unwrap();

@@ -17,14 +17,19 @@ use super::recipe_flags::RecipeFlags;
 use splatsieve::diagnostics::demo_scene::Playground;
 use splatsieve::outputs::bounds::MaxError;
 
-/// Headings of the groups of options in the help.
+/// Heading of the options for cameras in the help.
 const CAMERAS: &str = "Cameras";
+/// Heading of the options for the target size or quality.
 const HOW_SMALL: &str = "How small";
+/// Heading of the options that keep or drop Gaussians.
 const WHAT_STAYS: &str = "What is kept";
+/// Heading of the options for threads, memory and progress.
 const MACHINE: &str = "Machine";
+/// Heading of the options for the cache folder and shards.
 const CACHE: &str = "Resuming and sharing a run";
 
-/// Makes trained dynamic (4D) Gaussian-splatting models much smaller. Needs no GPU and no training code; your renderer opens the result
+/// Makes trained dynamic (4D) Gaussian-splatting models much smaller. Needs no GPU and no training code; your renderer
+/// opens the result
 #[derive(Debug, Parser)]
 #[command(name = "splatsieve", version, about, max_term_width = 110)]
 pub(super) struct Cli {
@@ -39,7 +44,7 @@ pub(super) struct Cli {
     pub(super) quiet: bool,
 }
 
-/// The commands.
+/// Commands with their arguments.
 #[derive(Debug, Subcommand)]
 pub(super) enum CommandArgs {
     /// Write a smaller model that your renderer opens
@@ -104,7 +109,7 @@ impl CommandArgs {
     }
 }
 
-/// `compress`
+/// Arguments of `compress`.
 #[derive(Debug, Args)]
 pub(super) struct Compress {
     #[command(flatten)]
@@ -115,8 +120,8 @@ pub(super) struct Compress {
     /// Format of the output [default: by its name]
     #[arg(long = "as", value_enum, value_name = "FORMAT")]
     pub(super) kind: Option<OutputKindArg>,
-    /// PSNR of an archive (NAME.gsz) against the result before quantization, such as 45dB [default: 9 dB above the PSNR of the result
-    /// against the original, which costs about 0.5 dB; at most 50dB]
+    /// PSNR of an archive (NAME.gsz) against the result before quantization, such as 45dB [default: 9 dB above the PSNR
+    /// of the result against the original, which costs about 0.5 dB; at most 50dB]
     #[arg(long, value_name = "DB", help_heading = HOW_SMALL, hide_short_help = true, value_parser = parse_decibels)]
     pub(super) archive_psnr: Option<f64>,
     #[command(flatten)]
@@ -179,8 +184,8 @@ pub(super) struct OutputSize {
     pub(super) max_loss: Option<f64>,
     /// Folder with photographs of the test views, for --max-loss
     ///
-    /// Files as the cameras name them, else tNNN_vNN.png. A quarter of them is kept apart from the search and gives the figure
-    /// that is reported.
+    /// Files as the cameras name them, else tNNN_vNN.png. A quarter of them is not used in the search and gives the
+    /// reported value.
     #[arg(long, help_heading = HOW_SMALL, value_name = "FOLDER", requires = "max_loss")]
     pub(super) ground_truth: Option<PathBuf>,
 }
@@ -221,7 +226,7 @@ pub(super) enum OutputKindArg {
     Spz,
 }
 
-/// `score`
+/// Arguments of `score`.
 #[derive(Debug, Args)]
 pub(super) struct ScoreArgs {
     #[command(flatten)]
@@ -238,7 +243,7 @@ pub(super) struct ScoreArgs {
     pub(super) recipe: RecipeFlags,
 }
 
-/// `render`
+/// Arguments of `render`.
 #[derive(Debug, Args)]
 #[command(group(clap::ArgGroup::new("wanted").args(["frame", "all", "video"]).required(true)))]
 pub(super) struct Render {
@@ -255,8 +260,8 @@ pub(super) struct Render {
     /// Render every view of the split into a folder, as tNNN_vNN files
     #[arg(long)]
     pub(super) all: bool,
-    /// Write a video with one image per frame: NAME.png or NAME.apng (animated PNG, lossless), NAME.gif, or NAME.mp4 or NAME.webm
-    /// (needs ffmpeg), from --view [default: the first] or along --path
+    /// Write a video with one image per frame: NAME.png or NAME.apng (animated PNG, lossless), NAME.gif, or NAME.mp4 or
+    /// NAME.webm (needs ffmpeg), from --view [default: the first] or along --path
     #[arg(long, value_name = "FILE")]
     pub(super) video: Option<PathBuf>,
     /// Move the camera of --video through these views, such as 0,2,5 [default: all views of the split]
@@ -343,7 +348,7 @@ pub(super) struct CompareArgs {
     pub(super) flip: bool,
 }
 
-/// `report`
+/// Arguments of `report`.
 #[derive(Debug, Args)]
 pub(super) struct ReportArgs {
     #[command(flatten)]
@@ -369,7 +374,7 @@ pub(super) struct ReportArgs {
     pub(super) earlier: Earlier,
 }
 
-/// `evaluate`
+/// Arguments of `evaluate`.
 #[derive(Debug, Args)]
 pub(super) struct Evaluate {
     #[command(flatten)]
@@ -386,7 +391,7 @@ pub(super) struct Evaluate {
     pub(super) json: bool,
 }
 
-/// `view`
+/// Arguments of `view`.
 #[derive(Debug, Args)]
 pub(super) struct ViewArgs {
     #[command(flatten)]
@@ -426,13 +431,13 @@ pub(super) fn default_page_limit() -> u64 {
     parse_bytes(DEFAULT_PAGE).expect("a size")
 }
 
-/// `convert`
+/// Arguments of `convert`.
 #[derive(Debug, Args)]
 pub(super) struct Convert {
     #[command(flatten)]
     pub(super) input: Input,
-    /// NAME.gseq, .ply, .splatv, .4dgs or .spz; a folder (the model in an archive, a PLY per frame of a sequence, or a model
-    /// of the input's own format); - for a frame stream on standard output (format/STREAM.md)
+    /// NAME.gseq, .ply, .splatv, .4dgs or .spz; a folder (the model in an archive, a PLY per frame of a sequence, or a
+    /// model of the input's own format); - for a frame stream on standard output (format/STREAM.md)
     #[arg(value_name = "OUTPUT", required_unless_present = "output_option")]
     pub(super) output: Option<PathBuf>,
     /// The output, as other commands name it
@@ -451,8 +456,9 @@ pub(super) struct Convert {
     #[arg(long = "as", value_name = "FORMAT", value_enum)]
     pub(super) kind: Option<OutputKindArg>,
     /// Maximum error of an attribute in a .gseq: `position=1e-3` in the attribute's unit (scene units, components of
-    /// quaternions, logs of scales, opacity logits, SH coefficients) or `position=0.01%` of the scene's extent; attributes that are
-    /// not named keep every bit. Every value is checked as it is written, and the file states its bounds
+    /// quaternions, logs of scales, opacity logits, SH coefficients) or `position=0.01%` of the scene's extent;
+    /// attributes that are not named keep every bit. Every value is checked as it is written, and the file states its
+    /// bounds
     #[arg(long, value_name = "ATTRIBUTE=BOUND", value_delimiter = ',', conflicts_with = "raw")]
     pub(super) max_error: Vec<MaxError>,
     /// Store the tiles of a .gseq uncompressed, for use in place
@@ -470,7 +476,7 @@ pub(super) struct Convert {
     pub(super) earlier: Earlier,
 }
 
-/// `info`
+/// Arguments of `info`.
 #[derive(Debug, Args)]
 pub(super) struct InfoArgs {
     #[command(flatten)]
@@ -488,7 +494,7 @@ pub(super) struct InfoArgs {
     pub(super) earlier: Earlier,
 }
 
-/// `cache`
+/// Arguments of `cache`.
 #[derive(Debug, Args)]
 pub(super) struct CacheFolder {
     /// Folder that was given to --cache
@@ -501,7 +507,7 @@ pub(super) struct CacheFolder {
     pub(super) json: bool,
 }
 
-/// `demo`
+/// Arguments of `demo`.
 #[derive(Debug, Args)]
 pub(super) struct Demo {
     /// Folder to write the scene, its compressed models, the pages and the film into
@@ -545,7 +551,7 @@ pub(super) struct TestScene {
     pub(super) recipe: RecipeFlags,
 }
 
-/// `selfcheck`
+/// Arguments of `selfcheck`.
 #[derive(Debug, Args)]
 pub(super) struct Selfcheck {
     /// Print JSON
@@ -553,7 +559,7 @@ pub(super) struct Selfcheck {
     pub(super) json: bool,
 }
 
-/// `recipe`
+/// Arguments of `recipe`.
 #[derive(Debug, Args)]
 pub(super) struct RecipeArgs {
     /// `default`, `paper` (with a description of every parameter), `gentle` or `strong`
@@ -561,7 +567,7 @@ pub(super) struct RecipeArgs {
     pub(super) preset: String,
 }
 
-/// `completions`
+/// Arguments of `completions`.
 #[derive(Debug, Args)]
 pub(super) struct Completions {
     /// Shell to complete for
@@ -569,7 +575,7 @@ pub(super) struct Completions {
     pub(super) shell: clap_complete::Shell,
 }
 
-/// `man`
+/// Arguments of `man`.
 #[derive(Debug, Args)]
 pub(super) struct Man {
     /// Output folder

@@ -1,4 +1,4 @@
-//! Help of the program and of each command: description, examples, options in groups; and the same as manual pages.
+//! Help of the program and of each command: description, examples, options in groups. Also writes it as manual pages.
 
 use std::fs;
 use std::path::Path;
@@ -9,8 +9,8 @@ use super::args::Cli;
 use splatsieve::error::{Error, Result, ShowPath};
 use splatsieve::files::atomic::{Kind, Replace, StagedFile, StagedFolder, check_target};
 
-/// Title in the source of every manual page of this program.
-const PAGE: &str = ".TH splatsieve";
+/// Start of the title line in the source of every manual page; identifies pages that this program wrote.
+const PAGE_TITLE: &str = ".TH splatsieve";
 
 /// Order of the help of a command: description, examples, usage, options.
 const TEMPLATE: &str = "{about-section}\n{before-help}{usage-heading} {usage}\n\n{all-args}{after-help}";
@@ -18,6 +18,7 @@ const TEMPLATE: &str = "{about-section}\n{before-help}{usage-heading} {usage}\n\
 /// Order of the help of the program: description, examples, usage, groups of commands, options.
 const TOP_TEMPLATE: &str = "{about-section}\n{before-help}{usage-heading} {usage}\n\n{after-help}\n{options}";
 
+/// Examples in the help of the program.
 const EXAMPLES: &str = "\
 Examples:
   splatsieve demo                                    try it on a built-in scene
@@ -147,26 +148,27 @@ pub(super) fn command() -> Command {
     command.help_template(TOP_TEMPLATE).after_help(groups.join("\n") + "\nOptions:")
 }
 
-/// Writes a manual page of the program and one of each command into `folder`, all or none; returns their number. Other files
-/// in the folder stay, and earlier pages are replaced.
+/// Writes one manual page for the program and one for each command to `folder`, all or none. Returns the number of
+/// pages. Replaces earlier pages and keeps other files in the folder.
 ///
 /// # Errors
-/// A folder that cannot be made or written to; a file with the name of a page that is no page of this program.
+/// Fails if the folder cannot be created or written, or if a file with the name of a page is not a page of this
+/// program.
 pub(super) fn write_pages(folder: &Path) -> Result<usize> {
     let pages = pages()?;
     let is_missing = |folder: &&Path| !folder.as_os_str().is_empty() && !folder.exists();
-    let made: Vec<&Path> = folder.ancestors().skip(1).take_while(is_missing).collect();
-    let parent = made.first().copied().unwrap_or(Path::new("."));
+    let missing: Vec<&Path> = folder.ancestors().skip(1).take_while(is_missing).collect();
+    let parent = missing.first().copied().unwrap_or(Path::new("."));
     fs::create_dir_all(parent).map_err(Error::io("create", parent))?;
     let written = if folder.exists() { write_beside(&pages, folder) } else { write_folder(&pages, folder) };
     if written.is_err() {
-        // Folders that hold other files by now stay.
-        made.iter().for_each(|folder| drop(fs::remove_dir(folder)));
+        // Removing fails for a folder into which another program has written meanwhile, so its files are kept.
+        missing.iter().for_each(|folder| drop(fs::remove_dir(folder)));
     }
     written.map(|()| pages.len())
 }
 
-/// Returns file name and text of every page.
+/// Returns the file name and the text of every page.
 fn pages() -> Result<Vec<(String, Vec<u8>)>> {
     let mut command = command().disable_help_subcommand(true);
     command.build();
@@ -175,7 +177,7 @@ fn pages() -> Result<Vec<(String, Vec<u8>)>> {
         let name = page.get_display_name().unwrap_or(page.get_name()).to_owned();
         let file = format!("{name}.1");
         let mut text = Vec::new();
-        // Manual pages have the examples at the end, one per line.
+        // In manual pages, the examples are at the end, one per line.
         let examples = page.get_before_help().map(ToString::to_string).unwrap_or_default();
         let page = page.clone().name(name).before_help("").after_help("");
         clap_mangen::Man::new(page).render(&mut text).map_err(Error::io("make", Path::new(&file)))?;
@@ -186,7 +188,7 @@ fn pages() -> Result<Vec<(String, Vec<u8>)>> {
     std::iter::once(&command).chain(subcommands).map(page).collect()
 }
 
-/// Writes pages into a folder that is not there yet.
+/// Writes pages to a new folder.
 fn write_folder(pages: &[(String, Vec<u8>)], folder: &Path) -> Result<()> {
     check_target(folder, Kind::Folder, &[], Replace::Never)?;
     let staged = StagedFolder::new(folder, Replace::Never)?;
@@ -197,12 +199,12 @@ fn write_folder(pages: &[(String, Vec<u8>)], folder: &Path) -> Result<()> {
     staged.commit()
 }
 
-/// Writes pages into a folder with whatever else is in it.
+/// Writes pages to an existing folder, beside its other files.
 fn write_beside(pages: &[(String, Vec<u8>)], folder: &Path) -> Result<()> {
     let mut staged = Vec::new();
     for (name, text) in pages {
         let path = folder.join(name);
-        let is_page = |text: Vec<u8>| text.windows(PAGE.len()).any(|part| part == PAGE.as_bytes());
+        let is_page = |text: Vec<u8>| text.windows(PAGE_TITLE.len()).any(|part| part == PAGE_TITLE.as_bytes());
         if path.exists() && !fs::read(&path).is_ok_and(is_page) {
             return Err(Error::usage(format!(
                 "{}: expected a manual page of splatsieve, found something else\n  move it away or name another folder",
@@ -248,9 +250,9 @@ mod tests {
             for example in examples {
                 // Two spaces separate the command line from its explanation.
                 let line = example.trim().split("  ").next().unwrap_or_default();
-                for one in line.split(" | ").filter_map(|one| one.split(" > ").next()) {
-                    let parsed = command().try_get_matches_from(one.split_whitespace());
-                    assert!(parsed.is_ok(), "{one}: {}", parsed.unwrap_err());
+                for command_line in line.split(" | ").filter_map(|part| part.split(" > ").next()) {
+                    let parsed = command().try_get_matches_from(command_line.split_whitespace());
+                    assert!(parsed.is_ok(), "{command_line}: {}", parsed.unwrap_err());
                 }
             }
         }

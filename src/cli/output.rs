@@ -1,4 +1,4 @@
-//! Standard output: data, and what a command says at its end. This is the one place that opens it.
+//! Standard output: data and results of commands. Only this module opens it.
 
 use std::io::{self, IsTerminal, Write};
 use std::path::Path;
@@ -7,36 +7,37 @@ use super::message::tell;
 use splatsieve::error::{Error, Result, printable};
 use splatsieve::files::atomic::is_standard_output_used;
 
-/// What messages call standard output.
+/// Name of standard output in error messages.
 const NAME: &str = "standard output";
 
+/// Returns standard output.
 #[expect(clippy::disallowed_methods, reason = "the one place that opens standard output")]
 pub(super) fn stdout() -> io::Stdout {
     io::stdout()
 }
 
-/// Writes `text`, control characters by their codes.
+/// Writes `text`, with control characters replaced by their codes.
 ///
 /// # Errors
-/// A standard output that cannot be written; see [`has_no_reader`].
+/// Fails if standard output cannot be written; see [`has_no_reader`].
 pub(super) fn print(text: &str) -> Result<()> {
     write(printable(text).as_bytes())
 }
 
-/// Writes `text`; if it is JSON, characters that could control a terminal are escaped as JSON has it.
+/// Writes `text`. If it is JSON, control characters are replaced by JSON escapes, otherwise as by [`print`].
 ///
 /// # Errors
-/// Those of [`print`].
+/// Fails as [`print`].
 pub(super) fn print_as(is_json: bool, text: &str) -> Result<()> {
     if is_json { write(json_escaped(text).as_bytes()) } else { print(text) }
 }
 
-/// Writes `bytes` as they are.
+/// Writes `bytes` unchanged. If a result was written to standard output, writes them to standard error instead.
 ///
 /// # Errors
-/// Those of [`print`].
+/// Fails as [`print`].
 pub(super) fn write(bytes: &[u8]) -> Result<()> {
-    // The result itself went there: a report behind it would corrupt it.
+    // Text after a result on standard output would corrupt the result.
     if is_standard_output_used() {
         tell(String::from_utf8_lossy(bytes).trim_end());
         return Ok(());
@@ -45,17 +46,18 @@ pub(super) fn write(bytes: &[u8]) -> Result<()> {
     out.write_all(bytes).and_then(|()| out.flush()).map_err(Error::io("write", Path::new(NAME)))
 }
 
-/// Writes what clap has to say: help and version to standard output, what is wrong with the arguments to standard error.
+/// Prints a message of clap: help and version to standard output, argument errors to standard error.
 ///
 /// # Errors
-/// Those of [`print`]; a standard error that cannot be written is none.
+/// Fails as [`print`]. A failure to write to standard error is ignored.
 pub(super) fn print_clap(error: &clap::Error) -> Result<()> {
-    // Its text has escape sequences of its own, for colors. So it must quote no argument that has some.
+    // The text contains escape sequences for colors, so it cannot be filtered here; the caller ensures that it quotes
+    // no argument with control characters.
     let done = error.print().and_then(|()| if error.use_stderr() { Ok(()) } else { stdout().flush() });
     if error.use_stderr() { Ok(()) } else { done.map_err(Error::io("write", Path::new(NAME))) }
 }
 
-/// Whether `error` says that whoever read standard output has ended, as `head` does when it has seen enough.
+/// Returns whether `error` means that the reader of standard output has ended, as `head` does after its last line.
 pub(super) fn has_no_reader(error: &Error) -> bool {
     match error {
         Error::Io { source, path, .. } => source.kind() == io::ErrorKind::BrokenPipe && path == Path::new(NAME),
@@ -63,13 +65,13 @@ pub(super) fn has_no_reader(error: &Error) -> bool {
     }
 }
 
-/// Whether standard output is a terminal.
+/// Returns whether standard output is a terminal.
 pub(super) fn is_terminal() -> bool {
     stdout().is_terminal()
 }
 
-/// Returns a JSON text in which every character that [`printable`] replaces is escaped; such characters occur in its
-/// strings alone.
+/// Returns a JSON text in which every character that [`printable`] replaces is escaped. Such characters occur only
+/// inside its strings.
 fn json_escaped(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
     for c in text.chars() {
@@ -90,7 +92,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn json_says_the_same_without_control_characters() {
+    fn escaped_json_parses_to_the_same_value() {
         let name = "a\u{9b}2J\u{202e}b\u{e0041}\u{7f}é";
         let text = serde_json::to_string(name).unwrap();
         let escaped = json_escaped(&text);

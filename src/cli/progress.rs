@@ -1,8 +1,8 @@
-//! Progress on standard error. On a terminal every task has a bar with rate and time left, tasks within a task a line each
-//! below it. Elsewhere, for logs, a task has a line when it ends and at most one a minute before; a task within another has
+//! Progress on standard error. On a terminal, every task has a bar with rate and time left; nested tasks have bars
+//! below it. In a log, a task prints a line when it ends and at most one line per minute before; a nested task prints
 //! none when it ends.
 //!
-//! A line that is wider than the terminal would leave its end behind when it is redrawn: lines are composed here from
+//! A line wider than the terminal would not be erased completely when it is redrawn. Therefore lines are composed from
 //! the parts that fit.
 
 use std::fmt::Write as _;
@@ -17,55 +17,60 @@ use super::message::{is_terminal, tell};
 use splatsieve::error::printable;
 use splatsieve::progress::{EventSink, ExpectedStage, Message, Task, TaskSink, duration};
 
-/// Seconds between two lines of one task in a log.
-const LINE_EVERY: u64 = 60;
+/// Minimum seconds between two log lines of one task.
+const LOG_INTERVAL_SECONDS: u64 = 60;
 
-/// Columns of a terminal that does not say how many it has.
-const USUAL_COLUMNS: u16 = 80;
-/// Columns that a bar has at most, and at least: a shorter one shows nothing that the percentage does not.
-const BAR: [usize; 2] = [30, 8];
+/// Assumed width of a terminal that does not report its width, columns.
+const DEFAULT_COLUMNS: u16 = 80;
+/// Maximum columns of a bar.
+const MAX_BAR_COLUMNS: usize = 30;
+/// Minimum columns of a bar; a shorter bar shows no more than the percentage.
+const MIN_BAR_COLUMNS: usize = 8;
 
-/// Shows events on standard error.
+/// Display of events on standard error.
 pub(super) struct Display {
-    /// Whether neither progress nor discarded results are shown; plans are, for they were asked for.
+    /// Whether to hide progress and discarded results. Plans are always shown, because the user requests them.
     is_quiet: bool,
     shared: Arc<Shared>,
 }
 
-/// What the display and its tasks share.
+/// State shared by the display and its tasks.
 #[derive(Debug)]
 struct Shared {
-    /// All bars: a task that begins within another has a line below it.
+    /// Bars of all running tasks; the bar of a nested task is below that of the outer task.
     bars: MultiProgress,
-    /// Number of tasks of a log that go on.
+    /// Number of running tasks in a log.
     logs: AtomicUsize,
+    /// Position in the current run; `None` outside a run.
     run: Mutex<Option<RunPosition>>,
 }
 
 impl Shared {
+    /// Locks the position in the current run. Ignores poisoning: a panicked thread cannot leave it inconsistent.
     fn run(&self) -> MutexGuard<'_, Option<RunPosition>> {
         self.run.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
 impl Display {
+    /// Returns a display; `is_quiet` hides progress.
     pub(super) fn new(is_quiet: bool) -> Self {
         let bars = MultiProgress::with_draw_target(ProgressDrawTarget::stderr_with_hz(10));
         Display { is_quiet, shared: Arc::new(Shared { bars, logs: AtomicUsize::new(0), run: Mutex::new(None) }) }
     }
 
-    /// Adds a bar for a task called `name` in its line.
+    /// Adds a bar for `task`, labeled `name`.
     fn bar(&self, task: Task<'_>, name: String) -> Bar {
         let bar = self.shared.bars.add(task.total.map_or_else(ProgressBar::no_length, ProgressBar::new));
         if let Ok(style) = ProgressStyle::with_template("{line}") {
             let (unit, shared) = (task.unit.to_owned(), self.shared.clone());
-            // Time left in a task that is no stage says nothing about the rest of the run.
+            // The time left of the run is known only during a stage; the label of a stage has a number.
             let is_stage = name != task.name;
             let line = move |state: &ProgressState, out: &mut dyn std::fmt::Write| {
-                let columns = Term::stderr().size_checked().map_or(USUAL_COLUMNS, |(_, columns)| columns);
+                let columns = Term::stderr().size_checked().map_or(DEFAULT_COLUMNS, |(_, columns)| columns);
                 let run = shared.run();
                 let run = run.as_ref().filter(|_| is_stage);
-                // Writing to what is drawn cannot fail. The last column stays free: some terminals go on to the next line.
+                // Writing to the draw buffer cannot fail. The last column stays free: some terminals wrap after it.
                 let _ = out.write_str(
                     &BarSnapshot::new(state, &name, run, &unit).line(usize::from(columns).saturating_sub(1)),
                 );
@@ -78,9 +83,9 @@ impl Display {
 }
 
 impl EventSink for Display {
-    /// From now on a bar or line of one of `stages` says `[k/n]`, and a bar how long the whole run will take yet.
+    /// Starts a run of `stages`. Labels of its stages then show `[k/n]`, and bars show the time left of the run.
     fn run_begun(&self, stages: &[ExpectedStage]) {
-        *self.shared.run() = Some(RunPosition { stages: stages.to_vec(), start: Instant::now(), at: None });
+        *self.shared.run() = Some(RunPosition { stages: stages.to_vec(), start: Instant::now(), current: None });
     }
 
     fn run_ended(&self) {
@@ -108,7 +113,7 @@ impl EventSink for Display {
             Message::Discarded { stage, why } => {
                 let line = format!("{stage}  left out: {why}");
                 match is_terminal() {
-                    // A terminal that cannot be written to shows nothing of the rest either.
+                    // A failure to write to the terminal is ignored, as for all progress.
                     true => drop(self.shared.bars.println(printable(&line))),
                     false => tell(&line),
                 }
@@ -117,7 +122,7 @@ impl EventSink for Display {
     }
 }
 
-/// A task with a bar.
+/// Task with a progress bar.
 #[derive(Debug)]
 struct Bar {
     bar: ProgressBar,
@@ -142,79 +147,81 @@ impl Drop for Bar {
     }
 }
 
-/// Where a run is.
+/// Position in a run.
 #[derive(Debug)]
 struct RunPosition {
-    /// Names, and about how many seconds they take.
+    /// Names of the stages and their expected seconds.
     stages: Vec<(&'static str, f64)>,
     start: Instant,
-    /// The stage that runs, and since when.
-    at: Option<(usize, Instant)>,
+    /// Index of the running stage and its start; `None` before the first stage.
+    current: Option<(usize, Instant)>,
 }
 
 impl RunPosition {
-    /// A stage's name with its place among the stages, if it is one of them: the one that runs now.
-    fn enter(&mut self, what: &str, now: Instant) -> String {
-        let Some(place) = self.stages.iter().position(|(stage, _)| *stage == what) else { return what.to_owned() };
-        if self.at.is_none_or(|(stage, _)| stage != place) {
-            self.at = Some((place, now));
+    /// Marks the stage `name` as running and returns its name with its number, `[k/n] name`. Returns other names
+    /// unchanged.
+    fn enter(&mut self, name: &str, now: Instant) -> String {
+        let Some(place) = self.stages.iter().position(|(stage, _)| *stage == name) else { return name.to_owned() };
+        if self.current.is_none_or(|(stage, _)| stage != place) {
+            self.current = Some((place, now));
         }
-        format!("[{}/{}] {what}", place + 1, self.stages.len())
+        format!("[{}/{}] {name}", place + 1, self.stages.len())
     }
 
-    /// Seconds until its end, about, when the step that runs takes `step` more: what is expected of the stages to come,
-    /// corrected by how long those before took.
+    /// Estimates the seconds until the end of the run, if the current task takes `step` more seconds. The expected
+    /// times of the current and later stages are scaled by actual over expected time of the stages before.
     fn left(&self, step: f64, now: Instant) -> f64 {
-        let Some((place, since)) = self.at else { return step };
+        let Some((place, since)) = self.current else { return step };
         let expected = |stages: &[(&str, f64)]| stages.iter().map(|(_, seconds)| seconds).sum::<f64>();
         let before = expected(&self.stages[..place]);
-        // What hardly takes time tells little.
+        // Below half a second of expected time, the ratio is too noisy.
         let correction = match before >= 0.5 {
             true => ((since - self.start).as_secs_f64() / before).clamp(0.1, 10.0),
             false => 1.0,
         };
-        let of_stage = correction * self.stages[place].1 - (now - since).as_secs_f64();
-        of_stage.max(step) + correction * expected(&self.stages[place + 1..])
+        let stage_left = correction * self.stages[place].1 - (now - since).as_secs_f64();
+        stage_left.max(step) + correction * expected(&self.stages[place + 1..])
     }
 }
 
-/// What a bar shows.
+/// Contents of a bar.
 struct BarSnapshot<'a> {
     name: &'a str,
     unit: &'a str,
     done: u64,
     total: Option<u64>,
     per_second: f64,
-    /// Seconds that this will take yet, and the whole run; none where nobody knows.
+    /// Estimated seconds left of the task; `None` if unknown.
     left: Option<f64>,
+    /// Estimated seconds left of the run; `None` if unknown.
     run: Option<f64>,
 }
 
 impl<'a> BarSnapshot<'a> {
-    /// A bar in the state `state` of a task that is a stage of `run`, if there is one.
+    /// Returns the contents of a bar in state `state`; `run` is given if the task is a stage of a run.
     fn new(state: &ProgressState, name: &'a str, run: Option<&RunPosition>, unit: &'a str) -> BarSnapshot<'a> {
         let (done, total) = (state.pos(), state.len());
-        // Of what has not begun to move nobody knows how fast it is.
+        // The rate is unknown before the first unit is done.
         let left = total.filter(|&total| done > 0 && total > done).map(|_| state.eta().as_secs_f64());
         let run = run.map(|run| run.left(left.unwrap_or(0.0), Instant::now()));
         BarSnapshot { name, unit, done, total, per_second: state.per_sec(), left, run }
     }
 
-    /// All of it that has room in so many columns: its name always, then how much is done, how long it takes yet, how
-    /// much, how fast, how long the run takes, and a bar.
+    /// Returns a line of at most `columns` columns. The name is always shown; the other parts are added while they fit,
+    /// in this order: percentage, time left, count, rate, time left of the run, bar.
     fn line(&self, columns: usize) -> String {
         let BarSnapshot { name, unit, done, total, per_second, left, run } = self;
-        let soon = |seconds: &&f64| **seconds >= 1.0;
-        // What has no steps yet is being prepared.
+        let is_shown = |seconds: &&f64| **seconds >= 1.0;
+        // A total of 0 means that the task is still being prepared.
         let total = total.filter(|&total| total > 0);
-        let part = total.map(|total| (*done as f64 / total as f64).min(1.0));
-        let of = total.map_or(String::new(), |total| format!("/{}", HumanCount(total)));
+        let fraction = total.map(|total| (*done as f64 / total as f64).min(1.0));
+        let total_text = total.map_or(String::new(), |total| format!("/{}", HumanCount(total)));
         let pieces = [
-            part.map(|part| format!("{:>3.0}%", (100.0 * part).floor())),
-            left.as_ref().filter(soon).map(|left| format!("{} left", whole(*left))),
-            Some(format!("{}{of} {unit}", HumanCount(*done))).filter(|_| *done > 0 || total.is_some()),
+            fraction.map(|fraction| format!("{:>3.0}%", (100.0 * fraction).floor())),
+            left.as_ref().filter(is_shown).map(|left| format!("{} left", whole_seconds(*left))),
+            Some(format!("{}{total_text} {unit}", HumanCount(*done))).filter(|_| *done > 0 || total.is_some()),
             Some(rate(*per_second, unit)).filter(|_| *done > 0),
-            run.as_ref().filter(soon).map(|run| format!("the run {}", whole(*run))),
+            run.as_ref().filter(is_shown).map(|run| format!("the run {}", whole_seconds(*run))),
         ];
         let mut shown = [false; 5];
         let mut width = name.chars().count().max(10);
@@ -225,11 +232,11 @@ impl<'a> BarSnapshot<'a> {
         }
         let [percent, left, count, rate, run] = std::array::from_fn(|k| pieces[k].as_ref().filter(|_| shown[k]));
         let mut line = format!("{name:>10}");
-        if let Some(part) = part {
-            let room = columns.saturating_sub(width + 3).min(BAR[0]);
-            if room >= BAR[1] {
-                let full = (part * room as f64) as usize;
-                line += &format!(" [{}{}]", "=".repeat(full), " ".repeat(room - full));
+        if let Some(fraction) = fraction {
+            let bar_columns = columns.saturating_sub(width + 3).min(MAX_BAR_COLUMNS);
+            if bar_columns >= MIN_BAR_COLUMNS {
+                let full = (fraction * bar_columns as f64) as usize;
+                line += &format!(" [{}{}]", "=".repeat(full), " ".repeat(bar_columns - full));
             }
         }
         line.extend(percent.map(|percent| format!(" {percent}")));
@@ -241,12 +248,12 @@ impl<'a> BarSnapshot<'a> {
     }
 }
 
-/// A time to come, in whole seconds: nobody knows it better.
-fn whole(seconds: f64) -> String {
+/// Returns an estimated time as text, rounded down to whole seconds.
+fn whole_seconds(seconds: f64) -> String {
     if seconds < 60.0 { format!("{:.0} s", seconds.floor()) } else { duration(seconds.floor()) }
 }
 
-/// A task in a log.
+/// Task in a log.
 #[derive(Debug)]
 struct Log {
     name: String,
@@ -256,27 +263,29 @@ struct Log {
     done: AtomicU64,
     /// Seconds from the start to the next line.
     next: AtomicU64,
-    /// Whether it goes on within another.
-    is_within: bool,
+    /// Whether another task was running when this one began.
+    is_nested: bool,
     shared: Arc<Shared>,
 }
 
 impl Log {
+    /// Returns a log of `task`, labeled `name`, that starts now.
     fn new(name: String, task: Task<'_>, shared: Arc<Shared>) -> Log {
-        let (done, next) = (AtomicU64::new(0), AtomicU64::new(LINE_EVERY));
-        let is_within = shared.logs.fetch_add(1, Ordering::Relaxed) > 0;
+        let (done, next) = (AtomicU64::new(0), AtomicU64::new(LOG_INTERVAL_SECONDS));
+        let is_nested = shared.logs.fetch_add(1, Ordering::Relaxed) > 0;
         let (unit, total) = (task.unit.to_owned(), task.total);
-        Log { name, unit, total, start: Instant::now(), done, next, is_within, shared }
+        Log { name, unit, total, start: Instant::now(), done, next, is_nested, shared }
     }
 
-    fn sum_up(&self) {
-        // What failed before its first step has nothing to tell.
-        if self.done.load(Ordering::Relaxed) > 0 && !self.is_within {
+    /// Prints the final line of the task, unless it is nested.
+    fn print_summary(&self) {
+        // A task that failed before its first unit prints nothing.
+        if self.done.load(Ordering::Relaxed) > 0 && !self.is_nested {
             tell(&self.line(self.start.elapsed(), true));
         }
     }
 
-    /// What is known `elapsed` after the start, within the stage or when it has ended.
+    /// Returns the line at `elapsed` after the start: count, rate, and the time left, or the elapsed time if `ended`.
     fn line(&self, elapsed: Duration, ended: bool) -> String {
         let done = self.done.load(Ordering::Relaxed);
         let per_second = done as f64 / elapsed.as_secs_f64().max(1e-9);
@@ -299,27 +308,27 @@ impl TaskSink for Log {
         self.done.fetch_add(units, Ordering::Relaxed);
         let (now, due) = (self.start.elapsed().as_secs(), self.next.load(Ordering::Relaxed));
         let relaxed = Ordering::Relaxed;
-        // One of the threads that find a line due writes it.
-        if now >= due && self.next.compare_exchange(due, now + LINE_EVERY, relaxed, relaxed).is_ok() {
+        // Several threads can find that a line is due; the exchange lets one of them print it.
+        if now >= due && self.next.compare_exchange(due, now + LOG_INTERVAL_SECONDS, relaxed, relaxed).is_ok() {
             tell(&self.line(self.start.elapsed(), false));
         }
     }
 
     fn restarted(&mut self, total: u64) {
-        self.sum_up();
+        self.print_summary();
         (self.total, self.start, self.done) = (Some(total), Instant::now(), AtomicU64::new(0));
-        self.next = AtomicU64::new(LINE_EVERY);
+        self.next = AtomicU64::new(LOG_INTERVAL_SECONDS);
     }
 }
 
 impl Drop for Log {
     fn drop(&mut self) {
         self.shared.logs.fetch_sub(1, Ordering::Relaxed);
-        self.sum_up();
+        self.print_summary();
     }
 }
 
-/// A rate as a person reads it: two digits or three, or how long each takes.
+/// Returns a rate as text with two or three digits, or the time per unit if it is below 0.5 units per second.
 fn rate(per_second: f64, unit: &str) -> String {
     if per_second > 0.0 && per_second < 0.5 {
         return format!("{} each", duration(1.0 / per_second));
@@ -343,7 +352,7 @@ mod tests {
     }
 
     #[test]
-    fn a_line_says_what_is_done_how_fast_and_how_long_it_took_or_will_take() {
+    fn log_line_has_progress_rate_and_time() {
         let scan = log("scan", "states", Some(1_252_980));
         scan.advanced(626_490);
         let minute = Duration::from_secs(60);
@@ -357,25 +366,25 @@ mod tests {
     }
 
     #[test]
-    fn rates_are_rounded_to_what_a_person_reads() {
+    fn rates_have_two_or_three_digits() {
         for (rate_of, text) in [
             (0.01, "1 min 40 s each"),
-            (0.5, "0.5 pictures/s"),
-            (12.4, "12 pictures/s"),
-            (999.6, "1.0 k pictures/s"),
-            (45_600.0, "46 k pictures/s"),
-            (3.14e6, "3.1 M pictures/s"),
-            (2e9, "2.0 G pictures/s"),
+            (0.5, "0.5 views/s"),
+            (12.4, "12 views/s"),
+            (999.6, "1.0 k views/s"),
+            (45_600.0, "46 k views/s"),
+            (3.14e6, "3.1 M views/s"),
+            (2e9, "2.0 G views/s"),
         ] {
-            assert_eq!(rate(rate_of, "pictures"), text);
+            assert_eq!(rate(rate_of, "views"), text);
         }
     }
 
     #[test]
-    fn a_bar_is_never_longer_than_its_room_says_most_in_most_and_no_time_of_no_seconds() {
-        let moment = BarSnapshot {
+    fn bar_lines_fit_the_columns_and_hide_times_below_a_second() {
+        let snapshot = BarSnapshot {
             name: "[3/9] rounds",
-            unit: "pictures",
+            unit: "views",
             done: 1234,
             total: Some(5000),
             per_second: 12.0,
@@ -383,36 +392,36 @@ mod tests {
             run: Some(4000.0),
         };
         for columns in 0..200 {
-            let line = moment.line(columns);
+            let line = snapshot.line(columns);
             assert!(line.chars().count() <= columns, "{columns}: {line}");
         }
         assert_eq!(
-            moment.line(119),
-            "[3/9] rounds [=====                   ]  24% 1,234/5,000 pictures, 12 pictures/s, 5 min 13 s left, \
+            snapshot.line(113),
+            "[3/9] rounds [=====                   ]  24% 1,234/5,000 views, 12 views/s, 5 min 13 s left, \
              the run 1 h 06 min"
         );
-        assert_eq!(moment.line(79), "[3/9] rounds  24% 1,234/5,000 pictures, 12 pictures/s, 5 min 13 s left");
-        assert_eq!(moment.line(30), "[3/9] rounds [==       ]  24%");
-        let nearly = BarSnapshot { left: Some(0.4), run: Some(0.2), ..moment };
+        assert_eq!(snapshot.line(75), "[3/9] rounds  24% 1,234/5,000 views, 12 views/s, 5 min 13 s left");
+        assert_eq!(snapshot.line(29), "[3/9] rounds [=       ]  24%");
+        let nearly = BarSnapshot { left: Some(0.4), run: Some(0.2), ..snapshot };
         assert!(!nearly.line(119).contains("left") && !nearly.line(119).contains("run"), "{}", nearly.line(119));
         let counting = BarSnapshot { total: None, left: None, run: None, ..nearly };
-        assert_eq!(counting.line(119), "[3/9] rounds 1,234 pictures, 12 pictures/s");
+        assert_eq!(counting.line(119), "[3/9] rounds 1,234 views, 12 views/s");
     }
 
     #[test]
-    fn stages_of_a_run_are_numbered_and_what_is_left_of_it_follows_how_long_the_first_ones_took() {
+    fn stages_are_numbered_and_time_left_follows_past_stages() {
         let start = Instant::now();
         let after = |seconds| start + Duration::from_secs(seconds);
         let stages = vec![("scan", 10.0), ("score", 0.0), ("rounds", 30.0), ("emit", 5.0)];
-        let mut run = RunPosition { stages, start, at: None };
+        let mut run = RunPosition { stages, start, current: None };
         assert_eq!(run.enter("motion", start), "motion");
         assert_eq!(run.left(2.0, start), 2.0);
         assert_eq!(run.enter("scan", start), "[1/4] scan");
         assert_eq!(run.left(8.0, after(4)), 8.0 + 35.0);
-        // Twice as slow as was thought: so will be what follows.
+        // The first stage took twice the expected time, so later stages are expected to.
         assert_eq!(run.enter("rounds", after(20)), "[3/4] rounds");
         assert_eq!(run.left(1.0, after(30)), 50.0 + 10.0);
-        // A second round does not begin the stage anew.
+        // Entering the same stage again does not restart it.
         assert_eq!(run.enter("rounds", after(60)), "[3/4] rounds");
         assert_eq!(run.left(7.0, after(90)), 7.0 + 10.0);
     }

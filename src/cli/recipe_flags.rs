@@ -10,66 +10,73 @@ use splatsieve::files::text::read_text;
 use splatsieve::pipeline::RecipeRecord;
 use splatsieve::recipe::{Effort, MergePass, PRESETS, Recipe, parameters};
 
-const RECIPE: &str = "Recipe";
+/// Heading of these options in the help.
+const HEADING: &str = "Recipe";
 
-/// Maximum number of bytes of a recipe file. A file that splatsieve writes has about 4,000.
-const MAX_RECIPE: u64 = 1 << 20;
+/// Maximum size of a recipe file, bytes. A recipe that splatsieve writes has about 4,000.
+const MAX_RECIPE_BYTES: u64 = 1 << 20;
 
-/// Key of the list of merge passes, the one parameter whose value is no single number or word.
+/// Key of the list of merge passes, the only parameter whose value is not a single number or word.
 const PASSES: &str = "passes";
 
-/// One `--set KEY=VALUE`.
+/// Value of one `--set KEY=VALUE`.
 #[derive(Debug, Clone, PartialEq)]
-enum Setting {
-    /// Section, key and value of a parameter.
+enum RecipeSetting {
+    /// Parameter with its section, key and value.
     Parameter { section: String, key: String, value: String },
-    /// A merge pass. The passes on the command line replace those of the recipe.
+    /// Merge pass. Passes on the command line replace all passes of the recipe.
     Pass(MergePass),
 }
 
-/// Recipe as the command line gives it: a preset or a file, then single parameters.
+/// Recipe options of a command line: a preset or a file, then an effort, then single parameters.
 #[derive(Debug, Clone, Default)]
 pub(super) struct RecipeFlags {
     preset: Option<String>,
     file: Option<PathBuf>,
     effort: Option<String>,
-    settings: Vec<Setting>,
+    settings: Vec<RecipeSetting>,
     has_no_refine: bool,
 }
 
 impl RecipeFlags {
-    /// What the recipe file, if there is one, says of the run it was written beside.
+    /// Returns the record of the run that the recipe file was written beside; empty without a file.
+    ///
+    /// # Errors
+    /// Fails if the file cannot be read or its record is invalid.
     pub(super) fn record(&self) -> Result<RecipeRecord> {
         let Some(path) = &self.file else { return Ok(RecipeRecord::default()) };
-        let text = read_text(path, MAX_RECIPE)?;
+        let text = read_text(path, MAX_RECIPE_BYTES)?;
         let folder = path.parent().unwrap_or(Path::new(""));
         RecipeRecord::read(&text, folder).map_err(|message| Error::usage(format!("{}: {message}", path.shown())))
     }
 
-    /// Confirms that what the recipe file names for `option` is there.
+    /// Checks that the path that the recipe file records for `option` exists.
     ///
     /// # Errors
-    /// A path where nothing is.
-    pub(super) fn check_named(&self, option: &str, path: &Path) -> Result<()> {
+    /// Fails if the path does not exist.
+    pub(super) fn check_recorded_path(&self, option: &str, path: &Path) -> Result<()> {
         if path.exists() {
             return Ok(());
         }
         let recipe = self.file.as_deref().unwrap_or(Path::new("")).shown();
         Err(Error::usage(format!(
             "{recipe}: [run] {}: expected a file or folder, found nothing at {}\n  \
-             paths in a recipe are seen from its own folder; name another with --{option}",
+             paths in a recipe are relative to its folder; give another path with --{option}",
             option.replace('-', "_"),
             path.shown()
         )))
     }
 
-    /// The effective recipe.
+    /// Returns the recipe after all options are applied.
+    ///
+    /// # Errors
+    /// Fails if the file cannot be read, or if a parameter is unknown or out of range.
     pub(super) fn recipe(&self) -> Result<Recipe> {
         let fallback = self.preset.as_deref().unwrap_or("default");
         let mut recipe = match &self.file {
             None => Recipe::preset(fallback)?,
             Some(path) => {
-                let text = read_text(path, MAX_RECIPE)?;
+                let text = read_text(path, MAX_RECIPE_BYTES)?;
                 Recipe::from_toml(&text, fallback)
                     .map_err(|message| Error::usage(format!("{}: {message}", path.shown())))?
             }
@@ -78,7 +85,7 @@ impl RecipeFlags {
             recipe = recipe.with_effort(effort);
         }
         for setting in &self.settings {
-            let Setting::Parameter { section, key, value } = setting else { continue };
+            let RecipeSetting::Parameter { section, key, value } = setting else { continue };
             recipe = recipe.with(section, key, value).map_err(|message| {
                 Error::usage(format!(
                     "--set {key}={value}: {}\n  see `splatsieve recipe --preset paper`",
@@ -90,8 +97,8 @@ impl RecipeFlags {
             recipe = recipe.unrefined();
         }
         let passes = self.settings.iter().filter_map(|setting| match setting {
-            Setting::Pass(pass) => Some(*pass),
-            Setting::Parameter { .. } => None,
+            RecipeSetting::Pass(pass) => Some(*pass),
+            RecipeSetting::Parameter { .. } => None,
         });
         let passes: Vec<MergePass> = passes.collect();
         if !passes.is_empty() {
@@ -104,7 +111,7 @@ impl RecipeFlags {
 
 impl Args for RecipeFlags {
     fn augment_args(command: Command) -> Command {
-        let arg = |name: &'static str| Arg::new(name).long(name).help_heading(RECIPE);
+        let arg = |name: &'static str| Arg::new(name).long(name).help_heading(HEADING);
         let preset = arg("preset")
             .value_parser(PRESETS.map(|(name, _)| name))
             .help("Recipe to start from: `default`, the best known; `paper`, as published; `gentle`; `strong`");
@@ -143,25 +150,25 @@ impl FromArgMatches for RecipeFlags {
         self.preset = matches.get_one::<String>("preset").cloned();
         self.file = matches.get_one::<PathBuf>("recipe").cloned();
         self.effort = matches.get_one::<String>("effort").cloned();
-        self.settings = matches.get_many::<Setting>("set").into_iter().flatten().cloned().collect();
+        self.settings = matches.get_many::<RecipeSetting>("set").into_iter().flatten().cloned().collect();
         self.has_no_refine = matches.get_flag("no-refine");
         Ok(())
     }
 }
 
-/// Parser of `KEY=VALUE`. Shells complete the keys.
+/// Parser of `KEY=VALUE`. Lists the keys for completion in shells.
 #[derive(Clone)]
 struct SettingParser;
 
 impl TypedValueParser for SettingParser {
-    type Value = Setting;
+    type Value = RecipeSetting;
 
     fn parse_ref(
         &self,
         command: &Command,
         arg: Option<&Arg>,
         value: &std::ffi::OsStr,
-    ) -> std::result::Result<Setting, clap::Error> {
+    ) -> std::result::Result<RecipeSetting, clap::Error> {
         let parser = StringValueParser::new().try_map(|text| parse_setting(&text));
         parser.parse_ref(command, arg, value)
     }
@@ -173,20 +180,20 @@ impl TypedValueParser for SettingParser {
 }
 
 /// Parses `key=value` or `section.key=value`.
-fn parse_setting(text: &str) -> std::result::Result<Setting, String> {
+fn parse_setting(text: &str) -> std::result::Result<RecipeSetting, String> {
     let (name, value) =
         text.split_once('=').ok_or_else(|| format!("expected KEY=VALUE such as mu=2, found {}", quoted(text)))?;
     let (name, value) = (name.trim().replace('-', "_"), value.trim());
     let key = name.rsplit('.').next().unwrap_or_default();
     if name == PASSES || name == format!("merge.{PASSES}") {
-        return parse_pass(value).map(Setting::Pass);
+        return parse_pass(value).map(RecipeSetting::Pass);
     }
     let all = parameters();
     let found = all
         .iter()
         .find(|parameter| name == parameter.key || name == format!("{}.{}", parameter.section, parameter.key));
     match found {
-        Some(parameter) => Ok(Setting::Parameter {
+        Some(parameter) => Ok(RecipeSetting::Parameter {
             section: parameter.section.clone(),
             key: parameter.key.clone(),
             value: value.to_owned(),
@@ -200,7 +207,7 @@ fn parse_setting(text: &str) -> std::result::Result<Setting, String> {
     }
 }
 
-/// Parses a merge pass `EPSILON,D0,RHO,TAU_M`.
+/// Parses a merge pass, `EPSILON,D0,RHO,TAU_M`.
 fn parse_pass(text: &str) -> std::result::Result<MergePass, String> {
     let numbers: Vec<f64> = numbers(text)?;
     match numbers[..] {
@@ -211,7 +218,7 @@ fn parse_pass(text: &str) -> std::result::Result<MergePass, String> {
 
 /// Parses numbers that are separated by commas.
 pub(super) fn numbers<T: std::str::FromStr>(text: &str) -> std::result::Result<Vec<T>, String> {
-    text.split(',').map(|part| part.trim().parse().map_err(|_| format!("{} is no number", quoted(part)))).collect()
+    text.split(',').map(|part| part.trim().parse().map_err(|_| format!("{} is not a number", quoted(part)))).collect()
 }
 
 #[cfg(test)]
@@ -247,7 +254,7 @@ mod tests {
         for parameter in parameters() {
             assert!(keys.contains(&format!("{}=", parameter.key)), "{}", parameter.key);
             let setting = parse_setting(&format!("{}.{}=1", parameter.section, parameter.key)).unwrap();
-            assert!(matches!(setting, Setting::Parameter { key, .. } if key == parameter.key));
+            assert!(matches!(setting, RecipeSetting::Parameter { key, .. } if key == parameter.key));
         }
     }
 

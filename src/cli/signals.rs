@@ -1,11 +1,11 @@
-//! Ends of a run from outside: signals, and input files that other programs cut short.
+//! Interruption of a run: signals, and input files that other programs truncate.
 
 use splat_platform::{TruncatedMapMessage, end_on_signals, report_cut_short_maps};
 use splatsieve::error::ErrorKind;
 use splatsieve::files::atomic::withdraw_all;
 
-/// From now on a signal that asks the process to end removes the outputs that have been begun, and a mapped input file that
-/// is cut short ends the process with a message that names the file.
+/// Installs the handlers. A signal that ends the process then removes unfinished outputs first. A mapped input file
+/// that is truncated ends the process with a message that names the file.
 pub(super) fn install() {
     end_on_signals(withdraw_all, |signal| ErrorKind::Interrupted { signal }.exit_code());
     report_cut_short_maps(TruncatedMapMessage {

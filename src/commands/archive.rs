@@ -1,4 +1,4 @@
-//! Unpacking of an archive: writes the model in it as files that its renderer opens. Part of the command `convert`.
+//! Unpacking of an archive into files that the renderer of the model opens. Part of the command `convert`.
 
 use std::fs;
 use std::io::Read;
@@ -19,7 +19,7 @@ use crate::outputs::kind::{OutputKind, check_folder_name};
 /// Returns whether the file at `path` begins with the magic bytes of an archive.
 ///
 /// # Errors
-/// A file that cannot be read.
+/// Fails if the file cannot be read.
 pub fn is_archive(path: &Path) -> Result<bool> {
     if fs::metadata(path).map_err(Error::io("open", path))?.is_dir() {
         return Ok(false);
@@ -30,10 +30,11 @@ pub fn is_archive(path: &Path) -> Result<bool> {
     Ok(head == MAGIC)
 }
 
-/// Writes the model in the archive at `path` to `output`: a model folder, or a PLY if the archive was made of one.
+/// Writes the model in the archive at `path` to `output`: a model folder, or a PLY file if the archive was made from
+/// one.
 ///
 /// # Errors
-/// An archive that is damaged or needs more than `memory`; an output that exists already or cannot be written.
+/// Fails if the archive is damaged or needs more than `memory`, or if the output exists already or cannot be written.
 pub fn unpack_archive(path: &Path, output: &Path, overwrite: Replace, memory: ReadLimit) -> Result<Converted> {
     let (content, parts) = read_archive(path, memory)?;
     let values: usize = content.tensors.values().map(|tensor| tensor.data.len()).sum();

@@ -37,33 +37,34 @@ use crate::scene::{
 };
 use crate::source::{BlockReader, FrameSource, Ids, ReadPlan};
 
-/// What packing is called.
-const PACK: &str = "pack";
+/// Name of the packing stage, for progress and cache entries.
+const PACK_STAGE: &str = "pack";
 
-/// How `pack` stores values.
+/// Precision with which `pack` stores values.
 #[derive(Debug, Clone)]
 pub enum Storing {
-    /// Every bit of them.
+    /// Every bit, with this compression.
     Exact(Compression),
-    /// Those of these columns within a bound, by zstd at a level.
+    /// Errors of the named attributes within bounds, others exact; compressed by zstd at this level.
     Within(Vec<MaxError>, i32),
 }
 
 impl Storing {
-    /// In a scene whose extent is asked for where a bound is of it.
+    /// Returns the packing of a scene. Calls `extent` only if a bound is relative to the extent of the scene.
     fn packing(&self, extent: impl Fn() -> Result<f64>) -> Result<Packing> {
         match self {
             Storing::Exact(compression) => Ok((*compression).into()),
-            Storing::Within(asked, level) => Ok(Packing::within(Bounds::from_errors(asked, extent)?, *level)),
+            Storing::Within(errors, level) => Ok(Packing::within(Bounds::from_errors(errors, extent)?, *level)),
         }
     }
 }
 
-/// Packs any input into a container. That of a stream names no digest of its source, which is known only
-/// when the container's header has long been written.
+/// Packs any input into a container. The container of a stream holds no digest of its source, because the digest is
+/// known only after the header of the container is written.
 ///
 /// # Errors
-/// What is wrong with the input; a bound of the extent of a stream, which is known at its end alone.
+/// Fails if the input cannot be read, if the output exists already or cannot be written, or if a bound is relative to
+/// the extent of a stream, which is known only at its end.
 pub fn pack(
     input: &InputOptions,
     output: &Path,
@@ -73,6 +74,7 @@ pub fn pack(
     Completion::from_result(pack_whole(input, output, storing, overwrite))
 }
 
+/// Runs [`pack`]; the end of a shard is an error value.
 fn pack_whole(input: &InputOptions, output: &Path, storing: &Storing, overwrite: Replace) -> Result<Converted> {
     check_container_name(output, "convert")?;
     check_target(output, Kind::File, &[&input.path], overwrite)?;
@@ -82,20 +84,25 @@ fn pack_whole(input: &InputOptions, output: &Path, storing: &Storing, overwrite:
         None => open_input(input)?,
     };
     let source = opened.input.source();
-    Plan::fit(workload(&*opened.input), input.memory, &input.events, |work, _| packing(work, storing))?
+    Plan::fit(workload(&*opened.input), input.memory, &input.events, |work, _| pack_estimates(work, storing))?
         .tell_time(input.memory.tell, &input.events);
     let (work, digest) = kept_work(input, &*opened.input)?;
     let extent = || Ok(first_box(source)?.map_or(1.0, |bounds| bounds.extent()));
     let packing = storing.packing(|| work.known("extent", work.key(&()), extent))?;
     let attributes = BTreeMap::from([("source_digest".to_owned(), digest.map_or_else(|| opened.input.digest(), Ok)?)]);
-    let progress = |frames: usize| input.events.task(PACK, "states", (source.info().count * frames) as u64);
+    let progress = |frames: usize| input.events.task(PACK_STAGE, "states", (source.info().count * frames) as u64);
     let staged = if work.keeps() {
         let encode = |blocks: Range<usize>, to: &mut SpillWriter| {
             let progress = progress(blocks.clone().map(|block| packing.frames(source, block).len()).sum());
             spill_blocks(source, packing, blocks, to, |done| progress.advance(done))
         };
-        let spills =
-            work.sharded_spill(PACK, packing.key(), packing.frame_blocks(source), &input.scratch_folder(), encode)?;
+        let spills = work.sharded_spill(
+            PACK_STAGE,
+            packing.key(),
+            packing.frame_blocks(source),
+            &input.scratch_folder(),
+            encode,
+        )?;
         work.end_shard_before("writing")?;
         let staged = StagedFile::new(output, overwrite)?;
         join_container(source, staged.path(), packing, attributes, &spills)?;
@@ -109,12 +116,12 @@ fn pack_whole(input: &InputOptions, output: &Path, storing: &Storing, overwrite:
     let bytes = fs::metadata(staged.path()).map_err(Error::io("read", staged.path()))?.len();
     staged.commit()?;
     let info = opened.input.source().info();
-    let larger = Size::of_frames(bytes).why_larger_than(&opened.input.size()?);
+    let larger = Size::from_frames(bytes).why_larger_than(&opened.input.size()?);
     let notes = opened.notes.into_iter().chain(work.take_notes()).collect();
     Ok(packed(output, info.count, info.times.len(), bytes, larger, notes))
 }
 
-/// Packs a stream of numbered Gaussians as it arrives.
+/// Packs a frame stream while it arrives. Its Gaussians keep their ids from frame to frame.
 fn pack_arriving(
     stream: FrameStream<Stdin>,
     input: &InputOptions,
@@ -127,13 +134,13 @@ fn pack_arriving(
         Err(Error::usage(message))
     })?;
     let staged = StagedFile::new(output, overwrite)?;
-    let mut room = room_to_pack(input, stream.header())?;
-    let received = pack_stream(stream, staged.path(), packing, &input.events, |held| room.admit(held.len()))?;
+    let mut quota = room_to_pack(input, stream.header())?;
+    let received = pack_stream(stream, staged.path(), packing, &input.events, |held| quota.admit(held.len()))?;
     let container = Container::open(staged.path())?;
     let (gaussians, frames) = (container.info().count, container.info().times.len());
     let bytes = fs::metadata(staged.path()).map_err(Error::io("read", staged.path()))?.len();
     staged.commit()?;
-    let larger = Size::of_frames(bytes).why_larger_than(&Size::of_frames(received));
+    let larger = Size::from_frames(bytes).why_larger_than(&Size::from_frames(received));
     Ok(packed(output, gaussians, frames, bytes, larger, Vec::new()))
 }
 
@@ -149,20 +156,20 @@ fn packed(
     Converted { path: output.to_owned(), kind: OutputKind::Gseq, gaussians, frames: Some(frames), bytes, larger, notes }
 }
 
-/// Writes any input as a frame stream; gives the input.
+/// Writes any input to `to` as a frame stream and returns the opened input.
 ///
-/// Memory: see [`unpacking`].
+/// Memory: see [`unpack_estimates`].
 pub fn unpack_stream(input: &InputOptions, to: impl Write) -> Result<OpenedInput> {
     let opened = open_input(input)?;
     let source = opened.input.source();
     let info = source.info();
     let header =
         StreamHeader { count: info.count, sh_degree: info.sh_degree, varying: info.varying, is_unlinked: false };
-    let plan = Plan::fit(workload(&*opened.input), input.memory, &input.events, unpacking)?;
+    let plan = Plan::fit(workload(&*opened.input), input.memory, &input.events, unpack_estimates)?;
     plan.tell_time(input.memory.tell, &input.events);
-    let held = plan.limits.frames_held;
-    let wanted = ReadPlan::every().holding(held);
-    let mut frames = FrameReaders::open(source, Ids::Range(0..source.info().count), Attributes::all(), &wanted)?;
+    let max_held = plan.limits.frames_held;
+    let read_plan = ReadPlan::every().holding(max_held);
+    let mut frames = FrameReaders::open(source, Ids::Range(0..source.info().count), Attributes::all(), &read_plan)?;
     let mut state = frames.state();
     if !info.times.is_empty() {
         frames.read(0, Attributes::all(), &mut state)?;
@@ -179,7 +186,7 @@ pub fn unpack_stream(input: &InputOptions, to: impl Write) -> Result<OpenedInput
     Ok(opened)
 }
 
-/// Refuses a file that is no container and no damaged one.
+/// Checks that a file is a container, possibly damaged: by its extension or its first bytes.
 fn check_is_container(path: &Path) -> Result<()> {
     let mut head = Vec::new();
     open_file(path)?.take(16).read_to_end(&mut head).map_err(Error::io("read", path))?;
@@ -192,14 +199,14 @@ fn check_is_container(path: &Path) -> Result<()> {
         .hint(format!("`splatsieve info {}` reads it and says what it holds", path.shown())))
 }
 
-/// Reads every byte of a container and checks it, within the memory that a run takes by default.
+/// Reads and checks every byte of a container, within the default memory limit.
 pub fn verify(path: &Path) -> Result<VerifyReport> {
     check_is_container(path)?;
     let memory = Budget::default().read_limit().bytes();
     Ok(Reader::open_within(path, memory)?.verify_within(memory)?)
 }
 
-/// Saves the complete frames of a container that was cut short.
+/// Copies the complete frames of a truncated or damaged container to a new container.
 pub fn recover(input: &Path, output: &Path, overwrite: Replace) -> Result<RecoverReport> {
     check_container_name(output, "info --repair")?;
     check_is_container(input)?;
@@ -215,23 +222,23 @@ pub fn recover(input: &Path, output: &Path, overwrite: Replace) -> Result<Recove
     Ok(report)
 }
 
-/// What an input holds.
+/// Description of an input, as `info` prints it.
 #[derive(Debug, Serialize)]
 pub struct InputInfo {
-    /// The input.
+    /// Summary of the input.
     #[serde(flatten)]
     pub input: InputSummary,
-    /// Time stamps of first and last frame; none without frames, or where cameras choose them.
+    /// Time stamps of the first and the last frame; `None` without frames, or if the cameras choose the times.
     pub times: Option<(f64, f64)>,
-    /// Columns of a container.
+    /// Columns of a container; empty for other inputs.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub columns: Vec<ColumnInfo>,
-    /// Things a person should know.
+    /// Notes for the user.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub notes: Vec<String>,
 }
 
-/// Looks at an input. Its bytes are read once for the digest, but no frame is evaluated.
+/// Describes an input. Reads its bytes once for the digest, but evaluates no frame.
 pub fn info(options: &InputOptions) -> Result<InputInfo> {
     let input: Box<dyn InputModel> = match options.is_stream() {
         true => open_input(options)?.input,
@@ -246,31 +253,31 @@ pub fn info(options: &InputOptions) -> Result<InputInfo> {
     Ok(InputInfo { input: summary, times, columns: input.columns()?, notes: input.notes() })
 }
 
-/// Of an input that nobody looks at.
+/// Returns the workload of reading `input` without rendering it.
 fn workload(input: &dyn InputModel) -> Workload {
     Workload::new(input.source().info(), input.residence())
 }
 
-/// What it takes to write every frame as a container.
-fn packing(work: &Workload, storing: &Storing) -> Vec<ResourceEstimate> {
+/// Returns the resource estimate of packing all frames into a container.
+fn pack_estimates(work: &Workload, storing: &Storing) -> Vec<ResourceEstimate> {
     let seconds =
         work.reading(work.count(), work.frames as f64) + work.count() * work.frames as f64 * SECONDS_TO_ENCODE;
     let level = match storing {
         Storing::Exact(Compression::Zstd(level)) | Storing::Within(_, level) => *level,
         Storing::Exact(_) => 0,
     };
-    // The first frame is read for its extent.
+    // Bounds may need the extent of the scene, for which the positions of the first frame are read.
     let (together, positions) = match storing {
         Storing::Within(..) => (BOUNDED_FRAME_BLOCK, 16),
         Storing::Exact(_) => (FRAME_BLOCK, 0),
     };
     let per_gaussian = vec![("positions", positions)];
     let fixed = [work.writing_together(together), vec![work.compressing(level, together)]].concat();
-    vec![ResourceEstimate { stage: PACK, reads: 1.0, seconds, per_gaussian, fixed }]
+    vec![ResourceEstimate { stage: PACK_STAGE, reads: 1.0, seconds, per_gaussian, fixed }]
 }
 
-/// What it takes to write every frame by itself.
-fn unpacking(work: &Workload, limits: &Limits) -> Vec<ResourceEstimate> {
+/// Returns the resource estimate of writing all frames as a stream.
+fn unpack_estimates(work: &Workload, limits: &Limits) -> Vec<ResourceEstimate> {
     let states = ("states", work.state(Attributes::all()));
     let per_gaussian = vec![states, ("readers", work.input.reader), ("held", work.held(limits, Attributes::all()))];
     let seconds = 2.0 * work.reading(work.count(), work.frames as f64);
@@ -278,7 +285,7 @@ fn unpacking(work: &Workload, limits: &Limits) -> Vec<ResourceEstimate> {
 }
 
 impl InputInfo {
-    /// A few lines for a person.
+    /// Returns a text for the terminal.
     pub fn text(&self) -> String {
         let input = &self.input;
         let mut out = format!(

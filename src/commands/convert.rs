@@ -22,40 +22,40 @@ use crate::pipeline::summary::InputSummary;
 use crate::recipe::Recipe;
 use crate::scene::{InputOptions, open_input};
 
-/// Bytes that a Gaussian takes while formats are fitted to it and encoded, about: a few pieces of it.
-const FITTED: u64 = 4 * 600;
+/// Approximate bytes per Gaussian while curves are fitted to its track and encoded: a few curve segments.
+const FITTED_BYTES: u64 = 4 * 600;
 
 /// Returns whether `convert` writes a container to `output`.
-pub fn is_container(output: &Path, asked: Option<OutputKind>) -> bool {
-    OutputKind::from_path(output, asked, OutputKind::Model) == OutputKind::Gseq
+pub fn is_container(output: &Path, requested: Option<OutputKind>) -> bool {
+    OutputKind::from_path(output, requested, OutputKind::Model) == OutputKind::Gseq
 }
 
-/// Writes `input` to `output` in the format `asked`; `None`: by the name of the output. The format of a folder is the input's own
-/// model format, or one PLY per frame for a sequence.
+/// Writes `input` to `output` in the format `requested`; `None`: by the name of the output. The format of a folder is
+/// the input's own model format, or one PLY per frame for a sequence.
 ///
 /// # Errors
-/// Inputs that cannot be read, a format that the input cannot be written as, an output that exists already.
+/// Fails if the input cannot be read or cannot be written in this format, or if the output exists already.
 pub fn convert(
     input: &InputOptions,
     output: &Path,
-    asked: Option<OutputKind>,
+    requested: Option<OutputKind>,
     overwrite: Replace,
 ) -> Result<Converted> {
-    if asked.is_none() {
+    if requested.is_none() {
         OutputKind::check_name(output)?;
     }
     let is_own = |kind| matches!(kind, OutputKind::Model | OutputKind::Ply);
-    let is_model = is_own(OutputKind::from_path(output, asked, OutputKind::Model));
+    let is_model = is_own(OutputKind::from_path(output, requested, OutputKind::Model));
     if is_model && !input.is_stream() && is_archive(&input.path)? {
         return unpack_archive(&input.path, output, overwrite, input.memory.read_limit());
     }
     let opened = open_input(input)?;
-    let (family, source) = (&*opened.input, opened.input.source());
-    let own = match family.own_output() {
+    let (model, source) = (&*opened.input, opened.input.source());
+    let own = match model.own_output() {
         OutputKind::Gseq => OutputKind::PlySequence,
         own => own,
     };
-    let kind = OutputKind::from_path(output, asked, own);
+    let kind = OutputKind::from_path(output, requested, own);
     if kind == OutputKind::Archive {
         return Err(Error::usage("archives are written by compress: splatsieve compress INPUT -o NAME.gsz"));
     }
@@ -66,22 +66,22 @@ pub fn convert(
     check_target(output, target, &[&input.path], overwrite)?;
     let (gaussians, frames) = (source.info().count, source.info().times.len());
     kind.check_frames(frames, output)?;
-    family.check_output(kind, output)?;
-    let work = Workload::new(source.info(), family.residence());
-    let plan = Plan::fit(work, input.memory, &input.events, |work, limits| vec![need(kind, work, limits)])?;
+    model.check_output(kind, output)?;
+    let work = Workload::new(source.info(), model.residence());
+    let plan = Plan::fit(work, input.memory, &input.events, |work, limits| vec![estimate(kind, work, limits)])?;
     plan.tell_time(input.memory.tell, &input.events);
     let all = CompressedModel::pruned((0..gaussians as u32).collect(), &Recipe::preset("default")?.merge);
     let mut notes = opened.notes;
     let mut write = |path: &Path| -> Result<u64> {
-        notes.extend(family.write(&all, kind, path, &plan.limits, &input.events)?);
-        Ok(family.size_written(kind, path)?.whole())
+        notes.extend(model.write(&all, kind, path, &plan.limits, &input.events)?);
+        Ok(model.size_written(kind, path)?.whole())
     };
     let bytes = if kind.is_folder() {
         let staged = StagedFolder::new(output, overwrite)?;
         let bytes = write(staged.path())?;
         let marker = serde_json::json!({
             "tool": TOOL,
-            "input": InputSummary::new(family, &input.path, family.digest()?)?.without_folders(),
+            "input": InputSummary::new(model, &input.path, model.digest()?)?.without_folders(),
         });
         let path = staged.path().join(MARKER);
         fs::write(&path, format!("{marker:#}\n")).map_err(Error::io("write", &path))?;
@@ -96,19 +96,19 @@ pub fn convert(
     Ok(Converted { path: output.to_owned(), kind, gaussians, frames: Some(frames), bytes, larger: None, notes })
 }
 
-/// All states once, and what is fitted to them.
-fn need(kind: OutputKind, work: &Workload, limits: &Limits) -> ResourceEstimate {
-    let whole = work.state(Attributes::all());
+/// Returns the resource estimate of writing all frames once as `kind`, with curve fitting where the format needs it.
+fn estimate(kind: OutputKind, work: &Workload, limits: &Limits) -> ResourceEstimate {
+    let state_bytes = work.state(Attributes::all());
     let fits = matches!(kind, OutputKind::Splatv | OutputKind::FourDgs);
-    let tracked = work.threads * TRACK_BLOCK as u64 * work.frames * whole;
+    let tracked = work.threads * TRACK_BLOCK as u64 * work.frames * state_bytes;
     let mut fixed = work.writing();
     fixed.push(("tracks", if fits { 2 * tracked } else { 0 }));
     let per_gaussian = vec![
         ("kept", 16),
-        ("result", work.input.reduced + work.input.file + whole),
+        ("result", work.input.reduced + work.input.file + state_bytes),
         ("readers", work.input.reader),
         ("held", if fits { 0 } else { work.held(limits, Attributes::all()) }),
-        ("fitted", if fits { FITTED } else { 0 }),
+        ("fitted", if fits { FITTED_BYTES } else { 0 }),
     ];
     let seconds =
         work.reading(work.count(), work.frames as f64) + work.count() * work.frames as f64 * SECONDS_TO_ENCODE;

@@ -1,4 +1,4 @@
-//! Commands beside `compress`, from input to output.
+//! Commands other than `compress`: `convert`, `info`, `render` and `score`.
 
 pub mod archive;
 pub mod container;

@@ -1,4 +1,4 @@
-//! Pictures of an input, as files.
+//! Command `render`: renders views of an input to image files.
 
 use std::fs;
 use std::ops::Range;
@@ -23,62 +23,64 @@ use crate::scene::pictures::{self, ViewSet, background, picture, pictures};
 use crate::scene::{InputOptions, open_scene};
 use crate::source::FrameSource;
 
-/// What rendering is called.
+/// Name of the stage, for progress and cache entries.
 const NAME: &str = "render";
 
-/// Which pictures to render.
+/// Views to render.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum RenderSelection {
-    /// One, into a file whose name says its format.
+    /// One view at one frame, to a file whose extension gives the format.
     One {
         /// Frame of the sequence.
         frame: usize,
         /// View number.
         view: u32,
     },
-    /// All of the part, into a folder, named `tNNN_vNN`.
+    /// All views of the set, to a folder, as files named `tNNN_vNN` (frame, view).
     All(ImageFormat),
 }
 
-/// What to render.
+/// Options of `render`.
 #[derive(Debug, Clone)]
 pub struct RenderOptions {
-    /// What to read; of its split nothing is used.
+    /// Input and cameras. Its split is ignored.
     pub input: InputOptions,
-    /// Which pictures.
-    pub wanted: RenderSelection,
-    /// Part of the cameras' pictures they are among.
-    pub part: ViewSet,
-    /// Red, green, blue in [0, 1]; none: see [`background`].
+    /// Views to render.
+    pub selection: RenderSelection,
+    /// Set of views from which they are selected.
+    pub views: ViewSet,
+    /// Background color: red, green, blue in [0, 1]; `None`: chosen by [`background`].
     pub background: Option<[f32; 3]>,
-    /// File or folder to write.
+    /// Output file or folder.
     pub output: PathBuf,
-    /// Replace an earlier output.
+    /// Policy for an existing output.
     pub overwrite: Replace,
 }
 
-/// What was rendered.
+/// Result of `render`.
 #[derive(Debug)]
 pub struct Rendered {
-    /// Number of pictures.
-    pub pictures: usize,
-    /// Things a person should know.
+    /// Number of rendered views.
+    pub views: usize,
+    /// Notes for the user.
     pub notes: Vec<String>,
 }
 
-/// Renders pictures of an input.
+/// Renders views of an input to image files.
 ///
-/// Memory: one frame's state, and per thread one picture with its footprints ([`crate::scene::pictures::need`]).
+/// Memory: one frame state, and per thread one render with its footprints ([`crate::scene::pictures::need`]).
 ///
 /// # Errors
-/// Whatever is wrong with input, cameras, choice or output. Nothing is left behind then.
+/// Fails if input or cameras cannot be read, if a selected view does not exist, or if the output exists already or
+/// cannot be written. Leaves no partial output.
 pub fn render(options: &RenderOptions) -> Result<Completion<Rendered>> {
     Completion::from_result(render_whole(options))
 }
 
+/// Runs [`render`]; the end of a shard is an error value.
 fn render_whole(options: &RenderOptions) -> Result<Rendered> {
     let output = options.output.as_path();
-    let (kind, format) = match options.wanted {
+    let (kind, format) = match options.selection {
         RenderSelection::All(format) => {
             check_folder_name(output, "--all")?;
             (Kind::Folder, format)
@@ -89,16 +91,16 @@ fn render_whole(options: &RenderOptions) -> Result<Rendered> {
     inputs.extend(options.input.cameras.as_deref());
     check_target(output, kind, &inputs, options.overwrite)?;
     if options.input.work.is_some() && kind == Kind::File {
-        return Err(Error::usage("--cache: one picture is not divided; expected --all"));
+        return Err(Error::usage("--cache: expected --all, found a single view, which cannot be divided into shards"));
     }
     let mut scene = open_scene(&InputOptions { split: None, ..options.input.clone() })?;
-    scene.keep_to(options.input.memory, |work, limits| needs(work, limits, options.input.work.is_some()))?;
+    scene.keep_to(options.input.memory, |work, limits| estimates(work, limits, options.input.work.is_some()))?;
     let source = scene.source();
     let times = &source.info().times;
     let background = background(options.background, &scene)?;
-    let chosen = match options.wanted {
-        RenderSelection::One { frame, view } => vec![picture(&scene.rig, times, options.part, frame, view)?],
-        RenderSelection::All(_) => pictures(&scene.rig, times, options.part)?,
+    let chosen = match options.selection {
+        RenderSelection::One { frame, view } => vec![picture(&scene.rig, times, options.views, frame, view)?],
+        RenderSelection::All(_) => pictures(&scene.rig, times, options.views)?,
     };
     let job = RenderJob {
         source,
@@ -144,24 +146,26 @@ fn render_whole(options: &RenderOptions) -> Result<Rendered> {
         staged.commit()?;
     }
     let notes = scene.notes.into_iter().chain(scene.work.take_notes()).collect();
-    Ok(Rendered { pictures: chosen.len(), notes })
+    Ok(Rendered { views: chosen.len(), notes })
 }
 
-/// What it takes to make pictures of a model; `waiting`: the files of those that are made together wait to be written.
-fn needs(work: &Workload, limits: &Limits, waiting: bool) -> Vec<ResourceEstimate> {
-    vec![pictures::need(work, limits, NAME, 1, if waiting { 24 } else { 12 })]
+/// Returns the resource estimate of rendering. `keeps_files`: the encoded files of a batch stay in memory until they
+/// are written.
+fn estimates(work: &Workload, limits: &Limits, keeps_files: bool) -> Vec<ResourceEstimate> {
+    vec![pictures::need(work, limits, NAME, 1, if keeps_files { 24 } else { 12 })]
 }
 
+/// Returns the image format that the extension of `output` gives.
 fn format_of(output: &Path) -> Result<ImageFormat> {
     ImageFormat::from_path(output).ok_or_else(|| {
         Error::usage(format!(
-            "{}: expected a name that ends in .png or .npy\n  for every picture into a folder, say --all",
+            "{}: expected a name that ends in .png or .npy\n  use --all to render every view to a folder",
             output.shown()
         ))
     })
 }
 
-/// Rendering into files.
+/// Renderer of views to image files.
 struct RenderJob<'a> {
     source: &'a dyn FrameSource,
     cameras: &'a [Camera],
@@ -172,40 +176,41 @@ struct RenderJob<'a> {
 }
 
 impl RenderJob<'_> {
+    /// Renders `pictures` and writes each to the file `path` returns for it.
     fn write(&self, pictures: &[FrameView], path: impl Fn(&FrameView) -> PathBuf + Sync) -> Result<()> {
-        self.make(pictures, |picture, image| write_image(image, self.format, &path(&picture)), |()| Ok(()))
+        self.for_each_view(pictures, |picture, image| write_image(image, self.format, &path(&picture)), |()| Ok(()))
     }
 
-    /// Writes a record of the file of each of `pictures`, in order.
+    /// Renders `pictures` and writes their encoded files to `to`, one record each, in order.
     fn spill(&self, pictures: &[FrameView], to: &mut SpillWriter) -> Result<()> {
         let encode = |picture: FrameView, image: &Image| {
             let named = PathBuf::from(format!("{}.{}", picture.name(), self.format.extension()));
             image_bytes(image, self.format).map_err(Error::io("make", &named))
         };
-        self.make(pictures, encode, |bytes| to.write_record(&bytes))
+        self.for_each_view(pictures, encode, |bytes| to.write_record(&bytes))
     }
 
-    /// Has `of_each` do something with each of `pictures`, from any thread, and `then` with what comes of it, in order.
-    fn make<T: Send>(
+    /// Renders `pictures`. Calls `render_one` with each render, from any thread, and `take` with its results, in order.
+    fn for_each_view<T: Send>(
         &self,
         pictures: &[FrameView],
-        of_each: impl Fn(FrameView, &Image) -> Result<T> + Sync,
-        mut then: impl FnMut(T) -> Result<()>,
+        render_one: impl Fn(FrameView, &Image) -> Result<T> + Sync,
+        mut take: impl FnMut(T) -> Result<()>,
     ) -> Result<()> {
-        let progress = self.events.task(NAME, "pictures", pictures.len() as u64);
-        show([RenderedSource::all(self.source)], self.cameras, pictures, Batch::of_frame(&self.limits), |views| {
-            // Tasks within a picture too: a frame may have fewer pictures than there are threads.
+        let progress = self.events.task(NAME, "views", pictures.len() as u64);
+        show([RenderedSource::all(self.source)], self.cameras, pictures, Batch::one_frame(&self.limits), |views| {
+            // Renders are parallel inside too, because a frame can have fewer views than there are threads.
             let made = views.par_iter().map(|view: &ViewStates<'_, 1>| {
-                let made = of_each(view.picture, &view.render(0, self.background))?;
+                let made = render_one(view.picture, &view.render(0, self.background))?;
                 progress.advance(1);
                 Ok(made)
             });
-            made.collect::<Result<Vec<T>>>()?.into_iter().try_for_each(&mut then)
+            made.collect::<Result<Vec<T>>>()?.into_iter().try_for_each(&mut take)
         })
     }
 }
 
-/// Writes the files that [`RenderJob::spill`] has made of `pictures`, one at a time.
+/// Writes the files that [`RenderJob::spill`] encoded for `pictures`, one by one.
 fn write_spilled(pictures: &[FrameView], spill: &Spill, path: impl Fn(&FrameView) -> PathBuf) -> Result<()> {
     let (mut at, mut bytes) = (0, Vec::new());
     for picture in pictures {

@@ -1,4 +1,4 @@
-//! Statistics and scores of every Gaussian to a file, nothing removed.
+//! Command `score`: writes statistics and scores of every Gaussian to a file and removes none.
 
 use std::path::{Path, PathBuf};
 
@@ -14,7 +14,11 @@ use crate::pruning::score::UserOverrides;
 use crate::recipe::Recipe;
 use crate::scene::InputOptions;
 
-/// Writes the rows of an input as `.npz` or `.csv`, by the output's name.
+/// Writes statistics and scores of every Gaussian as `.npz` or `.csv`, according to the extension of `output`.
+///
+/// # Errors
+/// Fails if the recipe is invalid, if `output` has another extension, or if the input cannot be read or the output
+/// cannot be written.
 pub fn score(input: &InputOptions, output: &Path, recipe: &Recipe, overwrite: Replace) -> Result<ScoreReport> {
     recipe.validate().map_err(Error::usage)?;
     let extension = output.extension().and_then(|e| e.to_str()).unwrap_or("").to_ascii_lowercase();
@@ -51,15 +55,15 @@ pub fn score(input: &InputOptions, output: &Path, recipe: &Recipe, overwrite: Re
     })
 }
 
-/// What `score` wrote.
+/// Result of `score`.
 #[derive(Debug)]
 pub struct ScoreReport {
-    /// The file.
+    /// Path of the file.
     pub output: PathBuf,
-    /// Rows in it.
+    /// Number of rows, one per Gaussian.
     pub gaussians: usize,
-    /// Rows the recipe would keep before merging.
+    /// Number of Gaussians that the recipe keeps before merging.
     pub kept: usize,
-    /// Things a person should know.
+    /// Notes for the user.
     pub notes: Vec<String>,
 }

@@ -1,6 +1,7 @@
-//! A film of an input: one view along time, or a way through cameras; beside that of another model, if there is one.
+//! Command `render --video`: renders a video of an input from one view or along a camera path, beside another model if
+//! one is given.
 //!
-//! Frames stream: at a time one state of either model, and one picture of each for every thread at most.
+//! Frames are read one by one. Memory holds one frame state of each model, and at most one render of each per thread.
 
 use std::path::{Path, PathBuf};
 
@@ -20,62 +21,65 @@ use crate::scene::path::along;
 use crate::scene::pictures::{self, ViewSet, background};
 use crate::scene::{InputOptions, OpenedInput, from_input, open_input};
 
-/// What rendering a film is called.
+/// Name of the stage, for progress.
 const NAME: &str = "render";
-/// Pictures between two cameras of a way through a scene that stands still.
-const STEPS: usize = 24;
+/// Number of video frames between two cameras of a path through a still.
+const VIEWS_BETWEEN_STOPS: usize = 24;
 
-/// From where a film is taken.
+/// Camera of a video.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum FilmPath {
-    /// One view, wherever its camera is at a time; none: that of the lowest number.
+    /// Camera of one view, which may move over time; `None`: the view with the lowest number.
     View(Option<u32>),
-    /// Through the cameras of these views, in order; empty: of all, by number.
+    /// Path through the cameras of these views, in order; empty: through all views by number.
     Path(Vec<u32>),
 }
 
-/// What to film.
+/// Options of a video.
 #[derive(Debug, Clone)]
 pub struct VideoOptions {
-    /// What to read; of its split nothing is used. Frames, if any, need not be those of the cameras.
+    /// Input and cameras. Its split is ignored. Its frames can differ from the times of the cameras.
     pub input: InputOptions,
-    /// Another model of the same frames, to the right.
+    /// Other model with the same frames, shown to the right.
     pub beside: Option<PathBuf>,
-    /// From where.
-    pub way: FilmPath,
-    /// Part of the cameras' pictures whose views count.
-    pub part: ViewSet,
+    /// Camera of the video.
+    pub path: FilmPath,
+    /// Set of views that `path` selects from.
+    pub views: ViewSet,
     /// Frames per second, at least 1.
     pub fps: u32,
-    /// Red, green, blue in [0, 1]; none: see [`background`].
+    /// Background color: red, green, blue in [0, 1]; `None`: chosen by [`background`].
     pub background: Option<[f32; 3]>,
-    /// File to write, whose name says its format.
+    /// Output file; its extension gives the format.
     pub output: PathBuf,
-    /// Replace an earlier file.
+    /// Policy for an existing output.
     pub overwrite: Replace,
 }
 
-/// What was filmed.
+/// Result of rendering a video.
 #[derive(Debug)]
 pub struct Filmed {
-    /// Frames of the film.
+    /// Number of video frames.
     pub frames: usize,
-    /// Pixels across and down.
+    /// Width and height, pixels.
     pub size: (u32, u32),
-    /// Things a person should know.
+    /// Notes for the user.
     pub notes: Vec<String>,
 }
 
-/// Films an input: a picture for every frame, in order.
+/// Renders a video of an input, one image per frame in order. Along a path through a still, the camera moves instead.
 ///
 /// # Errors
-/// Whatever is wrong with inputs, cameras, choice or output; models whose frames are not the same; an encoder that is not
-/// there or fails. Nothing is left behind then.
+/// Fails if inputs or cameras cannot be read, if a selected view does not exist, if the models have different frames,
+/// if the views have different sizes, if the output cannot be written, or if the encoder is missing or fails. Leaves no
+/// partial output.
 pub fn video(options: &VideoOptions) -> Result<Filmed> {
     let output = options.output.as_path();
     let format = FilmFormat::from_path(output)?;
     if options.input.work.is_some() {
-        return Err(Error::usage("--cache: a film is not divided; --all renders pictures in parts"));
+        return Err(Error::usage(
+            "--cache: a video cannot be divided into shards\n  leave out --cache, or use --all, which renders views in shards",
+        ));
     }
     let mut inputs = vec![options.input.path.as_path()];
     inputs.extend(options.input.cameras.as_deref());
@@ -83,133 +87,141 @@ pub fn video(options: &VideoOptions) -> Result<Filmed> {
     check_target(output, Kind::File, &inputs, options.overwrite)?;
 
     let mut opened = open_input(&InputOptions { split: None, ..options.input.clone() })?;
-    let own = own_shots(&mut opened, options.input.frames.is_some());
+    let own = shots_with_times(&mut opened, options.input.frames.is_some());
     let mut scene = from_input(opened, &InputOptions { split: None, ..options.input.clone() })?;
     let beside = options.beside.as_deref().map(|path| open_compressed(path, &scene, &options.input)).transpose()?;
     let models = 1 + u64::from(beside.is_some());
     scene.keep_to(options.input.memory, |work, limits: &Limits| -> Vec<ResourceEstimate> {
-        // Two pictures, and the frame that they make up, with its bytes and, of a GIF, those that colors are chosen from.
-        let mut need = pictures::need(work, limits, NAME, models, models * 12);
-        need.fixed.push(("frame", models * work.pixels * (12 + 3 + 5)));
-        vec![need]
+        // Per pixel and model: the render, the joined frame (12), its bytes (3) and, for a GIF, the samples of its
+        // palette (5).
+        let mut estimate = pictures::need(work, limits, NAME, models, models * 12);
+        estimate.fixed.push(("frame", models * work.pixels * (12 + 3 + 5)));
+        vec![estimate]
     })?;
     let background = background(options.background, &scene)?;
-    let shots = shots(own.as_deref().unwrap_or(&scene.rig.shots), &scene.rig, options.part)?;
-    let (cameras, pictures) = plan(&options.way, &shots, &scene.rig, &scene.source().info().times)?;
-    let size = one_size(&cameras)?;
+    let shots = shots(own.as_deref().unwrap_or(&scene.rig.shots), &scene.rig, options.views)?;
+    let (cameras, views) = plan_views(&options.path, &shots, &scene.rig, &scene.source().info().times)?;
+    let size = common_size(&cameras)?;
     let size = (size.0 * models as u32, size.1);
 
     let staged = StagedFile::new(output, options.overwrite)?;
-    let mut film = FilmOutput::create((staged.path(), output), &format, size, pictures.len() as u32, options.fps)?;
-    let shown =
-        FilmSource { cameras: &cameras, pictures: &pictures, limits: &scene.limits, background, events: &scene.events };
+    let mut film = FilmOutput::create((staged.path(), output), &format, size, views.len() as u32, options.fps)?;
+    let source =
+        FilmSource { cameras: &cameras, views: &views, limits: &scene.limits, background, events: &scene.events };
     match &beside {
-        None => shown.film([RenderedSource::all(scene.source())], &mut film)?,
-        Some(other) => shown.film([scene.source(), other.source()].map(RenderedSource::all), &mut film)?,
+        None => source.film([RenderedSource::all(scene.source())], &mut film)?,
+        Some(other) => source.film([scene.source(), other.source()].map(RenderedSource::all), &mut film)?,
     }
     film.finish()?;
     staged.commit()?;
-    Ok(Filmed { frames: pictures.len(), size, notes: scene.notes })
+    Ok(Filmed { frames: views.len(), size, notes: scene.notes })
 }
 
-/// The shots with their times, where the frames are none of theirs: every camera may then look at every frame.
-fn own_shots(opened: &mut OpenedInput, are_others: bool) -> Option<Vec<Shot>> {
-    let rig = opened.rig.as_mut().filter(|_| are_others)?;
+/// If the frames differ from the times of the cameras (`has_other_frames`), removes the times of the shots in `opened`,
+/// so that every camera can show every frame, and returns the shots with their times.
+fn shots_with_times(opened: &mut OpenedInput, has_other_frames: bool) -> Option<Vec<Shot>> {
+    let rig = opened.rig.as_mut().filter(|_| has_other_frames)?;
     let own = rig.shots.clone();
     rig.shots.iter_mut().for_each(|shot| shot.time = None);
     Some(own)
 }
 
-/// The shots of `part`, by view, then time, those without one first.
-fn shots(all: &[Shot], rig: &Rig, part: ViewSet) -> Result<Vec<Shot>> {
-    let split = part.split(rig);
+/// Returns the shots of the set `views`, sorted by view, then time; shots without a time come first.
+fn shots(all: &[Shot], rig: &Rig, views: ViewSet) -> Result<Vec<Shot>> {
+    let split = views.split(rig);
     let mut found: Vec<Shot> =
         all.iter().filter(|shot| split.is_none_or(|split| split == shot.split)).cloned().collect();
     let time = |shot: &Shot| shot.time.unwrap_or(f64::NEG_INFINITY);
     found.sort_by(|a, b| a.view.cmp(&b.view).then(time(a).total_cmp(&time(b))));
     match found.is_empty() {
-        true => Err(Error::usage(format!("{}: no picture in this split (--split)", rig.origin))),
+        true => {
+            Err(Error::usage(format!("{}: expected at least one view in this split (--split), found none", rig.origin)))
+        }
         false => Ok(found),
     }
 }
 
-/// The cameras of the film and its pictures, one after the other.
-fn plan(way: &FilmPath, shots: &[Shot], rig: &Rig, times: &[f64]) -> Result<(Vec<Camera>, Vec<FrameView>)> {
-    match way {
+/// Returns the cameras of the video and the view of each video frame, in order.
+fn plan_views(path: &FilmPath, shots: &[Shot], rig: &Rig, times: &[f64]) -> Result<(Vec<Camera>, Vec<FrameView>)> {
+    match path {
         FilmPath::View(view) => {
             let view = view.unwrap_or_else(|| shots.first().map_or(0, |shot| shot.view));
-            let own = of_view(shots, view, "--view", rig)?;
-            let away = |shot: &Shot, time: f64| shot.time.map_or(0.0, |at| (at - time).abs());
-            let nearest = |time: f64| own.iter().min_by(|a, b| away(a, time).total_cmp(&away(b, time)));
+            let own = shots_of_view(shots, view, "--view", rig)?;
+            let time_distance = |shot: &Shot, time: f64| shot.time.map_or(0.0, |at| (at - time).abs());
+            let nearest =
+                |time: f64| own.iter().min_by(|a, b| time_distance(a, time).total_cmp(&time_distance(b, time)));
             let camera = |&time: &f64| nearest(time).map_or(0, |shot| shot.camera);
-            let picture = |(frame, time)| FrameView { frame, view, camera: camera(time) };
-            Ok((rig.cameras.clone(), times.iter().enumerate().map(picture).collect()))
+            let film_view = |(frame, time)| FrameView { frame, view, camera: camera(time) };
+            Ok((rig.cameras.clone(), times.iter().enumerate().map(film_view).collect()))
         }
         FilmPath::Path(views) => {
-            let all = || shots.chunk_by(|a, b| a.view == b.view).map(|of| of[0].view).collect();
+            let all = || shots.chunk_by(|a, b| a.view == b.view).map(|shots| shots[0].view).collect();
             let views: Vec<u32> = if views.is_empty() { all() } else { views.clone() };
             if views.len() < 2 {
                 return Err(Error::usage(format!(
-                    "--path: expected two views or more, found {} in {}\n  --split all takes those of all pictures; \
+                    "--path: expected two views or more, found {} in {}\n  --split all takes the views of all splits; \
                      --path 0,2,5 goes through these",
                     views.len(),
                     rig.origin
                 )));
             }
-            let stop = |&view: &u32| Ok(rig.cameras[of_view(shots, view, "--path", rig)?[0].camera as usize].clone());
+            let stop =
+                |&view: &u32| Ok(rig.cameras[shots_of_view(shots, view, "--path", rig)?[0].camera as usize].clone());
             let stops = views.iter().map(stop).collect::<Result<Vec<Camera>>>()?;
-            one_size(&stops)?;
-            let count = if times.len() > 1 { times.len() } else { STEPS * (stops.len() - 1) + 1 };
-            let picture = |k: usize| FrameView { frame: k.min(times.len() - 1), view: 0, camera: k as u32 };
-            Ok((along(&stops, count), (0..count).map(picture).collect()))
+            common_size(&stops)?;
+            let count = if times.len() > 1 { times.len() } else { VIEWS_BETWEEN_STOPS * (stops.len() - 1) + 1 };
+            let film_view = |k: usize| FrameView { frame: k.min(times.len() - 1), view: 0, camera: k as u32 };
+            Ok((along(&stops, count), (0..count).map(film_view).collect()))
         }
     }
 }
 
-/// The shots of a view.
-fn of_view<'a>(shots: &'a [Shot], view: u32, flag: &str, rig: &Rig) -> Result<&'a [Shot]> {
+/// Returns the shots of view `view`. `flag` names the option in the error if there are none.
+fn shots_of_view<'a>(shots: &'a [Shot], view: u32, flag: &str, rig: &Rig) -> Result<&'a [Shot]> {
     let mut views = shots.chunk_by(|a, b| a.view == b.view);
-    views.find(|of| of[0].view == view).ok_or_else(|| {
-        let views: Vec<String> = shots.chunk_by(|a, b| a.view == b.view).map(|of| of[0].view.to_string()).collect();
+    views.find(|shots| shots[0].view == view).ok_or_else(|| {
+        let views: Vec<String> =
+            shots.chunk_by(|a, b| a.view == b.view).map(|shots| shots[0].view.to_string()).collect();
         Error::usage(format!("{flag} {view}: expected one of the views {} ({})", views.join(", "), rig.origin))
     })
 }
 
-/// The size of all pictures.
-fn one_size(cameras: &[Camera]) -> Result<(u32, u32)> {
+/// Returns the common image size of `cameras`.
+fn common_size(cameras: &[Camera]) -> Result<(u32, u32)> {
     let size = |camera: &Camera| (camera.width, camera.height);
     let first = cameras.first().map_or((0, 0), size);
     match cameras.iter().map(size).find(|&other| other != first) {
         None => Ok(first),
         Some(other) => Err(Error::usage(format!(
-            "a film has pictures of one size, but its cameras take some of {}x{} and some of {}x{}\n  choose a view \
+            "a video needs views of one size, found {}x{} and {}x{}\n  choose a view \
              (--view), or views of one size (--path 0,2,5)",
             first.0, first.1, other.0, other.1
         ))),
     }
 }
 
-/// What a film shows.
+/// Cameras, views and settings from which the frames of a video are rendered.
 struct FilmSource<'a> {
     cameras: &'a [Camera],
-    pictures: &'a [FrameView],
+    views: &'a [FrameView],
     limits: &'a Limits,
     background: [f32; 3],
     events: &'a Events,
 }
 
 impl FilmSource<'_> {
+    /// Renders all views of the `subjects` side by side and adds them to `film`.
     fn film<const S: usize>(&self, subjects: [RenderedSource<'_>; S], film: &mut FilmOutput) -> Result<()> {
-        let progress = self.events.task(NAME, "frames", self.pictures.len() as u64);
-        show(subjects, self.cameras, self.pictures, Batch::of_frame(self.limits), |views| {
-            let made: Vec<Image> = views
+        let progress = self.events.task(NAME, "frames", self.views.len() as u64);
+        show(subjects, self.cameras, self.views, Batch::one_frame(self.limits), |views| {
+            let images: Vec<Image> = views
                 .par_iter()
                 .map(|view: &ViewStates<'_, S>| {
-                    let of_models = (0..S).into_par_iter().map(|subject| view.render(subject, self.background));
-                    side_by_side(of_models.collect())
+                    let renders = (0..S).into_par_iter().map(|subject| view.render(subject, self.background));
+                    side_by_side(renders.collect())
                 })
                 .collect();
-            made.iter().try_for_each(|image| {
+            images.iter().try_for_each(|image| {
                 progress.advance(1);
                 film.add(image)
             })
@@ -217,7 +229,7 @@ impl FilmSource<'_> {
     }
 }
 
-/// One image of several of one size, from left to right.
+/// Joins images of the same size from left to right.
 fn side_by_side(mut images: Vec<Image>) -> Image {
     if images.len() == 1 {
         return images.swap_remove(0);
@@ -231,7 +243,7 @@ fn side_by_side(mut images: Vec<Image>) -> Image {
     Image { width: width * images.len() as u32, height, data }
 }
 
-/// What stands where in a film of two models.
+/// Returns a line that says which model is left and which is right.
 pub fn places(left: &Path, right: &Path) -> String {
     format!("left: {}; right: {}", left.shown(), right.shown())
 }

@@ -71,7 +71,7 @@ impl WholeRun<'_> {
             original: with_training_views(self.input),
             compressed: result.to_owned(),
             ground_truth: None,
-            part: ViewSet::HeldOut,
+            views: ViewSet::HeldOut,
             max_frames: self.max_frames,
             max_views: None,
             background: self.background,

@@ -1,5 +1,5 @@
-//! The field's static baselines: pruning by one property of the model at rest, blind to time and to what
-//! is seen (the paper's "opacity/scale thresholds"), and pruning at random.
+//! Static baselines of the literature: pruning by one property of one frame state, without regard to time or visibility
+//! (the paper's "opacity/scale thresholds"), and pruning at random.
 
 use std::path::Path;
 
@@ -15,46 +15,47 @@ use crate::pipeline::stages::write::write_alone;
 use crate::recipe::Recipe;
 use crate::scene::{InputOptions, open_scene};
 
-/// What a baseline ranks by, largest first, ties by hashed id.
+/// Property by which a baseline ranks Gaussians, largest first; ties are ordered by hashed id.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Baseline {
     /// Opacity.
     Opacity,
-    /// Largest scale.
+    /// Largest of the three scales.
     Scale,
-    /// Hashed id alone.
+    /// Hashed id only.
     Random,
 }
 
-/// Writes the `target` best of an input by `baseline`; gives its bytes. The state
-/// ranked is the canonical one of a model with a deformation field, else that of the first frame.
+/// Prunes an input to `target` Gaussians by `baseline`, writes the result to `output` and returns its bytes. `None`
+/// keeps all Gaussians. Ranks the canonical Gaussians of a model with a deformation field, otherwise the state of the
+/// first frame.
 ///
 /// # Errors
-/// As of `compress`.
+/// Fails if the input cannot be opened or read, if it cannot be written in the format of `output`, or if writing fails.
 pub fn prune_by(baseline: Baseline, options: &InputOptions, target: Option<Target>, output: &Path) -> Result<u64> {
     let scene = open_scene(options)?;
     let source = scene.source();
     let count = source.info().count;
-    let wanted = target.map_or(Ok(count), |target| target.count(count))?;
+    let target_count = target.map_or(Ok(count), |target| target.count(count))?;
     let ids: Vec<u32> = (0..count as u32).collect();
     let state = match scene.input.canonical() {
         Some(canonical) => canonical.clone(),
         None if count == 0 => Gaussians::default(),
         None => gather(source, &ids, 0, Attributes::OPACITY | Attributes::LOG_SCALE)?,
     };
-    let kept = best(baseline, &state, ids, wanted);
+    let kept = largest(baseline, &state, ids, target_count);
     let kind = OutputKind::from_path(output, None, scene.input.own_output());
     scene.input.check_output(kind, output)?;
-    let reduction = CompressedModel::pruned(kept, &Recipe::preset("default")?.merge);
-    write_alone(&*scene.input, &reduction, kind, output, &Limits::NONE, &scene.events)
+    let compressed = CompressedModel::pruned(kept, &Recipe::preset("default")?.merge);
+    write_alone(&*scene.input, &compressed, kind, output, &Limits::NONE, &scene.events)
 }
 
-/// The `wanted` best of `ids`, increasing.
-fn best(baseline: Baseline, state: &Gaussians, mut ids: Vec<u32>, wanted: usize) -> Vec<u32> {
+/// Returns the `target_count` ids with the largest property, in increasing order.
+fn largest(baseline: Baseline, state: &Gaussians, mut ids: Vec<u32>, target_count: usize) -> Vec<u32> {
     let value = |id: u32| -> f32 {
         let row = id as usize;
         let value = match baseline {
-            // As the opacity itself: it grows with its logit.
+            // The order of logits is the order of opacities.
             Baseline::Opacity => state.opacity_logit.plane(0)[row],
             Baseline::Scale => state.log_scale.row::<3>(row).into_iter().fold(f32::NEG_INFINITY, f32::max),
             Baseline::Random => 0.0,
@@ -64,7 +65,7 @@ fn best(baseline: Baseline, state: &Gaussians, mut ids: Vec<u32>, wanted: usize)
     ids.sort_unstable_by(|&a, &b| {
         value(b).total_cmp(&value(a)).then_with(|| hash_id(a.into()).cmp(&hash_id(b.into())))
     });
-    ids.truncate(wanted);
+    ids.truncate(target_count);
     ids.sort_unstable();
     ids
 }
@@ -85,8 +86,8 @@ mod tests {
     }
 
     #[test]
-    fn each_baseline_keeps_the_largest_of_its_own_property_in_the_order_of_ids() {
-        let kept = |baseline, wanted| best(baseline, &state(), (0..4).collect(), wanted);
+    fn each_baseline_keeps_the_largest_of_its_property() {
+        let kept = |baseline, target_count| largest(baseline, &state(), (0..4).collect(), target_count);
         assert_eq!(kept(Baseline::Opacity, 2), [2, 3]);
         assert_eq!(kept(Baseline::Opacity, 3), [0, 2, 3]);
         assert_eq!(kept(Baseline::Scale, 2), [0, 3]);

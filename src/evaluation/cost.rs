@@ -1,4 +1,4 @@
-//! What a piece of work costs: time and memory of repeated runs of it alone.
+//! Cost of a piece of work: time and memory of repeated runs.
 
 use serde::{Deserialize, Serialize};
 
@@ -6,33 +6,36 @@ use crate::error::Result;
 use crate::journal::Clock;
 use crate::machine::{peak_memory_bytes, reset_peak_memory};
 
-/// What some runs of the same work took.
+/// Time and memory of repeated runs of the same work.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Cost {
-    /// How many runs.
+    /// Number of runs.
     pub runs: usize,
-    /// Wall-clock seconds.
+    /// Wall-clock seconds of a run.
     pub seconds: Spread,
-    /// Seconds of all processors together; none where the system does not tell.
+    /// CPU seconds of a run, over all threads; `None` if the system does not report them.
     pub processor_seconds: Option<Spread>,
-    /// Largest resident memory of any run, with all that this process holds beside it; none where the system does not
-    /// tell.
+    /// Maximum resident memory of the process over all runs, including memory that the work does not use; `None` if the
+    /// system does not report it.
     pub peak_memory_bytes: Option<u64>,
 }
 
-/// Values of repeated runs.
+/// Median and range of the values of repeated runs.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Spread {
-    /// The middle one, or the mean of the two there.
+    /// Median; the mean of both middle values if their number is even.
     pub median: f64,
-    /// Smallest.
+    /// Smallest value.
     pub least: f64,
-    /// Largest.
+    /// Largest value.
     pub most: f64,
 }
 
 impl Spread {
-    /// Of at least one value.
+    /// Computes the spread of `values`.
+    ///
+    /// # Panics
+    /// Panics if `values` is empty.
     pub fn from_values(mut values: Vec<f64>) -> Spread {
         values.sort_unstable_by(f64::total_cmp);
         let last = values.len() - 1;
@@ -40,25 +43,26 @@ impl Spread {
     }
 }
 
-/// How often work is repeated.
+/// Limits on the repetition of work.
 #[derive(Debug, Clone, Copy)]
 pub struct Repeats {
-    /// At most so often, at least once.
+    /// Maximum number of runs; the work always runs at least once.
     pub most: usize,
-    /// Not again once all runs together took as many seconds.
+    /// Total seconds after which no further run starts.
     pub enough: f64,
 }
 
 impl Repeats {
-    /// So often, whatever it takes.
+    /// Returns `most` runs without a time limit.
     pub fn always(most: usize) -> Repeats {
         Repeats { most, enough: f64::INFINITY }
     }
 
-    /// Runs `work` and gives what the last run gave, and what all cost. `clear` comes between two runs, at nobody's cost.
+    /// Runs `work` repeatedly and returns the value of the last run with the cost of all runs. Calls `clear` between
+    /// two runs, outside the measurement.
     ///
     /// # Errors
-    /// Those of both.
+    /// Fails if `work` or `clear` fails.
     pub fn measure<T>(
         self,
         mut work: impl FnMut() -> Result<T>,
@@ -66,13 +70,13 @@ impl Repeats {
     ) -> Result<(T, Cost)> {
         let (mut seconds, mut processors, mut peak) = (Vec::new(), Vec::new(), None);
         loop {
-            let resets = reset_peak_memory();
+            let is_peak_reset = reset_peak_memory();
             let clock = Clock::start();
             let value = work()?;
             seconds.push(clock.seconds());
             processors.extend(clock.processor_seconds());
-            // None is less than any.
-            peak = peak.max(if resets { peak_memory_bytes() } else { None });
+            // `None` is less than every `Some`.
+            peak = peak.max(if is_peak_reset { peak_memory_bytes() } else { None });
             if seconds.len() >= self.most || seconds.iter().sum::<f64>() >= self.enough {
                 let runs = seconds.len();
                 let processor_seconds = (processors.len() == runs).then(|| Spread::from_values(processors));
@@ -89,7 +93,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_spread_is_the_middle_and_both_ends_of_any_number() {
+    fn spread_is_median_smallest_and_largest() {
         for (values, expected) in
             [(vec![7.0], [7.0; 3]), (vec![9.0, 1.0], [5.0, 1.0, 9.0]), (vec![9.0, 1.0, 2.0], [2.0, 1.0, 9.0])]
         {
@@ -99,7 +103,7 @@ mod tests {
     }
 
     #[test]
-    fn work_is_repeated_until_it_was_often_enough_or_took_long_enough() {
+    fn work_repeats_until_run_or_time_limit() {
         for (repeats, expected) in [
             (Repeats::always(3), 3),
             (Repeats { most: 3, enough: 0.0 }, 1),

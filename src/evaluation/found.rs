@@ -1,7 +1,7 @@
-//! What an evaluation found, for people and for programs: scores of every picture and their means.
+//! Result of an evaluation as JSON, text and CSV: scores of every view and their means.
 //!
-//! Data in: scores per picture, by frame, then view. Data out: means overall, per view and per frame, as
-//! JSON, as text, and the pictures themselves as CSV. Means are arithmetic, in the order of the pictures.
+//! Input: scores of every (frame, view), by frame, then view. Output: means over all views, per view and per frame, as
+//! JSON and text, and the scores themselves as CSV. Means are arithmetic and summed in the order of the views.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -17,146 +17,146 @@ use crate::models::Size;
 use crate::models::size::compared;
 use crate::pipeline::summary::CameraSummary;
 
-/// One value for the model before compression and one for the model after it.
+/// Pair of values, for the original and the compressed model.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Both<T> {
-    /// Before.
+    /// Value of the original model.
     pub original: T,
-    /// After.
+    /// Value of the compressed model.
     pub compressed: T,
 }
 
-/// How close two pictures are.
+/// Scores of one image against another.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct ImageScore {
-    /// [`crate::metrics::psnr`], dB.
+    /// PSNR, dB ([`crate::metrics::psnr`]).
     pub psnr: f64,
-    /// [`crate::metrics::ssim`].
+    /// SSIM ([`crate::metrics::ssim`]).
     pub ssim: f64,
-    /// [`crate::metrics::temporal_error`] from the view's picture before; none of its first.
+    /// Temporal error since the previous image of the view ([`crate::metrics::temporal_error`]); `None` for its first.
     pub temporal: Option<f64>,
-    /// [`crate::metrics::flip`], where it is asked for.
+    /// FLIP ([`crate::metrics::flip`]); `None` if it was not requested.
     pub flip: Option<f64>,
 }
 
-/// The scores of one (frame, view).
+/// Scores of one (frame, view).
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct PictureScores {
     /// Frame of the sequence.
     pub frame: usize,
-    /// Its time stamp.
+    /// Time stamp of the frame.
     pub time: f64,
     /// View number.
     pub view: u32,
-    /// Compressed against original.
+    /// Scores of the compressed model against the original.
     pub loss: ImageScore,
-    /// Each against the ground truth, where that is given.
+    /// Scores of both models against the photograph; `None` without a photograph.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub truth: Option<Both<ImageScore>>,
 }
 
-/// Means over pictures.
+/// Mean scores over a set of views.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct QualityMeans {
-    /// Number of pictures.
+    /// Number of (frame, view) pairs.
     pub pairs: usize,
     /// Mean PSNR, dB.
     pub psnr: f64,
     /// Mean SSIM.
     pub ssim: f64,
-    /// Mean temporal error of those pictures that have one; none if no view is seen twice.
+    /// Mean temporal error over the pairs that have one; `None` if no view occurs at two frames.
     pub temporal: Option<f64>,
-    /// Mean FLIP, where it is asked for.
+    /// Mean FLIP; `None` if it was not requested.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub flip: Option<f64>,
 }
 
-/// Means over the pictures of one view.
+/// Mean scores over all frames of one view.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct ViewMeans {
     /// View number.
     pub view: u32,
-    /// Its means.
+    /// Means over the frames of this view.
     #[serde(flatten)]
     pub means: QualityMeans,
 }
 
-/// Means over the pictures of one frame.
+/// Mean scores over all views of one frame.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct FrameMeans {
     /// Frame of the sequence.
     pub frame: usize,
-    /// Its time stamp.
+    /// Time stamp of the frame.
     pub time: f64,
-    /// Its means; the temporal error is that since the frame evaluated before.
+    /// Means over the views of this frame; the temporal error refers to the previous evaluated frame.
     #[serde(flatten)]
     pub means: QualityMeans,
 }
 
-/// Pictures of one origin against pictures of another.
+/// Mean scores of one set of images against another.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Comparison {
-    /// Over all pictures.
+    /// Means over all views.
     #[serde(flatten)]
     pub overall: QualityMeans,
-    /// View by view, by number.
+    /// Means per view, by view number.
     pub per_view: Vec<ViewMeans>,
-    /// Frame by frame.
+    /// Means per frame, in order.
     pub per_frame: Vec<FrameMeans>,
 }
 
-/// Both models against the ground truth.
+/// Comparison of both models with photographs.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct TruthComparison {
-    /// Folder of the pictures.
+    /// Folder of the photographs.
     pub folder: String,
-    /// Pictures compared with each other; those that have a photograph are `pairs`.
+    /// Number of views on which the models are compared; `pairs` of them have a photograph.
     pub of: usize,
-    /// The compressed model.
+    /// Scores of the compressed model.
     #[serde(flatten)]
     pub compressed: Comparison,
-    /// The original, for what was lost to be seen.
+    /// Scores of the original, as the reference for the loss.
     pub original: Comparison,
 }
 
-/// Everything an evaluation found.
+/// Result of an evaluation.
 #[derive(Debug, Clone, Serialize)]
 pub struct Evaluation {
     /// Program and version.
     pub tool: String,
-    /// Paths as given.
+    /// Paths of the models, as given.
     pub path: Both<String>,
-    /// Gaussians.
+    /// Numbers of Gaussians.
     pub count: Both<usize>,
-    /// Bytes of everything that a renderer opens of a model.
+    /// Bytes of all files that a renderer opens.
     pub bytes: Both<u64>,
-    /// The same by part.
+    /// Bytes of the models by part.
     pub size: Both<Size>,
-    /// From where they were looked at.
+    /// Cameras of the evaluation.
     pub cameras: CameraSummary,
-    /// Red, green, blue behind the scene.
+    /// Background color: red, green, blue in [0, 1].
     pub background: [f32; 3],
-    /// Compressed against original.
+    /// Scores of the compressed model against the original.
     #[serde(flatten)]
     pub loss: Comparison,
-    /// Both against the ground truth, where that is given.
+    /// Scores of both models against photographs; `None` without `--ground-truth` or without any photograph.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub ground_truth: Option<TruthComparison>,
-    /// Render time of both models, where it was measured.
+    /// Render time of both models; `None` if it was not measured.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub render_ms: Option<RenderTime>,
-    /// Things a person should know.
+    /// Notes for the user.
     pub notes: Vec<String>,
-    /// The same of the work folder, which are no part of the result.
+    /// Notes about the cache folder, which are not part of the result.
     #[serde(skip)]
     pub work_notes: Vec<String>,
-    /// Every picture; for the CSV.
+    /// Scores of every view, for the CSV.
     #[serde(skip)]
     pub pictures: Vec<PictureScores>,
 }
 
 impl QualityMeans {
-    /// Of nothing: no pairs, and NaN, which JSON shows as null.
+    /// Computes the means of `scores`. Without scores, `pairs` is 0 and the means are NaN, which JSON writes as null.
     fn from_scores(scores: &[ImageScore]) -> QualityMeans {
         let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len() as f64;
         let all = |value: fn(&ImageScore) -> f64| mean(&scores.iter().map(value).collect::<Vec<_>>());
@@ -175,7 +175,10 @@ impl QualityMeans {
 }
 
 impl Comparison {
-    /// Averages what `score` picks of each picture; of those that have it; none if all lack it.
+    /// Averages the score that `score` selects from each view, over the views that have it. Returns `None` if none has
+    /// it.
+    ///
+    /// `pictures` is sorted by frame.
     pub fn from_pictures(
         pictures: &[PictureScores],
         score: impl Fn(&PictureScores) -> Option<ImageScore>,
@@ -192,11 +195,11 @@ impl Comparison {
         let mut per_frame = Vec::new();
         let mut rest = &scores[..];
         for frame in pictures.chunk_by(|a, b| a.frame == b.frame) {
-            let (these, after) = rest.split_at(frame.len());
+            let (frame_scores, after) = rest.split_at(frame.len());
             per_frame.push(FrameMeans {
                 frame: frame[0].frame,
                 time: frame[0].time,
-                means: QualityMeans::from_scores(these),
+                means: QualityMeans::from_scores(frame_scores),
             });
             rest = after;
         }
@@ -212,7 +215,7 @@ impl Comparison {
 }
 
 impl Evaluation {
-    /// Returns the evaluation with the last names of all paths alone, for a file.
+    /// Returns the evaluation with only the last component of every path, for writing to a file.
     pub fn without_folders(mut self) -> Evaluation {
         let truth = self.ground_truth.as_mut().map(|truth| &mut truth.folder);
         for path in [&mut self.path.original, &mut self.path.compressed].into_iter().chain(truth) {
@@ -221,7 +224,7 @@ impl Evaluation {
         self
     }
 
-    /// A few lines for a person.
+    /// Returns a text for the terminal: models, table of mean scores, worst view and worst frame, notes.
     pub fn text(&self) -> String {
         let mut out = String::new();
         let Both { original, compressed } = self.count;
@@ -243,14 +246,14 @@ impl Evaluation {
             after.format_relative_to(&before)
         );
         let frames = self.loss.per_frame.len();
-        let _ = writeln!(out, "{} pictures of {frames} frames: {}", self.cameras.pairs, self.cameras.origin);
+        let _ = writeln!(out, "{} views of {frames} frames: {}", self.cameras.pairs, self.cameras.origin);
         let with_flip = self.loss.overall.flip.is_some();
         let flip = if with_flip { "     FLIP" } else { "" };
         let _ = writeln!(out, "  {:<38} {:>8} {:>8} {:>10}{flip}", "", "PSNR dB", "SSIM", "temporal");
-        let mut line = |what: &str, means: &QualityMeans| {
+        let mut line = |label: &str, means: &QualityMeans| {
             let temporal = means.temporal.map_or("-".to_owned(), |error| format!("{error:.6}"));
             let flip = means.flip.map_or(String::new(), |error| format!(" {error:>8.5}"));
-            let _ = writeln!(out, "  {what:<38} {:>8.3} {:>8.5} {temporal:>10}{flip}", means.psnr, means.ssim);
+            let _ = writeln!(out, "  {label:<38} {:>8.3} {:>8.5} {temporal:>10}{flip}", means.psnr, means.ssim);
         };
         line("compressed against original", &self.loss.overall);
         if let Some(truth) = &self.ground_truth {
@@ -268,7 +271,7 @@ impl Evaluation {
             if pairs < truth.of {
                 let _ = writeln!(
                     out,
-                    "  ground truth: {pairs} of {} pictures have a photograph in {}",
+                    "  ground truth: {pairs} of {} views have a photograph in {}",
                     truth.of, truth.folder
                 );
             }
@@ -283,14 +286,14 @@ impl Evaluation {
         out
     }
 
-    /// One line per picture under a line of names; a value that does not exist is empty.
+    /// Returns a CSV table with one row per view; a missing value is an empty field.
     pub fn csv(&self) -> String {
         let with_flip = self.loss.overall.flip.is_some();
         let compared = if self.ground_truth.is_some() { &["", "_gt", "_gt_original"][..] } else { &[""] };
         let mut names = ["frame", "view", "time"].map(str::to_owned).to_vec();
-        for with in compared {
-            names.extend(["psnr", "ssim", "temporal"].map(|score| format!("{score}{with}")));
-            names.extend(with_flip.then(|| format!("flip{with}")));
+        for suffix in compared {
+            names.extend(["psnr", "ssim", "temporal"].map(|score| format!("{score}{suffix}")));
+            names.extend(with_flip.then(|| format!("flip{suffix}")));
         }
         let row = |picture: &PictureScores| {
             let mut row = vec![picture.frame.to_string(), picture.view.to_string(), picture.time.to_string()];
@@ -316,7 +319,7 @@ mod tests {
     }
 
     #[test]
-    fn means_weigh_every_picture_alike_and_skip_a_missing_temporal_error() {
+    fn means_weigh_views_alike_and_skip_missing_temporal_errors() {
         let pictures = [
             picture(0, 1, 30.0, None),
             picture(0, 2, 40.0, None),
@@ -344,11 +347,11 @@ mod tests {
             cameras: CameraSummary { origin: String::new(), cameras: 1, pairs: 2 },
             background: [0.0; 3],
             loss: Comparison::from_pictures(&pictures, |picture| Some(picture.loss)).unwrap(),
-            ground_truth: truth.map(|of| TruthComparison {
+            ground_truth: truth.map(|comparison| TruthComparison {
                 folder: String::new(),
                 of: 2,
-                compressed: of.clone(),
-                original: of,
+                compressed: comparison.clone(),
+                original: comparison,
             }),
             render_ms: None,
             notes: Vec::new(),
@@ -358,7 +361,7 @@ mod tests {
     }
 
     #[test]
-    fn csv_is_these_bytes() {
+    fn csv_matches_the_expected_text() {
         let mut pictures = vec![picture(0, 1, 30.0, None), picture(3, 2, 3e-5, Some(0.25))];
         assert_eq!(
             evaluation(pictures.clone()).csv(),

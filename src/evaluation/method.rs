@@ -1,17 +1,16 @@
-//! Ways to make a model smaller that a sweep compares: presets, parts of them, prunings by one number, and how each
-//! compresses.
+//! Compression methods that `sweep` compares: presets, parts of presets, and pruning by one property.
 
 use super::baseline::Baseline;
 use crate::error::{Error, Result};
 use crate::pipeline::Only;
 use crate::recipe::{Coverage, Precision, Recipe, ShDegreeRule, StaticTerm};
 
-/// A way to make a model smaller.
+/// Compression method.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Method {
     /// Preset `default`.
     Default,
-    /// Preset `default` that leaves what stays as it was.
+    /// Preset `default` without refinement.
     NoRefine,
     /// Preset `paper`: prunes and merges.
     Paper,
@@ -19,20 +18,20 @@ pub enum Method {
     PaperPrune,
     /// Preset `paper` without pruning.
     PaperMerge,
-    /// Prunes by visible contribution C alone.
+    /// Pruning by visible contribution C.
     Visible,
-    /// Prunes by projected coverage C alone.
+    /// Pruning by projected coverage C.
     Projected,
-    /// Prunes by opacity alone.
+    /// Pruning by opacity.
     Opacity,
-    /// Prunes by size alone.
+    /// Pruning by the largest scale.
     Scale,
-    /// Prunes at random.
+    /// Pruning at random.
     Random,
 }
 
 impl Method {
-    /// Every method, ours first.
+    /// All methods, those of this project first.
     pub const ALL: [Method; 10] = [
         Method::Default,
         Method::NoRefine,
@@ -46,7 +45,7 @@ impl Method {
         Method::Random,
     ];
 
-    /// As the command line and the results name it.
+    /// Returns the name on the command line and in results.
     pub fn name(self) -> &'static str {
         match self {
             Method::Default => "default",
@@ -62,25 +61,25 @@ impl Method {
         }
     }
 
-    /// The method that does the same and refines what stays, if this one leaves that out.
+    /// Returns the same method with refinement; `None` unless this method is [`Method::NoRefine`].
     pub fn refined(self) -> Option<Method> {
         (self == Method::NoRefine).then_some(Method::Default)
     }
 
-    /// How it compresses.
+    /// Returns how the method compresses: a recipe with its stages, or a baseline.
     ///
     /// # Errors
-    /// None but of presets that do not parse.
+    /// Fails only if a built-in preset does not parse.
     pub(crate) fn means(self) -> Result<MethodKind> {
         let unrefined = || Ok::<_, Error>(Recipe::preset("default")?.unrefined());
         let pruning = |coverage| {
             let mut recipe = unrefined()?;
-            // Pruning and nothing else.
+            // Leave out every stage except pruning.
             recipe.field.field = Precision::Exact;
             recipe.bands.bands = ShDegreeRule::All;
             recipe.scan.coverage = coverage;
             recipe.score.static_term = StaticTerm::Mean;
-            // S = C without clipping, so that no two Gaussians tie that differ in C.
+            // S = C without clipping, so that Gaussians with different C never tie.
             recipe.score.w_dynamic = 0.0;
             recipe.score.clip_norm = false;
             recipe.select.round_fraction = 1.0;
@@ -102,22 +101,22 @@ impl Method {
         }
     }
 
-    /// Whether it has a size of its own choice, by thresholds.
+    /// Returns whether the method chooses the number of Gaussians itself, by thresholds.
     pub(crate) fn chooses_size(self) -> bool {
         matches!(self, Method::Default | Method::NoRefine | Method::Paper | Method::PaperPrune | Method::PaperMerge)
     }
 }
 
-/// How a method compresses.
+/// Recipe or baseline by which a method compresses.
 pub(crate) enum MethodKind {
     Recipe(Box<Recipe>, Only),
     Baseline(Baseline),
 }
 
-/// The parameter that `--steps` turns.
+/// Name of the recipe parameter that `--steps` varies.
 pub(crate) const STEPS: &str = "refine_steps";
 
-/// [`Method::Default`] with so many steps, and before each cut as many in proportion.
+/// Returns [`Method::Default`] with `steps` refinement steps; the steps before prune steps change in proportion.
 pub(crate) fn refining_by(steps: u32) -> Result<MethodKind> {
     Ok(MethodKind::Recipe(Box::new(Recipe::preset("default")?.refining_by(steps)), Only::Both))
 }
@@ -127,7 +126,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn turning_steps_to_the_presets_own_leaves_the_preset() {
+    fn setting_the_presets_own_steps_keeps_the_preset() {
         let preset = Recipe::preset("default").unwrap();
         let recipe = |steps| match refining_by(steps).unwrap() {
             MethodKind::Recipe(recipe, Only::Both) => *recipe,

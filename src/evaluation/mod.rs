@@ -1,8 +1,8 @@
-//! What compression cost: the renders of two models side by side, and beside photographs.
+//! Evaluation: compares renders of the original and the compressed model with each other and with photographs.
 //!
-//! Frames stream: at a time one state of either model, and per thread one picture of each. For the error
-//! of what moves, the last pictures of every view that is seen again stay: 12 bytes per pixel, two or,
-//! with ground truth, three pictures per view. A part of the pictures begins by making these of the views before it again.
+//! Frames are read one by one. Memory holds one frame state of each model, and one render of each per thread. For the
+//! temporal error, the last images of every view that occurs again are kept: 12 bytes per pixel for two images per
+//! view, or three with photographs. A shard first renders the last images of its views again.
 
 pub mod baseline;
 pub mod cost;
@@ -39,54 +39,55 @@ use crate::scene::photographs::Photographs;
 use crate::scene::pictures::{self, ViewSet, background, pictures, spread_views, thin};
 use crate::scene::{InputOptions, Scene, open_compressed, open_scene};
 
-/// What comparing pictures is called.
+/// Name of the stage, for progress and cache entries.
 const NAME: &str = "evaluate";
 
-/// What to compare.
+/// Options of an evaluation.
 #[derive(Debug, Clone)]
 pub struct EvaluateOptions {
-    /// The model before compression and its cameras; of its split nothing is used.
+    /// Original model and its cameras. Its split is ignored.
     pub original: InputOptions,
-    /// The model after it, of any kind.
+    /// Path of the compressed model, in any format.
     pub compressed: PathBuf,
-    /// Folder of photographs.
+    /// Folder of photographs; `None`: compare with the original only.
     pub ground_truth: Option<PathBuf>,
-    /// Part of the cameras' pictures to compare.
-    pub part: ViewSet,
-    /// Compare at most this many frames, evenly; none: all.
+    /// Views to compare.
+    pub views: ViewSet,
+    /// Maximum number of frames, spread evenly; `None`: all.
     pub max_frames: Option<usize>,
     /// Maximum number of views, spread over frames and cameras; `None`: all.
     pub max_views: Option<usize>,
-    /// Red, green, blue in [0, 1]; none: see [`background`].
+    /// Background color: red, green, blue in [0, 1]; `None`: chosen by [`background`].
     pub background: Option<[f32; 3]>,
-    /// Whether to compute FLIP too, which takes longer than all else.
+    /// Whether to compute FLIP, which takes longer than all other scores.
     pub flip: bool,
-    /// File for the scores of every picture.
+    /// CSV file for the scores of every view.
     pub csv: Option<PathBuf>,
-    /// Replace an earlier file.
+    /// Policy for an existing CSV file.
     pub overwrite: Replace,
 }
 
-/// Renders both models at the cameras' pictures and compares them.
+/// Renders both models from the selected views and compares them.
 ///
 /// # Errors
-/// Whatever is wrong with inputs, cameras, pictures or output; models whose frames are not the same.
+/// Fails if inputs, cameras or photographs cannot be read, if the models have different frames, or if the CSV file
+/// cannot be written.
 pub fn evaluate(options: &EvaluateOptions) -> Result<Completion<Evaluation>> {
     Completion::from_result(evaluate_whole(options))
 }
 
-/// [`evaluate`] of a whole run, without parts.
+/// Runs [`evaluate`]; the end of a shard is an error value.
 ///
 /// # Errors
-/// Those of [`evaluate`].
+/// Fails as [`evaluate`].
 pub(crate) fn evaluate_whole(options: &EvaluateOptions) -> Result<Evaluation> {
     if let Some(csv) = &options.csv {
         check_target(csv, Kind::File, &options.inputs(), options.overwrite)?;
     }
-    let mut side = ModelPair::open(options)?;
-    side.keep_to(options.original.memory, needs)?;
-    let mut evaluation = side.evaluate()?;
-    evaluation.render_ms = side.render_time()?;
+    let mut pair = ModelPair::open(options)?;
+    pair.keep_to(options.original.memory, needs)?;
+    let mut evaluation = pair.evaluate()?;
+    evaluation.render_ms = pair.render_time()?;
     if let Some(csv) = &options.csv {
         let staged = StagedFile::new(csv, options.overwrite)?;
         fs::write(staged.path(), evaluation.csv()).map_err(Error::io("write", csv))?;
@@ -95,18 +96,18 @@ pub(crate) fn evaluate_whole(options: &EvaluateOptions) -> Result<Evaluation> {
     Ok(evaluation)
 }
 
-/// What it takes to make pictures of two models, each of as many Gaussians at most, and to compare them.
+/// Returns the resource estimate of rendering and comparing two models. `work` holds the larger number of Gaussians.
 pub fn needs(work: &Workload, limits: &Limits) -> Vec<ResourceEstimate> {
-    // Both models' and the photograph, and what they are compared with.
+    // Three images of 12 bytes per pixel (both renders, the photograph), and the buffers of the metrics.
     let mut need = pictures::need(work, limits, NAME, 2, 3 * 12 + metrics::BYTES_PER_PIXEL as u64);
     need.per_gaussian.push(("other model", work.input.per_gaussian));
     need.fixed.push(("scores", size_of::<PictureScores>() as u64 * work.pictures));
-    need.fixed.push(("pictures before", 3 * 12 * work.viewpoints * work.pixels));
+    need.fixed.push(("previous views", 3 * 12 * work.viewpoints * work.pixels));
     vec![need]
 }
 
 impl EvaluateOptions {
-    /// Every path that is read.
+    /// Returns all paths that are read, so that none of them is overwritten.
     pub fn inputs(&self) -> Vec<&Path> {
         let mut inputs = vec![self.original.path.as_path(), &self.compressed];
         inputs.extend(self.original.cameras.as_deref());
@@ -115,32 +116,31 @@ impl EvaluateOptions {
     }
 }
 
-/// Two open models, and the pictures to compare them on.
+/// Original and compressed model, opened, with the views on which they are compared.
 pub struct ModelPair {
-    /// The original and its cameras, those of every split.
+    /// Original model with the cameras of all splits.
     pub scene: Scene,
     compressed: Box<dyn InputModel>,
-    /// How the compressed one was opened.
+    /// Options with which the compressed model was opened.
     compressed_as: InputOptions,
     background: [f32; 3],
     flip: bool,
-    pictures: Vec<FrameView>,
+    views: Vec<FrameView>,
     truth_folder: Option<PathBuf>,
     truth: Option<Photographs>,
 }
 
 impl ModelPair {
-    /// Opens both models and finds every picture; of `options` the files to write are not looked at.
+    /// Opens both models and selects the views. Ignores the CSV file of `options`.
     ///
     /// # Errors
-    /// Whatever is wrong with inputs, cameras or the folder of photographs; models whose frames are not
-    /// the same.
+    /// Fails if inputs, cameras or the folder of photographs cannot be read, or if the models have different frames.
     pub fn open(options: &EvaluateOptions) -> Result<ModelPair> {
         let scene = open_scene(&InputOptions { split: None, ..options.original.clone() })?;
         let compressed = open_compressed(&options.compressed, &scene, &options.original)?;
         let background = background(options.background, &scene)?;
         let times = &scene.source().info().times;
-        let mut chosen = pictures(&scene.rig, times, options.part)?;
+        let mut chosen = pictures(&scene.rig, times, options.views)?;
         if let Some(frames) = options.max_frames {
             chosen = thin(chosen, frames);
         }
@@ -148,7 +148,7 @@ impl ModelPair {
             chosen = spread_views(chosen, views);
         }
         let truth = match &options.ground_truth {
-            Some(folder) => Some(Photographs::of_some(folder, &scene.rig, times, chosen.clone())?.1),
+            Some(folder) => Some(Photographs::find(folder, &scene.rig, times, chosen.clone())?.1),
             None => None,
         };
         Ok(ModelPair {
@@ -159,7 +159,7 @@ impl ModelPair {
                 iteration: None,
                 ..options.original.clone()
             },
-            pictures: chosen,
+            views: chosen,
             scene,
             compressed,
             background,
@@ -167,92 +167,94 @@ impl ModelPair {
         })
     }
 
-    /// Limits what comparing keeps in memory; `needs` names what is to be done.
+    /// Plans the memory of the comparison; `needs` returns the estimates of its stages.
     ///
     /// # Errors
-    /// A budget that cannot work.
+    /// Fails if the stages cannot run within `budget`.
     pub fn keep_to(
         &mut self,
         budget: Budget,
         needs: impl Fn(&Workload, &Limits) -> Vec<ResourceEstimate>,
     ) -> Result<()> {
-        let of_scene = self.scene.workload();
-        let gaussians = of_scene.gaussians.max(self.compressed_count() as u64);
-        let pictures = of_scene.pictures.max(self.pictures.len() as u64);
-        let plan = Plan::fit(Workload { gaussians, pictures, ..of_scene }, budget, &self.scene.events, needs)?;
+        let scene_work = self.scene.workload();
+        let gaussians = scene_work.gaussians.max(self.compressed_count() as u64);
+        let views = scene_work.pictures.max(self.views.len() as u64);
+        let plan = Plan::fit(Workload { gaussians, pictures: views, ..scene_work }, budget, &self.scene.events, needs)?;
         plan.tell_time(budget.tell, &self.scene.events);
         self.scene.limits = plan.limits;
         Ok(())
     }
 
-    /// Compares all pictures; in parts, if the scene's work folder has some.
+    /// Compares all views. With a cache folder, joins the results of shards; a run of one shard stores its shard and ends.
     ///
     /// # Errors
-    /// A source or a photograph that cannot be read; those of the work folder.
+    /// Fails if a frame or a photograph cannot be read, or if the cache folder cannot be used.
     pub fn evaluate(&self) -> Result<Evaluation> {
         let evaluation = self.compare()?;
         self.scene.work.end_shard_before("averaging")?;
         Ok(evaluation)
     }
 
-    /// [`ModelPair::evaluate`] as the beginning of a longer run, which uses the same parts.
+    /// Compares all views as the first stage of a longer run: like [`ModelPair::evaluate`], but a run of one shard goes
+    /// on to the next stage if the results of all shards are in the cache.
     ///
     /// # Errors
-    /// Those of [`ModelPair::evaluate`].
+    /// Fails as [`ModelPair::evaluate`].
     pub fn compare(&self) -> Result<Evaluation> {
-        let compute = |some| Ok(self.scores(some, |_, _, _| ())?.0);
-        self.evaluation(self.divided(NAME, compute)?)
+        let compute = |range| Ok(self.scores(range, |_, _, _| ())?.0);
+        self.evaluation(self.compute_sharded(NAME, compute)?)
     }
 
-    /// [`ModelPair::compare`], undivided, of which `observe` sees every picture too, with the original's state, from any
-    /// thread. Gives what it made of them in the order of [`Evaluation::pictures`].
+    /// Compares all views in one process and calls `observe` with the images of every view and the frame state of the
+    /// original, from any thread. Returns the values of `observe` in the order of [`Evaluation::pictures`].
     ///
     /// # Errors
-    /// A source or a photograph that cannot be read.
+    /// Fails if a frame or a photograph cannot be read.
     pub fn observe<O: Send>(
         &self,
         observe: impl Fn(&Gaussians, &Camera, &RenderedViews) -> O + Sync,
     ) -> Result<(Evaluation, Vec<O>)> {
-        let (scores, observed) = self.scores(0..self.pictures.len(), observe)?;
+        let (scores, observed) = self.scores(0..self.views.len(), observe)?;
         Ok((self.evaluation(scores)?, observed))
     }
 
-    /// What `observe` makes of every picture, as [`ModelPair::observe`] has it, without scores: the stage `name`, in
-    /// parts if the scene's work folder has some.
+    /// Returns the values of `observe` for every view, like [`ModelPair::observe`], without scores. Runs as the stage
+    /// `name`, which shards can divide.
     ///
     /// # Errors
-    /// A source or a photograph that cannot be read; those of the work folder.
+    /// Fails if a frame or a photograph cannot be read, or if the cache folder cannot be used.
     pub fn observe_in_parts<O: Send + Serialize + DeserializeOwned>(
         &self,
         name: &'static str,
         observe: impl Fn(&Gaussians, &Camera, &RenderedViews) -> O + Sync,
     ) -> Result<Vec<O>> {
-        self.divided(name, |some| {
-            let progress = self.scene.events.task(name, "pictures", some.len() as u64);
-            let mut all = Vec::with_capacity(some.len());
-            self.show(&self.pictures[some], |views| {
-                let see = |view: &ViewStates<'_, 2>| {
-                    let seen = observe(view.states[0], view.camera, &self.take(view)?);
+        self.compute_sharded(name, |range| {
+            let progress = self.scene.events.task(name, "views", range.len() as u64);
+            let mut all = Vec::with_capacity(range.len());
+            self.show(&self.views[range], |views| {
+                let observe_view = |view: &ViewStates<'_, 2>| {
+                    let seen = observe(view.states[0], view.camera, &self.render_view(view)?);
                     progress.advance(1);
                     Ok(seen)
                 };
-                all.extend(views.par_iter().map(see).collect::<Result<Vec<O>>>()?);
+                all.extend(views.par_iter().map(observe_view).collect::<Result<Vec<O>>>()?);
                 Ok(())
             })?;
             Ok(all)
         })
     }
 
-    /// What `compute` finds of every picture, in order, as the stage `name`.
-    fn divided<T: Serialize + DeserializeOwned>(
+    /// Computes one value per view with `compute`, as the stage `name`, which shards can divide. Returns the values in
+    /// order.
+    fn compute_sharded<T: Serialize + DeserializeOwned>(
         &self,
         name: &str,
         compute: impl Fn(Range<usize>) -> Result<Vec<T>>,
     ) -> Result<Vec<T>> {
         let work = &self.scene.work;
         let key = self.key()?;
-        work.divided(name, key, self.pictures.len(), compute, |parts| {
-            let mut all = Vec::with_capacity(self.pictures.len());
+        work.divided(name, key, self.views.len(), compute, |parts| {
+            let mut all = Vec::with_capacity(self.views.len());
             for part in parts {
                 all.extend(part?);
             }
@@ -260,21 +262,21 @@ impl ModelPair {
         })
     }
 
-    /// What the scores of all pictures say.
+    /// Builds the evaluation from the scores of all views.
     fn evaluation(&self, scores: Vec<PairScores>) -> Result<Evaluation> {
         let times = &self.scene.source().info().times;
-        let of_picture = |(&FrameView { frame, view, .. }, (loss, truth))| PictureScores {
+        let view_scores = |(&FrameView { frame, view, .. }, (loss, truth))| PictureScores {
             frame,
             time: times[frame],
             view,
             loss,
             truth,
         };
-        let scores: Vec<PictureScores> = self.pictures.iter().zip(scores).map(of_picture).collect();
+        let scores: Vec<PictureScores> = self.views.iter().zip(scores).map(view_scores).collect();
         let ground_truth = self.truth_folder.as_deref().and_then(|folder| {
             Some(TruthComparison {
                 folder: folder.to_string_lossy().into_owned(),
-                of: self.pictures.len(),
+                of: self.views.len(),
                 compressed: Comparison::from_pictures(&scores, |picture| Some(picture.truth?.compressed))?,
                 original: Comparison::from_pictures(&scores, |picture| Some(picture.truth?.original))?,
             })
@@ -294,12 +296,11 @@ impl ModelPair {
             size,
             cameras: CameraSummary {
                 origin: scene.rig.origin.clone(),
-                cameras: self.pictures.iter().map(|picture| picture.camera).collect::<HashSet<_>>().len(),
-                pairs: self.pictures.len(),
+                cameras: self.views.iter().map(|picture| picture.camera).collect::<HashSet<_>>().len(),
+                pairs: self.views.len(),
             },
             background: self.background,
-            loss: Comparison::from_pictures(&scores, |picture| Some(picture.loss))
-                .expect("every picture has this score"),
+            loss: Comparison::from_pictures(&scores, |picture| Some(picture.loss)).expect("every view has this score"),
             ground_truth,
             render_ms: None,
             notes: scene.notes.iter().cloned().chain(size.compressed.why_larger_than(&size.original)).collect(),
@@ -308,21 +309,21 @@ impl ModelPair {
         })
     }
 
-    /// What scores follow from, beside the original and its cameras.
+    /// Returns the cache key of the scores, without the original and its cameras, which the cache adds.
     fn key(&self) -> Result<CacheKey> {
         if !self.scene.work.keeps() {
             return Ok(CacheKey::NONE);
         }
         let compressed = self.scene.digest_of(&self.compressed_as, &*self.compressed)?;
-        let photographs = self.truth.as_ref().map(|truth| truth.stamps(&self.pictures)).transpose()?;
-        Ok(CacheKey::new(&(compressed, photographs, &self.pictures, self.background, self.flip)))
+        let photographs = self.truth.as_ref().map(|truth| truth.stamps(&self.views)).transpose()?;
+        Ok(CacheKey::new(&(compressed, photographs, &self.views, self.background, self.flip)))
     }
 
-    /// Makes the pictures numbered `places` among [`Evaluation::pictures`] again (to keep all of them would
-    /// take memory that grows with frames and views), each with the original's state.
+    /// Renders the views with the indices `places` in [`Evaluation::pictures`] again and passes them to `see`, each
+    /// with the frame state of the original. Keeping all renders would take memory that grows with frames and views.
     ///
     /// # Errors
-    /// A source or a photograph that cannot be read.
+    /// Fails if a frame or a photograph cannot be read.
     pub fn again<O>(
         &self,
         places: &[usize],
@@ -331,26 +332,27 @@ impl ModelPair {
         let mut places = places.to_vec();
         places.sort_unstable();
         places.dedup();
-        let chosen: Vec<FrameView> = places.iter().map(|&place| self.pictures[place]).collect();
+        let chosen: Vec<FrameView> = places.iter().map(|&place| self.views[place]).collect();
         let mut found = Vec::with_capacity(chosen.len());
         self.show(&chosen, |views| {
             for view in views {
-                found.push(see(places[found.len()], view.states[0], view.camera, self.take(view)?));
+                found.push(see(places[found.len()], view.states[0], view.camera, self.render_view(view)?));
             }
             Ok(())
         })?;
         Ok(found)
     }
 
-    /// That of the number `place` among [`Evaluation::pictures`].
+    /// Returns the view at index `place` of [`Evaluation::pictures`].
     pub fn picture(&self, place: usize) -> FrameView {
-        self.pictures[place]
+        self.views[place]
     }
 
-    /// What `see` makes of both models' pictures, the original's first, of any `pictures` of the scene's cameras, in order.
+    /// Renders `pictures` with both models and returns the values of `see`, in order. The first image is of the
+    /// original. The views may be any views of the cameras of the scene.
     ///
     /// # Errors
-    /// A source that cannot be read; those of `see`.
+    /// Fails if a frame cannot be read or if `see` fails.
     pub fn both<O: Send>(
         &self,
         pictures: &[FrameView],
@@ -358,11 +360,11 @@ impl ModelPair {
     ) -> Result<Vec<O>> {
         let mut found = Vec::with_capacity(pictures.len());
         self.show(pictures, |views| {
-            let of = |view: &ViewStates<'_, 2>| {
+            let compare_view = |view: &ViewStates<'_, 2>| {
                 let images = [0, 1].map(|subject| view.render(subject, self.background));
                 see([&images[0], &images[1]])
             };
-            found.extend(views.par_iter().map(of).collect::<Result<Vec<O>>>()?);
+            found.extend(views.par_iter().map(compare_view).collect::<Result<Vec<O>>>()?);
             Ok(())
         })?;
         Ok(found)
@@ -373,29 +375,30 @@ impl ModelPair {
     /// # Errors
     /// Fails if frames cannot be read.
     pub fn render_time(&self) -> Result<Option<RenderTime>> {
-        render_times(&self.scene, self.compressed.source(), &self.pictures)
+        render_times(&self.scene, self.compressed.source(), &self.views)
     }
 
-    /// Gaussians of the compressed model.
+    /// Returns the number of Gaussians of the compressed model.
     pub fn compressed_count(&self) -> usize {
         self.compressed.source().info().count
     }
 
-    /// Shows the original and the compressed model.
+    /// Calls `visit` with batches of views, each with the frame states of the original and the compressed model.
     fn show(&self, pictures: &[FrameView], visit: impl FnMut(&[ViewStates<'_, 2>]) -> Result<()>) -> Result<()> {
         let subjects = [self.scene.source(), self.compressed.source()].map(RenderedSource::all);
-        show(subjects, &self.scene.rig.cameras, pictures, Batch::of_frame(&self.scene.limits), visit)
+        show(subjects, &self.scene.rig.cameras, pictures, Batch::one_frame(&self.scene.limits), visit)
     }
 
-    /// Scores of `some` of the pictures. The last ones before them of their views are made again.
+    /// Computes the scores and the values of `observe` for the views in `range`. For the temporal error, first renders
+    /// the last images of these views before `range` again.
     fn scores<O: Send>(
         &self,
-        some: Range<usize>,
+        range: Range<usize>,
         observe: impl Fn(&Gaussians, &Camera, &RenderedViews) -> O + Sync,
     ) -> Result<(Vec<PairScores>, Vec<O>)> {
-        let mut chosen = last_before(&self.pictures, some.start, &self.pictures[some.clone()]);
+        let mut chosen = previous_views(&self.views, range.start, &self.views[range.clone()]);
         let again = chosen.len();
-        chosen.extend_from_slice(&self.pictures[some]);
+        chosen.extend_from_slice(&self.views[range]);
         let mut last_frame: HashMap<u32, usize> = HashMap::new();
         for picture in &chosen {
             last_frame.insert(picture.view, picture.frame);
@@ -404,32 +407,32 @@ impl ModelPair {
         let mut all = Vec::with_capacity(chosen.len() - again);
         let mut observed = Vec::with_capacity(chosen.len() - again);
         let mut shown = 0;
-        let progress = self.scene.events.task(NAME, "pictures", (chosen.len() - again) as u64);
+        let progress = self.scene.events.task(NAME, "views", (chosen.len() - again) as u64);
         self.show(&chosen, |views| {
             let first = shown;
             shown += views.len();
-            let taken: Vec<_> = views
+            let rendered: Vec<_> = views
                 .par_iter()
                 .enumerate()
                 .map(|(k, view)| {
-                    let taken = self.take(view)?;
+                    let rendered = self.render_view(view)?;
                     if first + k < again {
-                        return Ok((taken, None));
+                        return Ok((rendered, None));
                     }
-                    let scores = taken.scores(before.get(&view.picture.view), self.flip);
-                    let seen = observe(view.states[0], view.camera, &taken);
+                    let scores = rendered.scores(before.get(&view.picture.view), self.flip);
+                    let seen = observe(view.states[0], view.camera, &rendered);
                     progress.advance(1);
-                    Ok((taken, Some((scores, seen))))
+                    Ok((rendered, Some((scores, seen))))
                 })
                 .collect::<Result<_>>()?;
-            for (shown, (taken, found)) in views.iter().zip(taken) {
+            for (shown, (rendered, found)) in views.iter().zip(rendered) {
                 let FrameView { frame, view, .. } = shown.picture;
                 if let Some((scores, seen)) = found {
                     all.push(scores);
                     observed.push(seen);
                 }
                 if last_frame.get(&view).is_some_and(|&last| last > frame) {
-                    before.insert(view, taken);
+                    before.insert(view, rendered);
                 } else {
                     before.remove(&view);
                 }
@@ -439,7 +442,8 @@ impl ModelPair {
         Ok((all, observed))
     }
 
-    fn take(&self, view: &ViewStates<'_, 2>) -> Result<RenderedViews> {
+    /// Renders a view with both models and reads its photograph, if there is one.
+    fn render_view(&self, view: &ViewStates<'_, 2>) -> Result<RenderedViews> {
         let &ViewStates { picture, camera, .. } = view;
         Ok(RenderedViews {
             original: view.render(0, self.background),
@@ -452,46 +456,50 @@ impl ModelPair {
     }
 }
 
-/// Of every view of `these` the last of the first `start` of `pictures`, in their order.
-fn last_before(pictures: &[FrameView], start: usize, these: &[FrameView]) -> Vec<FrameView> {
-    let mut views: HashSet<u32> = these.iter().map(|picture| picture.view).collect();
+/// Returns, for every view that occurs in `range`, its last occurrence among the first `start` of `all`, in their
+/// order.
+fn previous_views(all: &[FrameView], start: usize, range: &[FrameView]) -> Vec<FrameView> {
+    let mut views: HashSet<u32> = range.iter().map(|picture| picture.view).collect();
     let mut last: Vec<FrameView> =
-        pictures[..start].iter().rev().filter(|picture| views.remove(&picture.view)).copied().collect();
+        all[..start].iter().rev().filter(|picture| views.remove(&picture.view)).copied().collect();
     last.reverse();
     last
 }
 
-/// Of a picture: compressed against original, and each against the ground truth, where that is given.
+/// Scores of one view: of the compressed model against the original, and of both against the photograph, if any.
 type PairScores = (ImageScore, Option<Both<ImageScore>>);
 
-/// The pictures of one (frame, view), all of one size.
+/// Images of one (frame, view), all of the same size.
 pub struct RenderedViews {
     /// Render of the original.
     pub original: Image,
     /// Render of the compressed model.
     pub compressed: Image,
-    /// The photograph, where there are any.
+    /// Photograph; `None` if the view has none.
     pub truth: Option<Image>,
 }
 
 impl RenderedViews {
-    /// Scores, with those of motion from the pictures `before` of the same view.
+    /// Computes the scores; `before` holds the previous images of the same view, for the temporal error.
     fn scores(&self, before: Option<&RenderedViews>, with_flip: bool) -> PairScores {
-        let size = |taken: &RenderedViews| (taken.original.width, taken.original.height);
-        // A view whose camera changed may have another size, and nothing to be compared with.
+        let size = |rendered: &RenderedViews| (rendered.original.width, rendered.original.height);
+        // The image size can change with the camera of a view; then there is no temporal error.
         let before = before.filter(|before| size(before) == size(self));
         let loss = score(&self.compressed, &self.original, before.map(|b| [&b.compressed, &b.original]), with_flip);
         let truth = self.truth.as_ref().map(|truth| {
             let against = |image: fn(&RenderedViews) -> &Image| {
                 score(image(self), truth, before.and_then(|b| Some([image(b), b.truth.as_ref()?])), with_flip)
             };
-            Both { original: against(|taken| &taken.original), compressed: against(|taken| &taken.compressed) }
+            Both {
+                original: against(|rendered| &rendered.original),
+                compressed: against(|rendered| &rendered.compressed),
+            }
         });
         (loss, truth)
     }
 }
 
-/// How close `a` is to `b`, given the same two at the view's frame before.
+/// Computes the scores of `a` against `b`; `before` holds the same two images at the previous frame of the view.
 fn score(a: &Image, b: &Image, before: Option<[&Image; 2]>, with_flip: bool) -> ImageScore {
     let temporal = before.map(|[a_before, b_before]| temporal_error([a_before, a], [b_before, b]));
     ImageScore { psnr: psnr(a, b), ssim: ssim(a, b), temporal, flip: with_flip.then(|| flip(a, b)) }

@@ -1,5 +1,4 @@
-//! What turning the knobs of a run showed, for people and for programs: what every setting costs, and what it leaves to be
-//! desired.
+//! Result of `precision` as JSON, text and CSV: run time and error of every value of the settings of each stage.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -9,55 +8,56 @@ use serde::{Deserialize, Serialize};
 use crate::evaluation::cost::{Cost, Spread};
 use crate::files::csv::{known, table};
 
-/// Every knob that was turned on a model, and what all of it shares.
+/// Result of `precision`: all knobs and their common conditions.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct PrecisionDiagram {
     /// Program and version.
     pub tool: String,
-    /// Input, as given.
+    /// Path of the input, as given.
     pub path: String,
-    /// Hash over the input's bytes.
+    /// Hash of the bytes of the input.
     pub digest: String,
-    /// Gaussians of the input.
+    /// Number of Gaussians of the input.
     pub gaussians: usize,
-    /// Its frames.
+    /// Number of frames of the input.
     pub frames: usize,
-    /// Frames, evenly from first to last, of which pictures are looked at and ranked by at most.
+    /// Maximum number of frames for scoring and ranking, spread evenly from first to last.
     pub frames_looked_at: usize,
-    /// Pictures of these.
+    /// Number of views of these frames.
     pub pictures: usize,
-    /// Pictures that rankings are judged by: held-out ones, where there are some.
+    /// Number of views on which rankings are judged: test views if there are any.
     pub judged: usize,
-    /// File of the cameras.
+    /// File of the cameras, or description of the virtual rig.
     pub cameras: String,
-    /// Gaussians that every setting is compared at.
+    /// Number of Gaussians that every setting keeps.
     pub kept: usize,
-    /// Threads at work, but where threads are turned.
+    /// Number of threads, except where the number of threads is varied.
     pub threads: usize,
-    /// Maximum number of runs of each setting; fewer where the runs so far took [`PrecisionDiagram::enough`] seconds in all.
+    /// Maximum number of runs of each setting; fewer where the runs so far took [`PrecisionDiagram::enough`] seconds in
+    /// all.
     pub runs: usize,
     /// Total time of the runs of one setting after which it is not run again, seconds.
     pub enough: f64,
-    /// What was turned.
+    /// Knobs that were varied.
     pub knobs: Vec<PrecisionKnob>,
-    /// Things a person should know.
+    /// Notes for the user.
     pub notes: Vec<String>,
 }
 
-/// Where an error comes from.
+/// Source of an error.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Source {
-    /// Something is looked at in samples or in steps.
+    /// Sampling, or a finite step.
     Discretization,
-    /// Numbers have so many digits.
+    /// Finite number of digits.
     Rounding,
-    /// A smaller model stands for a larger one.
+    /// Replacement of a model by a smaller one.
     Model,
 }
 
 impl Source {
-    /// As text has it.
+    /// Returns the name in tables and CSV files.
     pub fn name(self) -> &'static str {
         match self {
             Source::Discretization => "discretisation",
@@ -67,82 +67,83 @@ impl Source {
     }
 }
 
-/// Something that can be had cheaper or finer.
+/// Setting, or group of settings, that trades run time for error.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct PrecisionKnob {
-    /// As `--knobs` names it.
+    /// Name, as in `--knobs`.
     pub name: String,
-    /// What is turned, and what its errors are.
+    /// Description of the setting and of its errors.
     pub about: String,
-    /// What error turning it changes.
+    /// Source of the error that the setting changes.
     pub source: Source,
-    /// Ways to turn it.
+    /// One curve for each parameter of the knob.
     pub curves: Vec<PrecisionCurve>,
 }
 
-/// One way to turn a knob.
+/// Measurements of one parameter of a knob.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct PrecisionCurve {
-    /// What is turned; a recipe's parameter by its name.
+    /// Name of the parameter; the name in the recipe if it is a recipe parameter.
     pub name: String,
-    /// What errors are measured against.
+    /// Reference of the errors.
     pub against: String,
-    /// In the order in which they were tried: mostly from coarse to fine.
+    /// Measurements in the order in which they were made, mostly from coarse to fine.
     pub marks: Vec<PrecisionSetting>,
-    /// How errors go with the step.
+    /// Observed orders of the errors in the step.
     pub orders: Vec<ObservedOrder>,
-    /// The recipe's own value, if it is among the marks.
+    /// Value in the recipe; `None` if it was not measured.
     pub own: Option<f64>,
-    /// The coarsest value from which on errors added to pictures stay below a tenth of the model's own.
+    /// Coarsest value from which on the error added to renders stays below a tenth of the model's own error.
     pub enough: Option<f64>,
 }
 
-/// One setting.
+/// Measurements at one value of a parameter.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct PrecisionSetting {
-    /// Value of what is turned.
+    /// Value of the parameter.
     pub value: f64,
-    /// What errors go with as a power, of which the exponent is the order: a step h, or of sums the number of frames.
+    /// Step h: errors grow as h^order. For sums, h is the number of frames.
     pub step: f64,
-    /// Time and memory.
+    /// Time and memory of the runs.
     pub cost: Cost,
-    /// By what they are of: see [`meaning`].
+    /// Errors by name; [`meaning`] describes them.
     pub errors: BTreeMap<String, f64>,
-    /// Mean PSNR on the pictures judged by, dB, where a model came of it.
+    /// Mean PSNR on the judged views, dB; `None` if the setting yields no model.
     pub psnr: Option<f64>,
 }
 
-/// An observed order: of convergence, or of sums of growth.
+/// Observed order: of convergence, or of growth for sums.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ObservedOrder {
-    /// Of which error.
+    /// Name of the error.
     pub of: String,
-    /// Slope of log error by log step, by least squares.
+    /// Slope of log error against log step, by least squares.
     pub observed: f64,
-    /// What theory predicts, where it does.
+    /// Order that theory predicts; `None` if it predicts none.
     pub expected: Option<f64>,
 }
 
-/// Root mean square error of the pictures judged by, colors from 0 to 1, against the whole model's own.
+/// Error name: root mean square error of the judged renders against renders of the whole model, colors in [0, 1].
 pub const PICTURES: &str = "pictures";
-/// What a setting adds to [`PICTURES`] in squares, as a part of what the finest setting has: the model's own.
+/// Error name: error that a setting adds to [`PICTURES`], relative to the error of the finest setting, which is the
+/// model's own (see [`added`]).
 pub const ADDED: &str = "added";
-/// See [`meaning`].
+/// Error name: difference of the kept sets.
 pub const KEPT: &str = "kept";
-/// See [`meaning`].
+/// Error name: relative error of the number of survivors.
 pub const STAYING: &str = "staying";
-/// See [`meaning`].
+/// Error name: largest relative error of the percentiles P1 and P99.
 pub const PERCENTILES: &str = "percentiles";
-/// See [`meaning`].
+/// Error name: results whose bytes differ.
 pub const BYTES: &str = "bytes";
 
-/// A tenth: what [`PrecisionCurve::enough`] allows.
-const SMALL: f64 = 0.1;
+/// Maximum of [`ADDED`] from [`PrecisionCurve::enough`] on.
+const SMALL_ADDED_ERROR: f64 = 0.1;
 
-/// What an error is of, for an axis.
+/// Returns the axis label of the error called `error`.
 pub fn meaning(error: &str) -> String {
     match error {
-        PICTURES => "root mean square error of pictures".to_owned(),
+        PICTURES => "root mean square error of renders".to_owned(),
         ADDED => "error added / error of the model".to_owned(),
         KEPT => "1 - Jaccard of the kept set".to_owned(),
         STAYING => "relative error of how many stay".to_owned(),
@@ -153,7 +154,8 @@ pub fn meaning(error: &str) -> String {
 }
 
 impl PrecisionCurve {
-    /// A curve of `marks`, with the orders of all errors, those in `expected` beside what theory says.
+    /// Returns a curve of `marks` with the observed orders of all errors; `expected` lists the orders that theory
+    /// predicts. Infinite errors are removed.
     pub fn new(
         name: &str,
         against: &str,
@@ -161,22 +163,22 @@ impl PrecisionCurve {
         own: Option<f64>,
         expected: &[(&str, f64)],
     ) -> PrecisionCurve {
-        // JSON has no infinity.
+        // JSON cannot represent infinity.
         let mut marks = marks;
         marks.iter_mut().for_each(|mark| mark.errors.retain(|_, error| error.is_finite()));
         let mut names: Vec<String> = marks.iter().flat_map(|mark| mark.errors.keys().cloned()).collect();
         names.sort_unstable();
         names.dedup();
-        // What pictures lose goes to what the model loses, not to nothing.
+        // The error of renders converges to the model's own error, not to 0, so it has no order.
         names.retain(|name| name != PICTURES);
-        let order = |of: String| {
-            let points = marks.iter().filter_map(|mark| Some((mark.step, *mark.errors.get(&of)?)));
-            let expected = expected.iter().find(|(name, _)| *name == of).map(|&(_, order)| order);
-            Some(ObservedOrder { observed: slope(points)?, expected, of })
+        let order = |error: String| {
+            let points = marks.iter().filter_map(|mark| Some((mark.step, *mark.errors.get(&error)?)));
+            let expected = expected.iter().find(|(name, _)| *name == error).map(|&(_, order)| order);
+            Some(ObservedOrder { observed: slope(points)?, expected, of: error })
         };
         let orders = names.into_iter().filter_map(order).collect();
-        let is_small = |mark: &PrecisionSetting| mark.errors.get(ADDED).is_some_and(|&added| added < SMALL);
-        // The finest is measured against itself.
+        let is_small = |mark: &PrecisionSetting| mark.errors.get(ADDED).is_some_and(|&added| added < SMALL_ADDED_ERROR);
+        // The finest setting is measured against itself, so it does not count.
         let small = marks.iter().rev().take_while(|mark| is_small(mark)).skip(1).last();
         let own = own.filter(|own| marks.iter().any(|mark| mark.value == *own));
         PrecisionCurve {
@@ -190,7 +192,8 @@ impl PrecisionCurve {
     }
 }
 
-/// Slope of log error by log step, of the points whose errors are not 0; none of less than three steps.
+/// Returns the least-squares slope of log error against log step over the points with a step and an error above 0.
+/// Returns `None` for fewer than three such points or if all steps are equal.
 fn slope(points: impl Iterator<Item = (f64, f64)>) -> Option<f64> {
     let logs: Vec<(f64, f64)> = points
         .filter(|&(step, error)| step > 0.0 && error > 0.0)
@@ -198,39 +201,40 @@ fn slope(points: impl Iterator<Item = (f64, f64)>) -> Option<f64> {
         .collect();
     let count = logs.len() as f64;
     let (x, y) = logs.iter().fold((0.0, 0.0), |(x, y), log| (x + log.0 / count, y + log.1 / count));
-    let (up, along) =
-        logs.iter().fold((0.0, 0.0), |(up, along), log| (up + (log.0 - x) * (log.1 - y), along + (log.0 - x).powi(2)));
-    (logs.len() >= 3 && along > 0.0).then(|| up / along)
+    let (covariance, variance) = logs.iter().fold((0.0, 0.0), |(covariance, variance), log| {
+        (covariance + (log.0 - x) * (log.1 - y), variance + (log.0 - x).powi(2))
+    });
+    (logs.len() >= 3 && variance > 0.0).then(|| covariance / variance)
 }
 
-/// ‖a − b‖ / ‖b‖ over all values; where `b` is 0 throughout, ‖a‖.
+/// Returns ‖a − b‖ / ‖b‖ over all values, or ‖a‖ if `b` is all zero.
 pub(crate) fn relative_l2(a: impl IntoIterator<Item = f64>, b: impl IntoIterator<Item = f64>) -> f64 {
     let (off, all) = a.into_iter().zip(b).fold((0.0, 0.0), |(off, all), (a, b)| (off + (a - b) * (a - b), all + b * b));
     f64::sqrt(if all > 0.0 { off / all } else { off })
 }
 
-/// 1 − |a ∩ b| / |a ∪ b| of increasing ids; 0 of two empty sets.
+/// Returns the Jaccard distance 1 − |a ∩ b| / |a ∪ b| of two lists of increasing ids; 0 for two empty lists.
 pub(crate) fn apart(a: &[u32], b: &[u32]) -> f64 {
     let both = a.iter().filter(|id| b.binary_search(id).is_ok()).count();
     let either = a.len() + b.len() - both;
     if either == 0 { 0.0 } else { 1.0 - both as f64 / either as f64 }
 }
 
-/// What error a setting adds to pictures whose error is `finest` at best: errors that know nothing of one another add up
-/// in squares. A part of `finest`; 0 where pictures came out closer.
+/// Returns the error that a setting adds to the error `finest` of the finest setting, relative to `finest`:
+/// √(error² − finest²) / finest, as independent errors add in squares. Returns 0 if `error` is below `finest`.
 pub(crate) fn added(error: f64, finest: f64) -> f64 {
     ((error * error - finest * finest).max(0.0)).sqrt() / finest.max(f64::MIN_POSITIVE)
 }
 
 impl PrecisionDiagram {
-    /// As JSON, for programs.
+    /// Returns the result as indented JSON.
     pub fn json(&self) -> String {
         let mut text = serde_json::to_string_pretty(self).expect("plain data");
         text.push('\n');
         text
     }
 
-    /// A line for every error of every setting, under a line of names; a value that does not exist is empty.
+    /// Returns a CSV table with one row per error of every setting; a missing value is an empty field.
     pub fn csv(&self) -> String {
         let names = [
             "knob",
@@ -254,14 +258,16 @@ impl PrecisionDiagram {
         for (knob, curve) in self.curves() {
             for mark in &curve.marks {
                 let Cost { runs, seconds, processor_seconds, peak_memory_bytes } = &mark.cost;
-                let spread = |of: Option<&Spread>| {
-                    [of.map(|of| of.median), of.map(|of| of.least), of.map(|of| of.most)].map(known)
+                let spread_columns = |spread: Option<&Spread>| {
+                    [spread.map(|s| s.median), spread.map(|s| s.least), spread.map(|s| s.most)].map(known)
                 };
                 rows.extend(mark.errors.iter().map(|(of, error)| {
                     let mut row = vec![knob.name.clone(), knob.source.name().to_owned(), curve.name.clone()];
                     row.extend([mark.value, mark.step, *error].map(|value| value.to_string()));
                     row.extend([of.clone(), known(mark.psnr), runs.to_string()]);
-                    row.extend(spread(Some(seconds)).into_iter().chain(spread(processor_seconds.as_ref())));
+                    row.extend(
+                        spread_columns(Some(seconds)).into_iter().chain(spread_columns(processor_seconds.as_ref())),
+                    );
                     row.push(known(*peak_memory_bytes));
                     row
                 }));
@@ -270,17 +276,18 @@ impl PrecisionDiagram {
         table(&names, rows)
     }
 
+    /// Returns every curve with its knob.
     fn curves(&self) -> impl Iterator<Item = (&PrecisionKnob, &PrecisionCurve)> {
         self.knobs.iter().flat_map(|knob| knob.curves.iter().map(move |curve| (knob, curve)))
     }
 
-    /// A table for a person.
+    /// Returns a table for the terminal. A star marks the value in the recipe.
     pub fn text(&self) -> String {
         let mut out = String::new();
         // Writing to a String cannot fail.
         let _ = writeln!(
             out,
-            "{}: {} Gaussians x {} frames; {} pictures of {} frames looked at, {} judged by; {} kept",
+            "{}: {} Gaussians x {} frames; scoring on {} views of {} frames, judged on {} views; {} kept",
             self.path, self.gaussians, self.frames, self.pictures, self.frames_looked_at, self.judged, self.kept
         );
         for (knob, curve) in self.curves() {
@@ -293,7 +300,8 @@ impl PrecisionDiagram {
                 curve.against
             );
             for mark in &curve.marks {
-                let errors: Vec<String> = mark.errors.iter().map(|(of, error)| format!("{of} {error:.1e}")).collect();
+                let errors: Vec<String> =
+                    mark.errors.iter().map(|(name, error)| format!("{name} {error:.1e}")).collect();
                 let psnr = mark.psnr.map_or(String::new(), |psnr| format!("{psnr:>7.2} dB"));
                 let own = if curve.own == Some(mark.value) { "*" } else { " " };
                 let seconds = mark.cost.seconds.median;
@@ -308,7 +316,7 @@ impl PrecisionDiagram {
                 let _ = writeln!(out, "  order by the step: {}", orders.join(", "));
             }
             if let Some(enough) = curve.enough {
-                let _ = writeln!(out, "  adds less than a tenth of the model's own error to pictures from {enough} on");
+                let _ = writeln!(out, "  from {enough} on, adds less than a tenth of the model's own error to renders");
             }
         }
         for note in &self.notes {
@@ -334,7 +342,7 @@ mod tests {
     }
 
     #[test]
-    fn the_order_of_a_power_is_its_exponent_and_zeros_tell_nothing() {
+    fn observed_order_is_the_exponent_and_ignores_zeros() {
         let marks = [8.0, 4.0, 2.0, 1.0].map(|h: f64| mark(1.0 / h, h, &[("C", 3.0 * h.powf(1.5)), ("W", 0.0)]));
         let curve = PrecisionCurve::new("strides", "all", marks.to_vec(), None, &[("C", 1.5)]);
         assert_eq!(curve.orders.len(), 1);
@@ -343,19 +351,19 @@ mod tests {
     }
 
     #[test]
-    fn enough_is_the_coarsest_value_from_which_on_all_are_small() {
-        let of = |added: &[f64]| {
+    fn enough_is_the_coarsest_value_with_small_finer_errors() {
+        let curve = |added: &[f64]| {
             let marks = added.iter().zip(1..).map(|(&added, k)| mark(f64::from(k), 1.0, &[(ADDED, added)])).collect();
             PrecisionCurve::new("pictures", "all", marks, Some(2.0), &[])
         };
-        assert_eq!(of(&[0.5, 0.05, 0.2, 0.09, 0.0]).enough, Some(4.0));
-        assert_eq!(of(&[0.5, 0.5]).enough, None);
-        assert_eq!((of(&[0.0; 5]).enough, of(&[0.0; 5]).own, of(&[0.0]).own), (Some(1.0), Some(2.0), None));
-        assert_eq!(of(&[0.5, 0.5, 0.0]).enough, None, "the finest tells nothing");
+        assert_eq!(curve(&[0.5, 0.05, 0.2, 0.09, 0.0]).enough, Some(4.0));
+        assert_eq!(curve(&[0.5, 0.5]).enough, None);
+        assert_eq!((curve(&[0.0; 5]).enough, curve(&[0.0; 5]).own, curve(&[0.0]).own), (Some(1.0), Some(2.0), None));
+        assert_eq!(curve(&[0.5, 0.5, 0.0]).enough, None, "the finest setting is not counted");
     }
 
     #[test]
-    fn distances_are_those_of_their_definitions() {
+    fn distances_match_their_definitions() {
         assert_eq!(relative_l2([3.0, 0.0], [0.0, 4.0]), 1.25);
         assert_eq!(relative_l2([3.0, 4.0], [0.0, 0.0]), 5.0);
         assert_eq!(apart(&[1, 2, 3], &[2, 3, 4, 5]), 1.0 - 2.0 / 5.0);

@@ -1,5 +1,5 @@
-//! What a sweep found, for people and for programs: quality, size, time and memory of every method at
-//! every kept fraction, and of one method as a parameter is turned.
+//! Result of `sweep` as JSON, text and CSV: quality, size, time and memory of every method at every kept fraction, and
+//! of one method as one parameter varies.
 
 use std::fmt::Write as _;
 
@@ -7,95 +7,95 @@ use serde::{Deserialize, Serialize};
 
 use crate::files::csv::{known, table};
 
-/// Every point of a sweep, and what they share.
+/// Result of a sweep: all points and their common conditions.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct TradeOff {
     /// Program and version.
     pub tool: String,
-    /// Input, as given.
+    /// Path of the input, as given.
     pub path: String,
-    /// Hash over the input's bytes.
+    /// Hash of the bytes of the input.
     pub digest: String,
-    /// Gaussians of the input.
+    /// Number of Gaussians of the input.
     pub gaussians: usize,
-    /// Bytes of everything the model consists of.
+    /// Bytes of all files of the input.
     pub bytes: u64,
-    /// Threads at work.
+    /// Number of threads.
     pub threads: usize,
-    /// Pictures that every point is compared on: (frame, view) pairs, and where their cameras come from.
+    /// Number of (frame, view) pairs on which every point is compared with the original.
     pub pictures: usize,
-    /// File of the cameras, or the recipe of a virtual rig.
+    /// File of the cameras, or description of the virtual rig.
     pub cameras: String,
-    /// Times that every point was run.
+    /// Number of runs of every point.
     pub runs: usize,
-    /// By method, as listed in `--methods`, then by the fraction asked for, falling.
+    /// Points in the order of `--methods`, then by decreasing requested fraction.
     pub points: Vec<TradeOffPoint>,
-    /// Parameters that were turned.
+    /// Curves of the parameters that were varied.
     pub knobs: Vec<EffortCurve>,
-    /// Things a person should know.
+    /// Notes for the user.
     pub notes: Vec<String>,
 }
 
-/// One method at one size.
+/// Measurements of one method at one kept fraction.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct TradeOffPoint {
-    /// Name of the method, as `--methods` takes it.
+    /// Name of the method, as in `--methods`.
     pub method: String,
-    /// Kept fraction that was asked for; none: the method's own choice.
+    /// Requested fraction of the Gaussians to keep; `None`: chosen by the method.
     pub asked: Option<f64>,
-    /// Gaussians in the result.
+    /// Number of Gaussians of the result.
     pub count: usize,
-    /// Bytes of everything the result consists of.
+    /// Bytes of all files of the result.
     pub bytes: u64,
-    /// Mean PSNR against the original's own pictures, dB.
+    /// Mean PSNR against renders of the original, dB.
     pub psnr: f64,
-    /// Mean SSIM against them.
+    /// Mean SSIM against renders of the original.
     pub ssim: f64,
-    /// Mean temporal error against them; none if no view is seen twice.
+    /// Mean temporal error against renders of the original; `None` if no view occurs at two frames.
     pub temporal: Option<f64>,
-    /// Wall-clock time of compressing, from opening the input to the result on the disk: the median of all runs.
+    /// Wall-clock seconds of compression, from opening the input to the written result; median of all runs.
     pub seconds: f64,
-    /// Largest resident memory while compressing, of any run; none where the system does not tell.
+    /// Maximum resident memory during compression, over all runs; `None` if the system does not report it.
     pub peak_memory_bytes: Option<u64>,
 }
 
-/// One method at one size as one parameter is turned, all others as they are: what more time buys.
+/// Measurements of one method at one kept fraction for several values of one parameter: quality against time.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct EffortCurve {
-    /// Name of the parameter, as a recipe has it.
+    /// Name of the parameter in the recipe.
     pub parameter: String,
-    /// By value, rising.
+    /// Measurements by increasing value.
     pub settings: Vec<Setting>,
 }
 
-/// What a value of a [`EffortCurve`]'s parameter comes to.
+/// Measurements at one value of the parameter of an [`EffortCurve`].
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Setting {
-    /// The parameter's value.
+    /// Value of the parameter.
     pub value: u32,
-    /// Method, size and what was measured.
+    /// Method, kept fraction and measurements.
     #[serde(flatten)]
     pub point: TradeOffPoint,
 }
 
-/// A point's columns in a table.
+/// CSV columns of a point.
 const COLUMNS: [&str; 10] =
     ["method", "asked", "count", "fraction", "bytes", "psnr", "ssim", "temporal", "seconds", "peak_memory_bytes"];
 
 impl TradeOff {
-    /// As JSON, for programs.
+    /// Returns the sweep as indented JSON.
     pub fn json(&self) -> String {
         let mut text = serde_json::to_string_pretty(self).expect("plain data");
         text.push('\n');
         text
     }
 
-    /// One line per point under a line of names; a value that does not exist is empty.
+    /// Returns a CSV table with one row per point; a missing value is an empty field.
     pub fn csv(&self) -> String {
         table(&COLUMNS, self.points.iter().map(|point| self.row(point)))
     }
 
-    /// The same of every setting of every knob.
+    /// Returns a CSV table with one row per value of every varied parameter.
     pub fn knobs_csv(&self) -> String {
         let settings = self.knobs.iter().flat_map(|knob| knob.settings.iter().map(move |setting| (knob, setting)));
         let row = |(knob, setting): (&EffortCurve, &Setting)| {
@@ -104,7 +104,7 @@ impl TradeOff {
         table(&[&["parameter", "value"], &COLUMNS[..]].concat(), settings.map(row))
     }
 
-    /// Fields of [`COLUMNS`].
+    /// Returns the fields of [`COLUMNS`] of a point.
     fn row(&self, point: &TradeOffPoint) -> Vec<String> {
         vec![
             point.method.clone(),
@@ -120,12 +120,12 @@ impl TradeOff {
         ]
     }
 
-    /// A table for a person.
+    /// Returns a table for the terminal.
     pub fn text(&self) -> String {
         let mut out = String::new();
         let _ = writeln!(
             out,
-            "{}: {} Gaussians, compared on {} pictures: {}",
+            "{}: {} Gaussians, compared on {} views: {}",
             self.path, self.gaussians, self.pictures, self.cameras
         );
         let _ = writeln!(
@@ -151,7 +151,7 @@ impl TradeOff {
         out
     }
 
-    /// A point in the table.
+    /// Returns the table row of a point.
     fn line(&self, point: &TradeOffPoint) -> String {
         let temporal = point.temporal.map_or("-".to_owned(), |error| format!("{error:.5}"));
         let memory = point.peak_memory_bytes.map_or("-".to_owned(), |bytes| format!("{} MiB", bytes >> 20));
@@ -167,7 +167,7 @@ impl TradeOff {
         )
     }
 
-    /// Part of the Gaussians that a point keeps; 1 of none.
+    /// Returns the fraction of the Gaussians that a point keeps; 1 for an empty input.
     pub fn fraction(&self, point: &TradeOffPoint) -> f64 {
         if self.gaussians == 0 { 1.0 } else { point.count as f64 / self.gaussians as f64 }
     }
@@ -178,7 +178,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn csv_is_these_bytes() {
+    fn csv_matches_the_expected_text() {
         let point = TradeOffPoint {
             method: "paper".to_owned(),
             asked: Some(0.5),

@@ -45,7 +45,7 @@ pub struct RenderedAttributes {
 
 impl RenderedAttributes {
     /// Returns the attributes of row `row` of `state` after activation.
-    pub fn of_state(state: &Gaussians, row: usize) -> RenderedAttributes {
+    pub fn from_state(state: &Gaussians, row: usize) -> RenderedAttributes {
         RenderedAttributes {
             position: state.position.row::<3>(row).map(f64::from),
             scale: state.log_scale.row::<3>(row).map(|scale| f64::from(scale).exp()),

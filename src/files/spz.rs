@@ -103,7 +103,7 @@ pub fn write_spz(state: &Gaussians, path: &Path) -> Result<f64> {
 fn check_accuracy(state: &Gaussians, unit: f64) -> Result<f64> {
     let mut accuracy = Accuracy::new(&state.position);
     for row in 0..state.len() {
-        let wanted = RenderedAttributes::of_state(state, row);
+        let wanted = RenderedAttributes::from_state(state, row);
         let color = |dc: f32| color(((f64::from(color_byte(dc)) / 255.0 - 0.5) / 0.15) as f32);
         let found = RenderedAttributes {
             position: wanted.position.map(|x| f64::from(fixed(x, unit)) * unit),

@@ -59,7 +59,7 @@ mod tests {
             let mut journal = Journal::default();
             journal.leave_out("a", "b");
             journal.spare("c", "d", Saved::Stage { seconds: odd, reads: 2.0 });
-            journal.spare("e", "f", Saved::StatisticAccess { bytes: 1 << 50 });
+            journal.spare("e", "f", Saved::Values { bytes: 1 << 50 });
             journal.notes.push("several\nlines, 40.1 dB".to_owned());
             journal.field =
                 Some(FieldSummary { half: true, pictures: 3, rounding: odd, result: Some(odd), least: odd });

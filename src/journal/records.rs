@@ -57,7 +57,7 @@ pub enum Saved {
         reads: f64,
     },
     /// Values that did not change and were not read again.
-    StatisticAccess {
+    Values {
         /// Bytes of these values.
         bytes: u64,
     },
@@ -68,7 +68,7 @@ impl Saved {
     pub fn text(self) -> String {
         match self {
             Saved::Stage { seconds, reads } => format!("about {}, {reads:.2} full reads", duration(seconds)),
-            Saved::StatisticAccess { bytes } => format!("{} of values", ByteSize(bytes).display().si()),
+            Saved::Values { bytes } => format!("{} of values", ByteSize(bytes).display().si()),
         }
     }
 }

@@ -168,10 +168,10 @@ impl Workload {
             ("states", ready.min(limits.frames_together as u64) * self.state(columns)),
             ("readers", self.input.reader),
             ("held", self.held(limits, columns)),
-            ("pictures", pictures * (render::BYTES_PER_VISIBLE as u64 + sums) + sums),
+            ("views", pictures * (render::BYTES_PER_VISIBLE as u64 + sums) + sums),
         ];
         let buffers = pictures * (render::STRIP_BYTES as u64 + 12 * self.pixels);
-        (per_gaussian, vec![self.arriving(), ("pictures", buffers)])
+        (per_gaussian, vec![self.arriving(), ("views", buffers)])
     }
 
     /// Returns the memory of a list of `pictures` views.

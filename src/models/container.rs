@@ -102,7 +102,7 @@ fn columns(reader: &Reader) -> Result<Vec<ColumnInfo>> {
                 let tile = reader.tile_info(TileId { column: column as u32, gaussian_block, frame_block })?;
                 found.tiles += 1;
                 found.constant_tiles += usize::from(tile.constant);
-                found.raw_tiles += usize::from(tile.encoding == Encoding::StoredParams);
+                found.raw_tiles += usize::from(tile.encoding == Encoding::Raw);
                 if last_offset != Some(tile.offset) {
                     found.stored_bytes += tile.stored_bytes;
                 }

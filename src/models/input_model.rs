@@ -48,7 +48,7 @@ pub trait InputModel: Send + Sync {
     /// # Errors
     /// Fails if a file no longer exists.
     fn size(&self) -> Result<Size> {
-        Ok(Size::of_frames(self.bytes()?))
+        Ok(Size::from_frames(self.bytes()?))
     }
 
     /// Returns the bytes, by part, that [`InputModel::write`] wrote to `path` as `kind`. No other files may have been
@@ -58,7 +58,7 @@ pub trait InputModel: Send + Sync {
     /// Fails if a file no longer exists.
     fn size_written(&self, kind: OutputKind, path: &Path) -> Result<Size> {
         let _ = kind;
-        Ok(Size::of_frames(bytes_below(path)?))
+        Ok(Size::from_frames(bytes_below(path)?))
     }
 
     /// Returns the bytes of the files that frames are read from.

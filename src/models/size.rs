@@ -29,7 +29,7 @@ impl From<ArchiveSize> for Size {
 
 impl Size {
     /// Returns the size of a model that consists of `frames` bytes of frame states only.
-    pub fn of_frames(frames: u64) -> Size {
+    pub fn from_frames(frames: u64) -> Size {
         Size { frames, ..Size::default() }
     }
 
@@ -121,7 +121,7 @@ mod tests {
             "cloud 100 of 1000 (10.0%), field 2000 of 4000 (50.0%), rest 10 of 10 (100.0%)"
         );
         assert_eq!(
-            Size::of_frames(9).format_relative_to(&model),
+            Size::from_frames(9).format_relative_to(&model),
             "cloud none of 1000, field none of 4000, frames 9 of none, rest none of 10"
         );
     }
@@ -129,10 +129,10 @@ mod tests {
     #[test]
     fn only_larger_results_are_explained() {
         let model = Size { cloud: 1000, field: 4000, ..Size::default() };
-        assert_eq!(Size::of_frames(5000).why_larger_than(&model), None);
-        let why = Size::of_frames(5001).why_larger_than(&model).unwrap();
+        assert_eq!(Size::from_frames(5000).why_larger_than(&model), None);
+        let why = Size::from_frames(5001).why_larger_than(&model).unwrap();
         assert!(why.contains("5001 bytes instead of 5000") && why.contains("every frame"), "{why}");
-        let why = Size::of_frames(3).why_larger_than(&Size::of_frames(2)).unwrap();
+        let why = Size::from_frames(3).why_larger_than(&Size::from_frames(2)).unwrap();
         assert!(why.contains("fewer bytes"), "{why}");
     }
 }

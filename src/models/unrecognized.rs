@@ -7,28 +7,28 @@ use crate::error::{Error, ShowPath};
 use crate::files::names::shown_name;
 
 /// Files by which a folder of a layout is recognized, relative to it. `iteration_N` stands for any such folder.
-struct Layout {
+struct FolderLayout {
     name: &'static str,
     files: &'static [&'static str],
 }
 
 /// Layouts of folders, the more specific ones first.
-const LAYOUTS: [Layout; 6] = [
-    Layout {
+const LAYOUTS: [FolderLayout; 6] = [
+    FolderLayout {
         name: "4DGaussians model",
         files: &["cfg_args", "point_cloud/iteration_N/point_cloud.ply", "point_cloud/iteration_N/deformation.pth"],
     },
-    Layout {
+    FolderLayout {
         name: "Deformable-3D-Gaussians or SC-GS model",
         files: &["cfg_args", "point_cloud/iteration_N/point_cloud.ply", "deform/iteration_N/deform.pth"],
     },
-    Layout {
+    FolderLayout {
         name: "SpacetimeGaussians or 3D Gaussian Splatting model",
         files: &["point_cloud/iteration_N/point_cloud.ply"],
     },
-    Layout { name: "Dynamic3DGaussians model", files: &["params.npz"] },
-    Layout { name: "4D Gaussian Splatting model", files: &["chkpntN.pth"] },
-    Layout { name: "PLY frames", files: &["one .ply per frame, such as frame_00000.ply"] },
+    FolderLayout { name: "Dynamic3DGaussians model", files: &["params.npz"] },
+    FolderLayout { name: "4D Gaussian Splatting model", files: &["chkpntN.pth"] },
+    FolderLayout { name: "PLY frames", files: &["one .ply per frame, such as frame_00000.ply"] },
 ];
 
 /// Files that a data set for training has, and a model has not.
@@ -45,7 +45,7 @@ pub(super) fn unrecognized_folder(path: &Path) -> Error {
     };
     let expected = "a trained model or frames of one";
     let error = |found: String| Error::input(path, "", expected, found);
-    let mut closest: Option<(&Layout, Vec<&str>)> = None;
+    let mut closest: Option<(&FolderLayout, Vec<&str>)> = None;
     for layout in &LAYOUTS {
         let missing: Vec<&str> = layout.files.iter().copied().filter(|file| !has(path, file)).collect();
         let is_close = missing.len() < layout.files.len();
@@ -84,7 +84,7 @@ fn layouts() -> String {
     format!("inputs that can be read:\n    {}", lines.join("\n    "))
 }
 
-/// Returns whether `folder` holds `file`, a pattern of [`Layout::files`].
+/// Returns whether `folder` holds `file`, a pattern of [`FolderLayout::files`].
 fn has(folder: &Path, file: &str) -> bool {
     let Some((head, rest)) = file.split_once('/') else {
         return match file {

@@ -64,7 +64,7 @@ impl Packing {
     /// Returns the cache key of this encoding; the values are not included.
     pub fn key(&self) -> CacheKey {
         let column_key = |column| match self.column(column) {
-            Compression::StoredParams => (0, 0.0, 0),
+            Compression::Raw => (0, 0.0, 0),
             Compression::Zstd(level) => (1, 0.0, level),
             Compression::Bounded { max_error, level } => (2, max_error, level),
         };
@@ -290,7 +290,7 @@ fn uniform_presence(source: &dyn FrameSource, is_first: bool) -> Vec<BlockChange
 }
 
 /// Returns the Gaussians of block `block`, of `count` Gaussians.
-pub fn of_block(count: usize, block: usize) -> Range<usize> {
+pub fn gaussian_range(count: usize, block: usize) -> Range<usize> {
     let start = block * GAUSSIAN_BLOCK;
     start..count.min(start + GAUSSIAN_BLOCK)
 }
@@ -313,7 +313,7 @@ fn encode_frames(
         let tiles: Vec<Vec<Option<EncodedTile>>> = batch
             .par_iter()
             .map(|&block| {
-                let gaussians = of_block(info.count, block as usize);
+                let gaussians = gaussian_range(info.count, block as usize);
                 let count = gaussians.len();
                 let (columns, frames) = match presence[block as usize] {
                     BlockChange::New => (Attributes::all(), frames.clone()),
@@ -348,7 +348,7 @@ pub fn column_bytes(
 ) -> Result<Vec<usize>> {
     let count = source.info().count;
     let encode_tiles =
-        |&block: &usize| encode_block(source, of_block(count, block), frames.clone(), Attributes::all(), packing);
+        |&block: &usize| encode_block(source, gaussian_range(count, block), frames.clone(), Attributes::all(), packing);
     let mut bytes = vec![0; Attributes::all().iter().count()];
     for tiles in blocks.par_iter().map(encode_tiles).collect::<Result<Vec<_>>>()? {
         bytes.iter_mut().zip(tiles).for_each(|(bytes, tile)| *bytes += tile.map_or(0, |tile| tile.to_bytes().len()));

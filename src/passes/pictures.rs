@@ -70,7 +70,7 @@ impl Batch {
     }
 
     /// Returns the batch size for views that are kept until their batch ends: one frame, one view per thread.
-    pub fn of_frame(limits: &Limits) -> Batch {
+    pub fn one_frame(limits: &Limits) -> Batch {
         let pictures = rayon::current_num_threads().min(limits.pictures_together);
         Batch { frames: 1, pictures, held: limits.frames_held }
     }

@@ -175,7 +175,7 @@ pub(crate) mod tests {
     pub(crate) fn scene(folder: &std::path::Path) -> Scene {
         let made = demo_scene::Scene::new(1500, 6);
         let path = folder.join("scene.gseq");
-        write_container(&made, &path, gseq::Compression::StoredParams, Default::default(), |_| ()).unwrap();
+        write_container(&made, &path, gseq::Compression::Raw, Default::default(), |_| ()).unwrap();
         let input = Box::new(Container::open(&path).unwrap());
         let rig = made.rig();
         Scene::new(path, input, rig, Some(Split::Train)).unwrap()

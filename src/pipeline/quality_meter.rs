@@ -13,7 +13,7 @@ use crate::scene::photographs::Photographs;
 use crate::source::FrameSource;
 
 /// Images that renders of a model are compared with.
-pub(super) enum Comparison<'a> {
+pub(super) enum QualityReference<'a> {
     /// Renders of the original: targets, and the indices of the views among them.
     Original(&'a Targets, Vec<usize>),
     /// Photographs of the scene.
@@ -26,7 +26,7 @@ pub(super) struct QualityMeter<'a> {
     cameras: &'a [Camera],
     /// Views in order of frames; the flag tells whether a view is held back.
     pictures: Vec<(FrameView, bool)>,
-    comparison: Comparison<'a>,
+    comparison: QualityReference<'a>,
 }
 
 impl<'a> QualityMeter<'a> {
@@ -38,7 +38,7 @@ impl<'a> QualityMeter<'a> {
         scene: &'a Scene,
         cameras: &'a [Camera],
         pictures: Vec<(FrameView, bool)>,
-        comparison: Comparison<'a>,
+        comparison: QualityReference<'a>,
     ) -> Result<QualityMeter<'a>> {
         let held = pictures.iter().filter(|picture| picture.1).count();
         if held == 0 || held == pictures.len() {
@@ -61,15 +61,15 @@ impl<'a> QualityMeter<'a> {
         let places: Vec<usize> = (0..self.pictures.len()).filter(|&k| self.pictures[k].1 == held).collect();
         let pictures: Vec<FrameView> = places.iter().map(|&k| self.pictures[k].0).collect();
         let mut found = Vec::with_capacity(pictures.len());
-        show([RenderedSource::all(source)], self.cameras, &pictures, Batch::of_frame(&self.scene.limits), |views| {
+        show([RenderedSource::all(source)], self.cameras, &pictures, Batch::one_frame(&self.scene.limits), |views| {
             let first = found.len();
             let view_psnr = |(place, view): (usize, &ViewStates<'_, 1>)| {
                 match &self.comparison {
-                    Comparison::Photographs(photographs) => {
+                    QualityReference::Photographs(photographs) => {
                         let picture = view.render(0, background);
                         Ok(psnr(&picture, &photographs.read(view.picture, view.camera, background)?))
                     }
-                    Comparison::Original(targets, numbers) => {
+                    QualityReference::Original(targets, numbers) => {
                         // Rendered like the targets.
                         let picture = render(view.states[0], view.camera, background);
                         Ok(decibels(mean_square(&picture, &targets.values(numbers[places[first + place]])?)))

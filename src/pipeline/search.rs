@@ -6,7 +6,7 @@
 //! never used by the search and gives the reported figure (method.md, section 6.3).
 
 use super::planning::Planning;
-use super::quality_meter::{Comparison, QualityMeter};
+use super::quality_meter::{QualityMeter, QualityReference};
 use super::request::{Goal, Quality};
 use super::stage::{EstimateInput, Phase, RunState};
 use super::stages::bands::ShDegreeStage;
@@ -117,12 +117,7 @@ impl SearchStage {
                 + work.render_seconds(self.pictures as f64, work.count(), RENDER),
             per_gaussian: [
                 scored_memory(limits),
-                vec![
-                    ("states", whole),
-                    ("readers", reader),
-                    ("held", held),
-                    ("pictures", SHARED_VIEW_BYTES_PER_GAUSSIAN),
-                ],
+                vec![("states", whole), ("readers", reader), ("held", held), ("views", SHARED_VIEW_BYTES_PER_GAUSSIAN)],
             ]
             .concat(),
             fixed: vec![work.arriving()],
@@ -201,14 +196,19 @@ impl SearchStage {
                 journal.notes.push(format!("{} test views have photographs", views.len()));
                 let is_held = |k: usize| k % HELD_EVERY == HELD_EVERY - 1;
                 let views = views.into_iter().enumerate().map(|(k, view)| (view, is_held(k)));
-                QualityMeter::new(scene, &scene.rig.cameras, views.collect(), Comparison::Photographs(photographs))
+                QualityMeter::new(
+                    scene,
+                    &scene.rig.cameras,
+                    views.collect(),
+                    QualityReference::Photographs(photographs),
+                )
             }
             None => {
                 let mut numbers = [&parts.apart[..], &parts.held[..]].concat();
                 numbers.sort_unstable();
                 let view = |&k: &usize| (targets.pictures[k], parts.held.contains(&k));
                 let views = numbers.iter().map(view).collect();
-                QualityMeter::new(scene, &targets.cameras, views, Comparison::Original(targets, numbers))
+                QualityMeter::new(scene, &targets.cameras, views, QualityReference::Original(targets, numbers))
             }
         }
     }
@@ -246,7 +246,7 @@ impl SearchStage {
         let Quality::Loss { photographs, .. } = &self.searched else { return Ok(None) };
         let times = &scene.source().info().times;
         let views = pictures(&scene.rig, times, ViewSet::HeldOut)?;
-        let found = Photographs::of_some(photographs, &scene.rig, times, views)?;
+        let found = Photographs::find(photographs, &scene.rig, times, views)?;
         if found.0.len() < HELD_EVERY {
             let (folder, found) = (photographs.shown(), found.0.len());
             return Err(Error::usage(format!(

@@ -123,7 +123,7 @@ pub fn check_positions(state: &Gaussians, sh_degree: usize, steps: &Steps, point
     let mut accuracy = Accuracy::new(&state.position);
     let opacities = components(Attributes::OPACITY, sh_degree).start * count;
     for row in (0..count).filter(|row| points[opacities + row] > 0) {
-        let wanted = RenderedAttributes { color: [0.0; 3], ..RenderedAttributes::of_state(state, row) };
+        let wanted = RenderedAttributes { color: [0.0; 3], ..RenderedAttributes::from_state(state, row) };
         let position = [0, 1, 2].map(|axis| f64::from(points[axis * count + row]) * steps.position);
         accuracy.add(row, &wanted, &RenderedAttributes { position, ..wanted });
     }

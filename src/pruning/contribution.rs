@@ -51,7 +51,7 @@ pub fn visible_contribution(
     limits: Limits,
     events: &Events,
 ) -> Result<Contribution> {
-    let progress = events.task("visible", "pictures", pictures.len() as u64);
+    let progress = events.task("visible", "views", pictures.len() as u64);
     let mut running = RunningContribution::new(source.info().count, pixel_stride, limits);
     running.add(source, cameras, pictures, || progress.advance(1))?;
     Ok(running.sum())

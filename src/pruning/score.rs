@@ -341,7 +341,7 @@ impl Scored {
                 let why = format!("{} is the same in every frame", column.name());
                 let again = (info.times.len() - 1) as u64 * info.count as u64;
                 let bytes = again * state_bytes(info.sh_degree, column);
-                journal.spare(saved_reads(column), why, Saved::StatisticAccess { bytes });
+                journal.spare(saved_reads(column), why, Saved::Values { bytes });
             }
         }
         if info.sh_degree == 0 {

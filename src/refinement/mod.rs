@@ -162,14 +162,14 @@ impl RefineStage {
     pub fn need(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
         let whole = work.state(Attributes::all());
         let read = [("readers", work.input.reader), ("held", work.held(limits, Attributes::all()))];
-        let original = [("states", whole), ("pictures", SHARED_VIEW_BYTES_PER_GAUSSIAN)];
+        let original = [("states", whole), ("views", SHARED_VIEW_BYTES_PER_GAUSSIAN)];
         let original: Vec<MemoryPart> = read.into_iter().chain(original).collect();
         let left = [
             ("states", (6 + work.threads) * whole),
             ("jacobians", (3 + work.threads) * work.input.jacobian),
             ("descent", whole + optimizer::bytes_per_gaussian(self.columns, work.sh_degree.min(self.sh_degree)) as u64),
             ("result", work.input.reduced),
-            ("pictures", 2 * GRADIENT_BYTES_PER_VISIBLE as u64),
+            ("views", 2 * GRADIENT_BYTES_PER_VISIBLE as u64),
         ];
         // Peak memory is the maximum of three phases: rendering the original, optimizing the survivors, and optimizing
         // along time.
@@ -215,7 +215,7 @@ impl RefineStage {
             fixed: vec![
                 work.arriving(),
                 ("pairs", GRADIENT_STRIP_BYTES as u64),
-                ("pictures", (work.threads + 4) * 12 * work.pixels),
+                ("views", (work.threads + 4) * 12 * work.pixels),
                 ("similarity", self.loss.bytes_per_pixel(work.threads) * work.pixels),
             ],
         }

@@ -62,7 +62,7 @@ impl Targets {
         let (cameras, pictures) = choose_views(scene, max_views);
         let make = |some: Range<usize>, values: &mut SpillWriter| {
             let subject = [RenderedSource::all(scene.source())];
-            show(subject, &cameras, &pictures[some], Batch::of_frame(&scene.limits), |views| {
+            show(subject, &cameras, &pictures[some], Batch::one_frame(&scene.limits), |views| {
                 let picture = |view: &ViewStates<'_, 1>| narrow(&render(view.states[0], view.camera, scene.background));
                 let made: Vec<Vec<u16>> = views.par_iter().map(picture).collect();
                 made.iter().try_for_each(|picture| values.write(bytemuck::cast_slice(picture)))

@@ -96,7 +96,7 @@ fn interrupted_runs_resume_to_the_same_result() {
     let model = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/tiny_model");
     let long = folder.path().join("long.gseq");
     let demo = demo_scene::Scene::new(900, 16);
-    write_container(&demo, &long, gseq::Compression::StoredParams, Default::default(), |_| ()).unwrap();
+    write_container(&demo, &long, gseq::Compression::Raw, Default::default(), |_| ()).unwrap();
     let short = folder.path().join("scene.gseq");
     drop(scene(folder.path()));
     // States that are the stored parameters plus a delta, states from a deformation field, and time-varying deltas.
@@ -195,7 +195,7 @@ fn leaving_out_absent_gaussians_changes_no_result() {
         let (rig, info) = (demo.rig(), SequenceInfo { varying: Attributes::all(), ..demo.info().clone() });
         let path = folder.path().join("scene.gseq");
         let source = ShortLives(demo, info, logit);
-        write_container(&source, &path, gseq::Compression::StoredParams, Default::default(), |_| ()).unwrap();
+        write_container(&source, &path, gseq::Compression::Raw, Default::default(), |_| ()).unwrap();
         let input = Box::new(Container::open(&path).unwrap());
         let scene = Scene::new(path, input, rig, Some(Split::Train)).unwrap();
         let recipe = Recipe::preset("default").unwrap();
@@ -214,7 +214,7 @@ fn explicit_frames_improve_along_time_in_every_output() {
     let folder = tempfile::tempdir().unwrap();
     let demo = demo_scene::Scene::new(900, 16);
     let [packed, files] = ["scene.gseq", "frames"].map(|name| folder.path().join(name));
-    write_container(&demo, &packed, gseq::Compression::StoredParams, Default::default(), |_| ()).unwrap();
+    write_container(&demo, &packed, gseq::Compression::Raw, Default::default(), |_| ()).unwrap();
     std::fs::create_dir(&files).unwrap();
     write_sequence(&demo, OutputKind::PlySequence, &files, 1, &Events::IGNORED).unwrap();
     let read = |source: &dyn FrameSource| -> Vec<Gaussians> {

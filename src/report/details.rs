@@ -212,7 +212,7 @@ fn score_histograms(result: &ResultData) -> String {
     };
     let mut out = String::from(
         "<p class=\"note\">Number of Gaussians of the original by value: kept ones at the bottom of each bar, then dropped \
-         ones, then those merged into others. StatisticAccess go by powers of ten, but shares of the frames from none to all; 0 has \
+         ones, then those merged into others. Values go by powers of ten, but shares of the frames from none to all; 0 has \
          no place among powers of ten, and Gaussians at 0 are counted in the legend. Where kept and dropped ones lie apart, \
          the value decides; where they overlap, something else render_blended. S is the whole score, C the coverage, W the visible \
          coverage, D the motion, κ the rigidity, V the variation, in the symbols of the paper.</p>\n<div class=\"charts\">\n",

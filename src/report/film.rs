@@ -77,7 +77,7 @@ pub fn films(side: &ModelPair, shown: &[ShownImage]) -> Result<Vec<FilmPanel>> {
     let mut cameras = Vec::new();
     for (k, ShownImage { choice, factor, .. }) in shown.iter().enumerate() {
         let FrameView { view, camera, .. } = side.picture(choice.place);
-        let wanted = k == 0 || choice.why.iter().any(|why| why == "median picture");
+        let wanted = k == 0 || choice.why.iter().any(|why| why == "median render");
         if every < 2 || !wanted || cameras.contains(&camera) || films.len() == VIEWS {
             continue;
         }

@@ -139,7 +139,7 @@ fn table(curve: &PrecisionCurve) -> String {
     let names: String = errors.iter().map(|error| format!("<th>{}</th>", escape(error))).collect();
     let mut out = format!(
         "<details><summary>{}, against {}</summary>\n<div class=\"scroll\" tabindex=\"0\" role=\"region\" \
-         aria-label=\"StatisticAccess\"><table><tr><th>{}</th><th>s</th><th>from – to</th><th>processor s</th>\
+         aria-label=\"Values\"><table><tr><th>{}</th><th>s</th><th>from – to</th><th>processor s</th>\
          <th>MiB</th><th>dB</th>{names}</tr>\n",
         escape(&curve.name),
         escape(&curve.against),
@@ -171,7 +171,7 @@ fn table(curve: &PrecisionCurve) -> String {
         })
         .collect();
     said.extend(curve.enough.map(|enough| {
-        format!("from {} on it adds less than a tenth of the model's own error to pictures", figure(enough))
+        format!("from {} on it adds less than a tenth of the model's own error to renders", figure(enough))
     }));
     out += &list(&said);
     out + "</details>\n"

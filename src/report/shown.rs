@@ -60,10 +60,10 @@ pub fn choices(found: &Evaluation) -> Vec<Choice> {
     let of_view = lowest(&mut (0..pictures.len()).filter(|&i| Some(pictures[i].view) == view));
     let of_frame = lowest(&mut (0..pictures.len()).filter(|&i| Some(pictures[i].frame) == frame));
     let wanted = [
-        ("worst picture", by_psnr.first().copied()),
+        ("worst render", by_psnr.first().copied()),
         ("worst view", of_view),
         ("worst frame", of_frame),
-        ("median picture", by_psnr.get(by_psnr.len().saturating_sub(1) / 2).copied()),
+        ("median render", by_psnr.get(by_psnr.len().saturating_sub(1) / 2).copied()),
     ];
     let mut chosen: Vec<Choice> = Vec::new();
     for (why, place) in wanted {

@@ -47,7 +47,7 @@ impl Photographs {
     ///
     /// # Errors
     /// A folder that cannot be read; no photograph of any view; two views with the same photograph.
-    pub fn of_some(
+    pub fn find(
         folder: &Path,
         rig: &Rig,
         times: &[f64],

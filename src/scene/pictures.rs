@@ -143,11 +143,11 @@ pub fn need(work: &Workload, limits: &Limits, stage: &'static str, models: u64, 
             ("states", models * work.state(Attributes::all())),
             ("readers", models * work.input.reader),
             ("held", models * work.held(limits, Attributes::all())),
-            ("pictures", pictures * SHARED_VIEW_BYTES_PER_GAUSSIAN),
+            ("views", pictures * SHARED_VIEW_BYTES_PER_GAUSSIAN),
         ],
         fixed: vec![
             work.arriving(),
-            ("pictures", pictures * (render::STRIP_BYTES as u64 + pixel * work.pixels)),
+            ("views", pictures * (render::STRIP_BYTES as u64 + pixel * work.pixels)),
             Workload::listed(work.pictures as f64),
         ],
     }

@@ -235,7 +235,7 @@ fn ground_truth_is_compared_and_counted_where_it_exists() {
     assert_eq!((&some["ground_truth"]["pairs"], &some["ground_truth"]["of"]), (&left.into(), &of.into()));
     assert_eq!(some["psnr"], whole["psnr"], "the models are compared on all pictures");
     let text = workplace.done(&format!("{line} --csv scores.csv"));
-    assert!(text.contains(&format!("{left} of {of} pictures have a photograph in photos")), "{text}");
+    assert!(text.contains(&format!("{left} of {of} views have a photograph in photos")), "{text}");
     let csv = fs::read_to_string(workplace.path("scores.csv")).unwrap();
     let commas: Vec<usize> = csv.lines().map(|line| line.matches(',').count()).collect();
     assert!(commas.windows(2).all(|pair| pair[0] == pair[1]), "{csv}");

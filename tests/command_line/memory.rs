@@ -76,9 +76,7 @@ impl BlockReader for Block {
 /// Returns a folder with the scene as `packed.gseq` and `raw.gseq`, and its cameras.
 fn scene_workplace() -> Workplace {
     let workplace = Workplace::new();
-    for (name, compression) in
-        [("packed.gseq", gseq::Compression::Zstd(1)), ("raw.gseq", gseq::Compression::StoredParams)]
-    {
+    for (name, compression) in [("packed.gseq", gseq::Compression::Zstd(1)), ("raw.gseq", gseq::Compression::Raw)] {
         write_container(&ChangingScene::new(), &workplace.path(name), compression, Default::default(), |_| ()).unwrap();
     }
     let camera = r#"{"id": 0, "img_name": "a", "width": 96, "height": 64, "fx": 90, "fy": 90, "position": [0, -4, 0],

@@ -325,10 +325,10 @@ fn divided_stages_are_listed_with_their_units() {
     let cached_shards = list("--no-refine --ratio 0.7");
     let lines: Vec<&str> = cached_shards.lines().collect();
     assert_eq!(lines[0], "scan: 2 blocks of Gaussians");
-    assert!(lines[1].starts_with("visible: ") && lines[1].ends_with(" pictures"), "{cached_shards}");
+    assert!(lines[1].starts_with("visible: ") && lines[1].ends_with(" views"), "{cached_shards}");
     assert!(lines[2].starts_with("rounds-01: ") && lines.contains(&"pairs: pairs of neighbors"), "{cached_shards}");
     assert_eq!(list("--preset paper"), "scan: 2 blocks of Gaussians\npairs: pairs of neighbors\n");
-    assert!(list("").contains("targets: pictures"));
+    assert!(list("").contains("targets: views"));
     workplace.refused(2, "compress scene.gseq -o out.gseq --list-stages --cache work --shard 1/2", &["--shard"]);
 }
 

@@ -46,7 +46,7 @@ impl GeneratedScene {
         let path = folder.path().join("world.gseq");
         let mut held = HeldFrames::new(self.frames[0].len(), 0, Attributes::all(), Gaussians::zeros(0, 0));
         self.times.iter().zip(&self.frames).for_each(|(&time, frame)| held.push(time, frame.clone()));
-        write_container(&held, &path, gseq::Compression::StoredParams, BTreeMap::new(), |_| ()).unwrap();
+        write_container(&held, &path, gseq::Compression::Raw, BTreeMap::new(), |_| ()).unwrap();
         let shot =
             |view: usize| Shot { view: view as u32, camera: view as u32, time: None, split: Split::Train, image: None };
         let rig = Rig {

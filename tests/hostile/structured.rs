@@ -347,7 +347,7 @@ fn slow_165_mb_of_views_are_refused_within_memory() {
     let folder = Folder::new();
     write_transforms(&folder, 1_000_000);
     assert!(fs::metadata(folder.path("transforms.json")).unwrap().len() > 165_000_000);
-    dry_run(&folder, SMALL_MEMORY.0).refused(1, &["transforms.json", "1000000 pictures"]).within(SMALL_MEMORY.1);
+    dry_run(&folder, SMALL_MEMORY.0).refused(1, &["transforms.json", "1000000 images"]).within(SMALL_MEMORY.1);
 }
 
 #[test]

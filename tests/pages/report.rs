@@ -96,7 +96,7 @@ fn data_beside_the_page_are_those_of_evaluate_and_of_the_run() {
     let psnr = |picture: &Value| picture["loss"]["psnr"].as_f64().unwrap();
     let worst = found["pictures"].as_array().unwrap().iter().map(psnr).fold(f64::INFINITY, f64::min);
     assert_eq!(found["shown"][0]["psnr"].as_f64(), Some(worst));
-    assert!(found["shown"][0]["why"].as_array().unwrap().contains(&json!("worst picture")));
+    assert!(found["shown"][0]["why"].as_array().unwrap().contains(&json!("worst render")));
 }
 
 #[test]

@@ -17,7 +17,7 @@ fn decode(tile: &EncodedTile) -> Vec<u32> {
     let frames = if tile.constant { 1 } else { tile.frames as usize };
     let plane = tile.width as usize * tile.len as usize;
     let once: Vec<u32> = match tile.encoding {
-        Encoding::StoredParams => tile.bytes.as_chunks().0.iter().map(|bytes| u32::from_le_bytes(*bytes)).collect(),
+        Encoding::Raw => tile.bytes.as_chunks().0.iter().map(|bytes| u32::from_le_bytes(*bytes)).collect(),
         encoding => {
             let mut decoder = TileDecoder::default();
             let stored = StoredTile { bytes: &tile.bytes, encoding, frames, plane, max_error: tile.max_error };
@@ -82,7 +82,7 @@ proptest! {
     fn every_bit_pattern_survives_every_compression(
         (frames, len, values) in (1u32..6, 1u32..40)
             .prop_flat_map(|(t, n)| (Just(t), Just(n), prop::collection::vec(bits(), (t * n * 2) as usize))),
-        level in prop_oneof![Just(Compression::StoredParams), Just(Compression::Zstd(1)), Just(Compression::Zstd(-3))],
+        level in prop_oneof![Just(Compression::Raw), Just(Compression::Zstd(1)), Just(Compression::Zstd(-3))],
     ) {
         let floats: Vec<f32> = values.iter().map(|&b| f32::from_bits(b)).collect();
         let tile = encode_tile(&floats, frames, 2, len, level).unwrap();
@@ -101,10 +101,10 @@ fn a_straight_line_is_predicted_from_two_frames() {
 
 #[test]
 fn constant_tile_stores_one_frame_and_minus_zero_breaks_it() {
-    let still = encode_tile(&[0.0, 2.0, 0.0, 2.0], 2, 1, 2, Compression::StoredParams).unwrap();
+    let still = encode_tile(&[0.0, 2.0, 0.0, 2.0], 2, 1, 2, Compression::Raw).unwrap();
     assert!(still.is_constant());
     assert_eq!(still.stored_bytes(), 8);
-    let moved = encode_tile(&[0.0, 2.0, -0.0, 2.0], 2, 1, 2, Compression::StoredParams).unwrap();
+    let moved = encode_tile(&[0.0, 2.0, -0.0, 2.0], 2, 1, 2, Compression::Raw).unwrap();
     assert!(!moved.is_constant());
 }
 
@@ -139,8 +139,8 @@ fn decompressed_size_must_be_exact() {
 #[test]
 fn wrong_shapes_and_levels_are_refused() {
     for (frames, width, len) in [(0, 1, 0), (1, 1, 3), (u32::MAX, u32::MAX, u32::MAX)] {
-        assert!(encode_tile(&[1.0, 2.0], frames, width, len, Compression::StoredParams).is_err());
+        assert!(encode_tile(&[1.0, 2.0], frames, width, len, Compression::Raw).is_err());
     }
-    assert!(encode_tile(&[], 1, 1, 0, Compression::StoredParams).is_err());
+    assert!(encode_tile(&[], 1, 1, 0, Compression::Raw).is_err());
     assert!(encode_tile(&[1.0], 1, 1, 1, Compression::Zstd(99)).is_err());
 }

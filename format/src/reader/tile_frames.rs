@@ -71,7 +71,7 @@ impl Reader {
             None => None,
         };
         match (tile.encoding, mapped) {
-            (Encoding::StoredParams, mapped) => {
+            (Encoding::Raw, mapped) => {
                 let verified = match mapped {
                     Some(bytes) => self.verify_in_place(index, &tile, bytes)?,
                     None => self.verify_raw(index, &tile, &mut buffer.stored)?,
@@ -112,7 +112,7 @@ impl Reader {
         let plane = plane_len(&self.layout, &tile);
         assert!(out.len() == plane, "{} values for a frame of {tile:?}", out.len());
         match tile.encoding {
-            Encoding::StoredParams => {
+            Encoding::Raw => {
                 self.count_frame(frames, frame, 4 * plane);
                 let (offset, bytes) = (frame_offset(&tile, frame, plane), bytemuck::cast_slice_mut(&mut *out));
                 match frames.in_place {
@@ -136,7 +136,7 @@ impl Reader {
     pub fn frame<'a>(&'a self, frames: &mut TileFrames, frame: usize, buffer: &'a mut Vec<f32>) -> Result<&'a [f32]> {
         let (tile, stored) = self.loaded_frame(frames, frame);
         let plane = plane_len(&self.layout, &tile);
-        if tile.encoding == Encoding::StoredParams && frames.in_place && cfg!(target_endian = "little") {
+        if tile.encoding == Encoding::Raw && frames.in_place && cfg!(target_endian = "little") {
             let bytes = self.file.in_place(frame_offset(&tile, stored, plane), 4 * plane as u64)?;
             if let Ok(values) = bytemuck::try_cast_slice(bytes) {
                 self.count_frame(frames, stored, bytes.len());
@@ -215,7 +215,7 @@ impl TileFrames {
 
     /// Returns whether the loaded tile is raw and read in place, from the map.
     pub fn is_in_place(&self) -> bool {
-        self.in_place && self.tile.is_some_and(|tile| tile.encoding == Encoding::StoredParams)
+        self.in_place && self.tile.is_some_and(|tile| tile.encoding == Encoding::Raw)
     }
 }
 

@@ -14,8 +14,8 @@ use splatsieve::models::Link;
 /// Input of a command.
 #[derive(Debug, Args)]
 pub(in crate::cli) struct Input {
-    /// Trained model (folder or checkpoint of any supported trainer), folder of PLY frames, .ply, .splatv, .gsz or .gseq file, or -
-    /// for a frame stream on standard input. See docs/inputs.md
+    /// Trained model (folder or checkpoint of any supported trainer), folder of PLY frames, .ply, .splatv, .gsz or
+    /// .gseq file, or - for a frame stream on standard input. See docs/inputs.md
     pub(in crate::cli) input: PathBuf,
     /// Training iteration of a model folder [default: the largest]
     #[arg(long, value_name = "K", hide_short_help = true)]
@@ -25,12 +25,12 @@ pub(in crate::cli) struct Input {
     /// Accept a folder of PLY frames with missing frame numbers or with entries that are no files
     #[arg(long, hide_short_help = true)]
     pub(in crate::cli) allow_gaps: bool,
-    /// Tracking: find which Gaussian of one frame is which of the next, for frames that do not keep the order of their Gaussians
-    /// [default: auto]
+    /// Tracking: find which Gaussian of one frame is which of the next, for frames that do not keep the order of their
+    /// Gaussians [default: auto]
     #[arg(long, hide_short_help = true)]
     pub(in crate::cli) link: Option<LinkArg>,
-    /// Folder for temporary files of the run: received or tracked frames, and what does not fit into --memory [default: the
-    /// folder of the output, else the system's]
+    /// Folder for temporary files of the run: received or tracked frames, and what does not fit into --memory [default:
+    /// the folder of the output, else the system's]
     #[arg(long, value_name = "FOLDER", help_heading = MACHINE, hide_short_help = true)]
     pub(in crate::cli) scratch_dir: Option<PathBuf>,
     #[command(flatten)]
@@ -40,11 +40,12 @@ pub(in crate::cli) struct Input {
 /// Facts about the training that a model's files do not contain.
 #[derive(Debug, Args)]
 pub(in crate::cli) struct Trained {
-    /// Length of time_duration of a 4D Gaussian Splatting checkpoint, or its ends A,B [default: as in a YAML file beside it, else 10
-    /// if frame times exceed 1, else 1]
+    /// Length of time_duration of a 4D Gaussian Splatting checkpoint, or its ends A,B [default: as in a YAML file
+    /// beside it, else 10 if frame times exceed 1, else 1]
     #[arg(long, value_name = "L", hide_short_help = true, value_parser = parse_duration, allow_hyphen_values = true)]
     pub(in crate::cli) time_duration: Option<f64>,
-    /// Layout of the 4D rotations of a 4D Gaussian Splatting checkpoint: unflipped in code before 15 September 2024 [default: flipped]
+    /// Layout of the 4D rotations of a 4D Gaussian Splatting checkpoint: unflipped in code before 15 September 2024
+    /// [default: flipped]
     #[arg(long, value_name = "HOW", hide_short_help = true)]
     pub(in crate::cli) rot4d: Option<Rot4d>,
     /// Handling of Gaussians of a .splatv whose quaternion is zero; players do not draw them [default: drop]
@@ -91,6 +92,7 @@ pub(in crate::cli) struct Earlier {
 }
 
 impl Earlier {
+    /// Returns the policy as the library takes it.
     pub(in crate::cli) fn replace(&self) -> Replace {
         if self.overwrite { Replace::Existing } else { Replace::Never }
     }
@@ -101,7 +103,8 @@ impl Earlier {
 pub(in crate::cli) struct Memory {
     /// Memory limit, such as 512MiB or 4GB [default: a quarter of the machine's memory]
     ///
-    /// The limit does not change the result, except that refinement is reduced or left out if it needs more; the summary says so.
+    /// The limit does not change the result, except that refinement is reduced or left out if it needs more; the
+    /// summary says so.
     #[arg(long, help_heading = MACHINE, value_name = "SIZE", value_parser = parse_bytes)]
     pub(in crate::cli) memory: Option<u64>,
     /// Print the plan before the run: stages, memory, time, reads; and at the end what was used
@@ -112,9 +115,9 @@ pub(in crate::cli) struct Memory {
 /// Cameras of the scene.
 #[derive(Debug, Args)]
 pub(in crate::cli) struct CameraFile {
-    /// Cameras: the data folder, or transforms*.json, cameras.json, poses_bounds.npy, a COLMAP reconstruction, or dataset.json (NeRFies,
-    /// HyperNeRF). A folder gives all its splits, a file only itself [default: the data folder named in cfg_args; without it,
-    /// invented views]
+    /// Cameras: the data folder, or transforms*.json, cameras.json, poses_bounds.npy, a COLMAP reconstruction, or
+    /// dataset.json (NeRFies, HyperNeRF). A folder gives all its splits, a file only itself [default: the data folder
+    /// named in cfg_args; without it, invented views]
     #[arg(long, help_heading = CAMERAS, value_name = "PATH")]
     pub(in crate::cli) cameras: Option<PathBuf>,
     /// Number of evenly spaced frames, for a model that is continuous in time [default: the times of the cameras]
@@ -123,8 +126,9 @@ pub(in crate::cli) struct CameraFile {
     /// Width and height of the views where the cameras name none; views of COLMAP, NeRFies and LLFF are scaled to it
     #[arg(long, help_heading = CAMERAS, value_name = "WxH", value_parser = parse_size)]
     pub(in crate::cli) resolution: Option<(u32, u32)>,
-    /// Times of images that have none (COLMAP, cameras.json): `names`, the numbers in their names; `none`, every camera sees every
-    /// frame; or a CSV file of name,time [default: names for COLMAP images with numbers and an input in motion, else none]
+    /// Times of images that have none (COLMAP, cameras.json): `names`, the numbers in their names; `none`, every camera
+    /// sees every frame; or a CSV file of name,time [default: names for COLMAP images with numbers and an input in
+    /// motion, else none]
     #[arg(long, help_heading = CAMERAS, hide_short_help = true, value_name = "names|none|FILE", value_parser = parse_times)]
     pub(in crate::cli) times: Option<Times>,
 }
@@ -139,7 +143,7 @@ pub(in crate::cli) struct Cameras {
     pub(in crate::cli) split: Option<SplitArg>,
 }
 
-/// When frames are tracked.
+/// Condition under which frames are tracked.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub(in crate::cli) enum LinkArg {
     /// Only where the number of Gaussians changes or their order is not the same

@@ -9,7 +9,7 @@ use super::{Background, CameraFile, Earlier, Input, RecipeFlags};
 use splatsieve::diagnostics::precision::Knob;
 use splatsieve::evaluation::method::Method;
 
-/// `sweep`
+/// Arguments of `sweep`.
 #[derive(Debug, Args)]
 pub(in crate::cli) struct Sweep {
     #[command(flatten)]
@@ -17,15 +17,16 @@ pub(in crate::cli) struct Sweep {
     #[command(flatten)]
     pub(in crate::cli) cameras: CameraFile,
     /// Methods to compare: `default` and `paper`, the presets; `no-refine`, the first without refining; `paper-prune`,
-    /// `paper-merge`, the paper's ablations; prunings by `visible` contribution, `projected` coverage, `opacity` or `scale` alone, and at `random`
+    /// `paper-merge`, the paper's ablations; prunings by `visible` contribution, `projected` coverage, `opacity` or
+    /// `scale` alone, and at `random`
     #[arg(long, value_name = "METHODS", value_delimiter = ',', default_values_t = Method::ALL.map(Method::name).map(str::to_owned),
           value_parser = clap::builder::PossibleValuesParser::new(Method::ALL.map(Method::name)))]
     pub(in crate::cli) methods: Vec<String>,
     /// Fractions of the Gaussians to keep, such as 0.5,20%,10x
     #[arg(long, value_name = "FRACTIONS", value_delimiter = ',', default_value = "0.8,0.6,0.4,0.2,0.1", value_parser = parse_ratio)]
     pub(in crate::cli) fractions: Vec<f64>,
-    /// Also run `default` with these numbers of refinement steps, for error against run time; 0 leaves out refinement. The steps
-    /// before prune steps change in proportion
+    /// Also run `default` with these numbers of refinement steps, for error against run time; 0 leaves out refinement.
+    /// The steps before prune steps change in proportion
     #[arg(long, value_name = "STEPS", value_delimiter = ',', value_parser = clap::value_parser!(u32).range(..=1_000_000))]
     pub(in crate::cli) steps: Vec<u32>,
     /// Fraction of the Gaussians to keep with --steps
@@ -49,16 +50,16 @@ pub(in crate::cli) struct Sweep {
     pub(in crate::cli) json: bool,
 }
 
-/// `precision`
+/// Arguments of `precision`.
 #[derive(Debug, Args)]
 pub(in crate::cli) struct PrecisionArgs {
     #[command(flatten)]
     pub(in crate::cli) input: Input,
     #[command(flatten)]
     pub(in crate::cli) cameras: CameraFile,
-    /// Settings to vary: views and strides of the first scoring pass (`look`); views and steps of pruning `rounds`; bits of
-    /// `percentiles`; f32 and f64 `sums`; radius and passes of `merging`; steps and views of `refining`; threads and memory of the
-    /// `machine` [default: all; long inputs without the last three, which take whole runs]
+    /// Settings to vary: views and strides of the first scoring pass (`look`); views and steps of pruning `rounds`;
+    /// bits of `percentiles`; f32 and f64 `sums`; radius and passes of `merging`; steps and views of `refining`;
+    /// threads and memory of the `machine` [default: all; long inputs without the last three, which take whole runs]
     #[arg(long, value_name = "KNOBS", value_delimiter = ',',
           value_parser = clap::builder::PossibleValuesParser::new(Knob::ALL.map(Knob::name)))]
     pub(in crate::cli) knobs: Vec<String>,

@@ -5,7 +5,7 @@ use splatsieve::files::cameras::Times;
 
 use crate::cli::recipe_flags::numbers;
 
-/// Parses a length, or the two ends of a time span.
+/// Parses a length of time, or start and end of a time span, and returns the length.
 pub(super) fn parse_duration(text: &str) -> Result<f64, String> {
     let numbers: Result<Vec<f64>, _> = text.split(',').map(|part| part.trim().parse::<f64>()).collect();
     let length = match numbers.as_deref() {
@@ -47,12 +47,12 @@ pub(super) fn parse_ratio(text: &str) -> Result<f64, String> {
     }
 }
 
-/// Parses the source of image times.
+/// Parses the source of image times: `names`, `none` or the path of a table.
 pub(super) fn parse_times(text: &str) -> Result<Times, String> {
     Ok(Times::named(text))
 }
 
-/// Parses a number of bytes with an optional unit.
+/// Parses a number of bytes above 0, with an optional unit.
 pub(super) fn parse_bytes(text: &str) -> Result<u64, String> {
     match text.parse::<bytesize::ByteSize>() {
         Ok(bytes) if bytes.as_u64() > 0 => Ok(bytes.as_u64()),
@@ -69,17 +69,17 @@ pub(super) fn parse_decibels(text: &str) -> Result<f64, String> {
     }
 }
 
-/// Parses red, green and blue.
+/// Parses a color: red, green and blue, separated by commas.
 pub(super) fn parse_color(text: &str) -> Result<[f32; 3], String> {
     let channels: Vec<f32> = numbers(text)?;
     channels.try_into().map_err(|c: Vec<f32>| format!("expected three numbers, found {}", c.len()))
 }
 
-/// Parses the low and the high corner of a box.
+/// Parses a box: the minimum corner, then the maximum corner, as six numbers.
 pub(super) fn parse_box(text: &str) -> Result<[f64; 6], String> {
     let corners: [f64; 6] =
         numbers(text)?.try_into().map_err(|n: Vec<f64>| format!("expected six numbers, found {}", n.len()))?;
-    // A NaN compares as neither less nor equal, and is refused.
+    // NaN compares as neither less nor equal, so it is rejected.
     let in_order = |axis: usize| corners[axis].partial_cmp(&corners[axis + 3]).is_some_and(|order| order.is_le());
     match (0..3).find(|&axis| !in_order(axis)) {
         Some(axis) => Err(format!("axis {axis}: {} is not below {}", corners[axis], corners[axis + 3])),

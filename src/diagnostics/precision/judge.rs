@@ -88,7 +88,7 @@ fn render_views(
     mut take: impl FnMut(Image),
 ) -> Result<()> {
     let cameras: &[Camera] = &scene.schedule.cameras;
-    show([subject], cameras, pictures, Batch::of_frame(&scene.limits), |views| {
+    show([subject], cameras, pictures, Batch::one_frame(&scene.limits), |views| {
         let images: Vec<Image> =
             views.par_iter().map(|view| render(view.states[0], view.camera, scene.background)).collect();
         images.into_iter().for_each(&mut take);

@@ -17,7 +17,7 @@ const BACKGROUND: [f32; 3] = [0.1, 0.9, 0.4];
 /// Compares with α·c + (1 − α)·background, α = o·exp(−r²/2(f²s²/z² + 0.3)). Values of 1 in f32 are off by 6e-8, an
 /// exponential by a little more.
 pub(super) fn one_gaussian() -> Case {
-    Case::new("one Gaussian", "its picture: closed form (of white)", 3e-7, || {
+    Case::new("one Gaussian", "its render: closed form (of white)", 3e-7, || {
         let (size, depth, scale, opacity) = (48u32, 2.0f64, 0.08f64, 0.7f64);
         let image = render(&single(depth as f32, scale as f32, opacity as f32), &plain_camera(size), [0.25; 3]);
         let variance = (50.0 * scale / depth).powi(2) + 0.3;
@@ -38,7 +38,7 @@ pub(super) fn one_gaussian() -> Case {
 /// Compares with sums in f64, pixel by pixel; a pixel adds some dozen values in f32. Pixels with a decision within 1e-4
 /// of a threshold, which are few, are skipped, because f32 may decide differently.
 pub(super) fn many_gaussians() -> Case {
-    Case::new("many Gaussians", "their picture: f64 (of white)", 2e-6, || {
+    Case::new("many Gaussians", "their render: f64 (of white)", 2e-6, || {
         let (scene, camera) = (scene(1, 300, 3), camera(67, 45));
         let expected = picture(&scene, &camera, BACKGROUND, 1);
         let got = render(&scene, &camera, BACKGROUND);
@@ -71,7 +71,7 @@ pub(super) fn weights() -> Case {
 /// Compares with Σ‖render − render without the Gaussian‖², both in f64; the color behind a Gaussian results from a
 /// difference in f32.
 pub(super) fn removal() -> Case {
-    Case::new("removal errors", "pictures without one: f64 (px)", 5e-6, || {
+    Case::new("removal errors", "renders without one: f64 (px)", 5e-6, || {
         let (scene, camera) = undoubtful_scene();
         let mut found = RemovalError::new(scene.len(), 0.0);
         Renderer::new().removal_error(&scene, &camera, BACKGROUND, &mut found);

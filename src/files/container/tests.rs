@@ -105,7 +105,7 @@ fn blocks(scattered: &[u32]) -> [Ids<'_>; 5] {
 fn frames_are_independent_of_order_and_of_held_frames() {
     let source = EncodingSource::new();
     let scattered = [COUNT as u32 - 1, 5, 6, 7, 2000, 4, 1024, 1023];
-    for compression in [Compression::Zstd(1), Compression::StoredParams] {
+    for compression in [Compression::Zstd(1), Compression::Raw] {
         let (_folder, container) = source.pack(compression);
         for ids in blocks(&scattered) {
             for held in [1, 3, FRAME_BLOCK, usize::MAX] {
@@ -140,7 +140,7 @@ fn a_reader_keeps_no_more_than_allowed() {
                 let values = |kept: &KeptColumn| match kept {
                     KeptColumn::Nothing => 0,
                     KeptColumn::Tile(_, frames) => frames.memory() / 4,
-                    KeptColumn::StatisticAccess(kept) => kept.values.capacity(),
+                    KeptColumn::Values(kept) => kept.values.capacity(),
                 };
                 let kept: usize = reader.kept.iter().map(values).sum();
                 let frames = match held {
@@ -190,7 +190,7 @@ fn scan(source: &EncodingSource, container: &Container) {
 #[test]
 fn a_scan_reads_each_stored_byte_once() {
     let source = EncodingSource::new();
-    for compression in [Compression::Zstd(1), Compression::StoredParams] {
+    for compression in [Compression::Zstd(1), Compression::Raw] {
         let (_folder, container) = source.pack(compression);
         assert_eq!(container.reads(), Reads::default());
         let (tiles, bytes) = all_tiles(&container);
@@ -208,7 +208,7 @@ fn each_tile_is_read_once_for_all_planned_frames() {
     let source = EncodingSource::new();
     let scattered = [COUNT as u32 - 1, 5, 6, 7, 2000, 4, 1024, 1023];
     let wanted = [0, 3, 9, 30, 31, 33, 64, 65, 68];
-    for compression in [Compression::Zstd(1), Compression::StoredParams] {
+    for compression in [Compression::Zstd(1), Compression::Raw] {
         for ids in blocks(&scattered) {
             let blocks: std::collections::BTreeSet<usize> = ids.iter().map(|id| id / GAUSSIAN_BLOCK).collect();
             // The three frame blocks have 5, 1 and 3 of these frames. With at most 2 frames decoded together they are
@@ -237,7 +237,7 @@ fn each_tile_is_read_once_for_all_planned_frames() {
 fn held_tiles_are_read_once_and_have_the_same_values() {
     let source = EncodingSource::new();
     let scattered = [COUNT as u32 - 1, 5, 6, 7, 2000, 4, 1024, 1023];
-    for compression in [Compression::Zstd(1), Compression::StoredParams] {
+    for compression in [Compression::Zstd(1), Compression::Raw] {
         let whole = source.pack(compression).1.decoded_bytes();
         for capacity in [0, whole / 3, whole] {
             let (_folder, container) = source.pack(compression);

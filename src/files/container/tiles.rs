@@ -27,7 +27,7 @@ pub(super) enum KeptColumn {
     Nothing,
     /// Frame block, and the one tile that holds exactly the reader's Gaussians: decompressed, or raw in the file.
     Tile(u32, TileFrames),
-    StatisticAccess(FrameValues),
+    Values(FrameValues),
 }
 
 /// Values at some frames of a frame block.
@@ -127,7 +127,7 @@ impl<'a> TileReader<'a> {
                 let within = frame % self.source.reader.layout().frame_block as usize;
                 self.source.reader.read_frame(tile, within, out)?;
             }
-            KeptColumn::StatisticAccess(kept) => {
+            KeptColumn::Values(kept) => {
                 let at = kept.place(frame).unwrap_or_default() * out.len();
                 out.copy_from_slice(&kept.values[at..][..out.len()]);
             }
@@ -145,7 +145,7 @@ impl<'a> TileReader<'a> {
         }
         match &self.kept[index] {
             KeptColumn::Tile(of, _) if *of == frame_block => return Ok(true),
-            KeptColumn::StatisticAccess(values) if values.place(frame).is_some() => return Ok(true),
+            KeptColumn::Values(values) if values.place(frame).is_some() => return Ok(true),
             _ => (),
         }
         let (column, place) = self.source.places[index];
@@ -161,7 +161,7 @@ impl<'a> TileReader<'a> {
         }
         if self.whole {
             let at = TileId { column: place, gaussian_block: self.runs[0].gaussian_block, frame_block };
-            let raw = reader.tile_info(at)?.encoding == Encoding::StoredParams;
+            let raw = reader.tile_info(at)?.encoding == Encoding::Raw;
             let all = self.plan.held() >= block.len();
             // A decompressed tile is as large as all of its frames.
             if raw || all && 2 * frames.len() > block.len() {
@@ -184,7 +184,7 @@ impl<'a> TileReader<'a> {
             return Ok(false);
         }
         let mut kept = match std::mem::replace(&mut self.kept[index], KeptColumn::Nothing) {
-            KeptColumn::StatisticAccess(kept) => kept,
+            KeptColumn::Values(kept) => kept,
             _ => FrameValues::default(),
         };
         frames.truncate(self.plan.held());
@@ -197,7 +197,7 @@ impl<'a> TileReader<'a> {
         if constant {
             frames.clear();
         }
-        self.kept[index] = KeptColumn::StatisticAccess(FrameValues { block, frames, values: kept.values });
+        self.kept[index] = KeptColumn::Values(FrameValues { block, frames, values: kept.values });
         Ok(true)
     }
 

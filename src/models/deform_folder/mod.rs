@@ -214,7 +214,7 @@ impl<L: NetworkMotionModel + 'static> InputModel for DeformFolder<L> {
     fn size_written(&self, kind: OutputKind, path: &Path) -> Result<Size> {
         match kind {
             OutputKind::Model => size_of(&Paths::new(path, self.paths.iteration)),
-            _ => Ok(Size::of_frames(bytes_below(path)?)),
+            _ => Ok(Size::from_frames(bytes_below(path)?)),
         }
     }
 

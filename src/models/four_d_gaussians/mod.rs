@@ -73,7 +73,7 @@ impl InputModel for ModelFolder {
             }
             OutputKind::Ply => Ok(Size { cloud: bytes_read_for([path])?, ..Size::default() }),
             // Archives and `.splatv` are written elsewhere.
-            _ => Ok(Size::of_frames(bytes_below(path)?)),
+            _ => Ok(Size::from_frames(bytes_below(path)?)),
         }
     }
 

@@ -167,7 +167,7 @@ impl<L: ProxyRule + 'static> InputModel for CheckpointModel<L> {
                 let cloud = bytes_read_for([&*path.join(self.relative_path())])?;
                 Ok(Size { cloud, rest: bytes_below(path)?.saturating_sub(cloud), ..Size::default() })
             }
-            _ => Ok(Size::of_frames(bytes_below(path)?)),
+            _ => Ok(Size::from_frames(bytes_below(path)?)),
         }
     }
 

@@ -22,7 +22,7 @@ use crate::fit::MIN_VISIBLE_OPACITY;
 use crate::model::{Attributes, Gaussians, opacity};
 use crate::models::InputModel;
 use crate::models::trajectories::state_bytes;
-use crate::outputs::container::{GAUSSIAN_BLOCK, of_block};
+use crate::outputs::container::{GAUSSIAN_BLOCK, gaussian_range};
 use crate::source::{FrameSource, Ids, ReadPlan};
 
 /// PLY files of frames that are being received, and their times.
@@ -149,7 +149,7 @@ impl LinkedFrames {
 /// Returns the ranges of Gaussians of the blocks of `source`, for parallel reading.
 fn blocks(source: &dyn FrameSource) -> impl IndexedParallelIterator<Item = Range<usize>> {
     let count = source.info().count;
-    (0..count.div_ceil(GAUSSIAN_BLOCK)).into_par_iter().map(move |block| of_block(count, block))
+    (0..count.div_ceil(GAUSSIAN_BLOCK)).into_par_iter().map(move |block| gaussian_range(count, block))
 }
 
 /// Returns the rows of `state` that may be visible: with an opacity of at least [`MIN_VISIBLE_OPACITY`].

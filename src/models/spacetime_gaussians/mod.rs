@@ -267,7 +267,7 @@ impl InputModel for SpacetimeGaussians {
                 Ok(Size { cloud, rest, ..Size::default() })
             }),
             OutputKind::Ply | OutputKind::Splatv => Ok(Size { cloud: bytes_read_for([path])?, ..Size::default() }),
-            _ => Ok(Size::of_frames(bytes_below(path)?)),
+            _ => Ok(Size::from_frames(bytes_below(path)?)),
         }
     }
 

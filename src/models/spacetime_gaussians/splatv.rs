@@ -170,7 +170,7 @@ impl InputModel for SplatvModel {
     fn size_written(&self, kind: OutputKind, path: &Path) -> Result<Size> {
         match kind {
             OutputKind::Splatv => Ok(Size { cloud: bytes_read_for([path])?, ..Size::default() }),
-            _ => Ok(Size::of_frames(bytes_below(path)?)),
+            _ => Ok(Size::from_frames(bytes_below(path)?)),
         }
     }
 

@@ -122,11 +122,11 @@ impl ArchiveStage {
                 ("states", whole),
                 ("readers", work.input.reader),
                 ("held", work.held(limits, Attributes::all())),
-                ("pictures", SHARED_VIEW_BYTES_PER_GAUSSIAN),
+                ("views", SHARED_VIEW_BYTES_PER_GAUSSIAN),
                 ("contents", 4 * whole),
             ],
             fixed: vec![
-                ("pictures", BYTES_PER_PIXEL * (2 * count + work.threads) * work.pixels),
+                ("views", BYTES_PER_PIXEL * (2 * count + work.threads) * work.pixels),
                 ("strips", work.threads * render::STRIP_BYTES as u64),
                 ("fields", 4 * work.input.fixed),
                 // Archives of frames also encode a few blocks.

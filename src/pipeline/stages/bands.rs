@@ -99,7 +99,7 @@ impl ShDegreeStage {
             ("result", bytes_of_survivors(left, work.input.reduced)),
             ("readers", reader + bytes_of_survivors(left, reader)),
             ("held", held + bytes_of_survivors(left, held)),
-            ("pictures", SHARED_VIEW_BYTES_PER_GAUSSIAN),
+            ("views", SHARED_VIEW_BYTES_PER_GAUSSIAN),
         ];
         let pictures = if work.sh_degree > 0 { (COMPARED_VIEWS as u64).min(work.pictures) } else { 0 };
         ResourceEstimate {
@@ -109,7 +109,7 @@ impl ShDegreeStage {
                 + work.render_seconds(2.0 * pictures as f64, left * work.count(), RENDER),
             reads: 2.0 * work.scattered_reads(pictures, limits),
             per_gaussian: [scored_memory(limits), per_gaussian].concat(),
-            fixed: vec![work.arriving(), ("pictures", render::STRIP_BYTES as u64 + 36 * work.pixels)],
+            fixed: vec![work.arriving(), ("views", render::STRIP_BYTES as u64 + 36 * work.pixels)],
         }
     }
 
@@ -164,10 +164,10 @@ fn quality_without_degrees(
     degree: usize,
     pictures: &[FrameView],
 ) -> Result<[f64; 2]> {
-    let progress = scene.events.task(NAME, "pictures", pictures.len() as u64);
+    let progress = scene.events.task(NAME, "views", pictures.len() as u64);
     let mut sums = [0.0; 2];
     let subjects = [RenderedSource::all(scene.source()), RenderedSource::all(result)];
-    show(subjects, &scene.schedule.cameras, pictures, Batch::of_frame(&scene.limits), |views| {
+    show(subjects, &scene.schedule.cameras, pictures, Batch::one_frame(&scene.limits), |views| {
         for view in views {
             let picture = |state: &Gaussians| render(state, view.camera, scene.background);
             let [original, whole] = view.states.map(picture);

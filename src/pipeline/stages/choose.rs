@@ -77,7 +77,7 @@ impl Choose {
             ("result", bytes_of_survivors(left, work.input.reduced)),
             ("readers", reader + bytes_of_survivors(merging, reader)),
             ("held", held + bytes_of_survivors(merging, held)),
-            ("pictures", SHARED_VIEW_BYTES_PER_GAUSSIAN),
+            ("views", SHARED_VIEW_BYTES_PER_GAUSSIAN),
         ];
         let together = VIEWS_PER_BATCH.min(limits.pictures_together) as u64;
         let pictures = render::STRIP_BYTES as u64 + 12 * work.pixels * (1 + together);
@@ -90,7 +90,7 @@ impl Choose {
             seconds: work.reading(work.count(), frames as f64) + made,
             reads: work.reads(frames, limits) + work.scattered_reads(frames, limits),
             per_gaussian: [scored_memory(limits), per_gaussian].concat(),
-            fixed: vec![work.arriving(), ("pictures", pictures)],
+            fixed: vec![work.arriving(), ("views", pictures)],
         }
     }
 
@@ -136,10 +136,10 @@ impl Choose {
 /// Returns the mean PSNR over `pictures` of the Gaussians `pruned` and of `merged`, each against the original, dB.
 fn mean_psnr(scene: &Scene, pruned: &[u32], merged: &CompressedModel, pictures: &[FrameView]) -> Result<[f64; 2]> {
     let result = scene.input.reduced(merged)?;
-    let progress = scene.events.task(NAME, "pictures", pictures.len() as u64);
+    let progress = scene.events.task(NAME, "views", pictures.len() as u64);
     let mut sums = [0.0; 2];
     let pictures_together = VIEWS_PER_BATCH.min(scene.limits.pictures_together);
-    let batch = Batch { pictures: pictures_together, ..Batch::of_frame(&scene.limits) };
+    let batch = Batch { pictures: pictures_together, ..Batch::one_frame(&scene.limits) };
     let subjects = [RenderedSource::all(scene.source()), RenderedSource::all(&*result)];
     show(subjects, &scene.schedule.cameras, pictures, batch, |views| {
         let picture = |subject: usize, view: &ViewStates<'_, 2>| view.render(subject, scene.background);

@@ -74,7 +74,7 @@ impl FieldPrecisionStage {
             ("states", whole + bytes_of_survivors(left, whole)),
             ("result", bytes_of_survivors(left, 2 * work.input.reduced)),
             ("readers", work.input.reader + bytes_of_survivors(left, work.input.reader)),
-            ("pictures", SHARED_VIEW_BYTES_PER_GAUSSIAN),
+            ("views", SHARED_VIEW_BYTES_PER_GAUSSIAN),
         ];
         let pictures = (COMPARED_VIEWS as u64).min(work.pictures);
         ResourceEstimate {
@@ -87,7 +87,7 @@ impl FieldPrecisionStage {
             fixed: vec![
                 work.arriving(),
                 ("field", work.input.fixed),
-                ("pictures", render::STRIP_BYTES as u64 + 24 * work.pixels),
+                ("views", render::STRIP_BYTES as u64 + 24 * work.pixels),
             ],
         }
     }
@@ -135,10 +135,10 @@ pub(crate) fn least(result: f64, margin: f64) -> f64 {
 
 /// Returns the mean PSNR between renders of two sources over `pictures`, dB.
 fn closeness(scene: &Scene, [a, b]: [&dyn FrameSource; 2], pictures: &[FrameView]) -> Result<f64> {
-    let progress = scene.events.task(NAME, "pictures", pictures.len() as u64);
+    let progress = scene.events.task(NAME, "views", pictures.len() as u64);
     let mut sum = 0.0;
     let subjects = [RenderedSource::all(a), RenderedSource::all(b)];
-    show(subjects, &scene.schedule.cameras, pictures, Batch::of_frame(&scene.limits), |views| {
+    show(subjects, &scene.schedule.cameras, pictures, Batch::one_frame(&scene.limits), |views| {
         for view in views {
             let [a, b] = view.states.map(|state| render(state, view.camera, scene.background));
             sum += psnr(&a, &b);

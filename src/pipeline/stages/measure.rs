@@ -136,7 +136,7 @@ impl Stage for Measure {
                 0 => scene.schedule.pairs(),
                 most => most.min(scene.schedule.pairs()),
             };
-            units.push(format!("{}: {most} pictures", visible::NAME));
+            units.push(format!("{}: {most} views", visible::NAME));
         }
         units
     }

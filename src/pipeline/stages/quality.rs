@@ -151,7 +151,7 @@ fn mean_scores(scene: &Scene, result: &dyn FrameSource, views: &[FrameView]) -> 
     let progress = scene.events.task(NAME, "views", views.len() as u64);
     let mut scores: Vec<(f64, f64)> = Vec::with_capacity(views.len());
     let subjects = [scene.source(), result].map(RenderedSource::all);
-    show(subjects, &scene.rig.cameras, views, Batch::of_frame(&scene.limits), |batch| {
+    show(subjects, &scene.rig.cameras, views, Batch::one_frame(&scene.limits), |batch| {
         let score = |view: &ViewStates<'_, 2>| {
             let [original, compressed] = [0, 1].map(|subject| view.render(subject, scene.background));
             progress.advance(1);
@@ -171,7 +171,7 @@ pub(crate) fn render_times(scene: &Scene, result: &dyn FrameSource, views: &[Fra
     let views = spread_views(views.to_vec(), TIMED_VIEWS);
     let mut times = [Vec::new(), Vec::new()];
     let subjects = [scene.source(), result].map(RenderedSource::all);
-    show(subjects, &scene.rig.cameras, &views, Batch::of_frame(&scene.limits), |batch| {
+    show(subjects, &scene.rig.cameras, &views, Batch::one_frame(&scene.limits), |batch| {
         for view in batch {
             for (subject, times) in times.iter_mut().enumerate() {
                 times.push(pool.install(|| {

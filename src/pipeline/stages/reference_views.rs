@@ -123,7 +123,7 @@ impl ReferenceViews<'_> {
 
     fn render<T: Send>(&self, source: &dyn FrameSource, finish: impl Fn(usize, Image) -> T + Sync) -> Result<Vec<T>> {
         let mut rendered = Vec::with_capacity(self.pictures.len());
-        let batch = Batch::of_frame(&self.scene.limits);
+        let batch = Batch::one_frame(&self.scene.limits);
         show([RenderedSource::all(source)], &self.scene.schedule.cameras, &self.pictures, batch, |views| {
             let first = rendered.len();
             let view = |(k, view): (usize, &crate::passes::ViewStates<'_, 1>)| {

@@ -36,7 +36,7 @@ impl Stage for RefineStage {
     }
 
     fn shardable_units(&self, _: &Scene, _: &CountPlan) -> Vec<String> {
-        vec![format!("{}: pictures", targets::NAME)]
+        vec![format!("{}: views", targets::NAME)]
     }
 
     fn run(&self, run: &mut RunState<'_>) -> Result<()> {

@@ -187,7 +187,7 @@ impl Rounds {
         }
         let pictures =
             (done..sizes.len()).map(|round| active_turns(&turns, round).map(|turn| turns[turn].len()).sum::<usize>());
-        let progress = scene.events.task(NAME, "pictures", pictures.sum::<usize>() as u64);
+        let progress = scene.events.task(NAME, "views", pictures.sum::<usize>() as u64);
         let RoundState { free, removed, .. } = journal.stage(NAME, first, scene.source(), |_| {
             for (round, &left) in sizes.iter().enumerate().skip(done) {
                 state = self.round(scene, scored, (state, &turns), round, (key, left), &progress)?;

@@ -270,7 +270,7 @@ impl WriteStage {
                     }
                     Some(Archived::Frames(bounds)) => {
                         write_within(&*scene.input.reduced(compressed)?, *bounds, path, &scene.events)?;
-                        Size::of_frames(fs::metadata(path).map_err(Error::io("read", path))?.len())
+                        Size::from_frames(fs::metadata(path).map_err(Error::io("read", path))?.len())
                     }
                     None => {
                         journal.notes.extend(scene.input.write(

@@ -27,7 +27,7 @@ fn looked() -> Looked {
     let folder = tempfile::tempdir().unwrap();
     let made = Scene::new(3000, 12);
     let path = folder.path().join("scene.gseq");
-    write_container(&made, &path, gseq::Compression::StoredParams, Default::default(), |_| ()).unwrap();
+    write_container(&made, &path, gseq::Compression::Raw, Default::default(), |_| ()).unwrap();
     let input = Box::new(Container::open(&path).unwrap());
     let rig = made.rig();
     let scene = crate::scene::Scene::new(path, input, rig, Some(Split::Train)).unwrap();

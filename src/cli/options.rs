@@ -1,0 +1,410 @@
+//! Request structs of the library, made from the arguments of each command.
+
+use std::path::{Path, PathBuf};
+
+use super::args::{
+    self, CacheArgs, CameraFile, Cameras, CompareArgs, Compress, Convert, Demo, ImageKind, Input, Memory,
+    OutputKindArg, OutputSize, PrecisionArgs, Render, Rot4d, SplitArg, Sweep, TestScene, Trained, ViewArgs,
+    ZeroRotationArg,
+};
+use gseq::Compression;
+use splatsieve::cache::CacheRequest;
+use splatsieve::commands::container::Storing;
+use splatsieve::commands::render::{RenderOptions, RenderSelection};
+use splatsieve::commands::video::{FilmPath, VideoOptions};
+use splatsieve::diagnostics::demo::DemoOptions;
+use splatsieve::diagnostics::precision::{Knob, PrecisionOptions};
+use splatsieve::diagnostics::sweep::SweepOptions;
+use splatsieve::diagnostics::test_scene::TestSceneOptions;
+use splatsieve::error::{Error, Result};
+use splatsieve::evaluation::EvaluateOptions;
+use splatsieve::evaluation::method::Method;
+use splatsieve::files::atomic::Replace;
+use splatsieve::files::cameras::Times;
+use splatsieve::files::image::write::ImageFormat;
+use splatsieve::memory_plan::{Budget, Verbosity};
+use splatsieve::model::Split;
+use splatsieve::models::{Conventions, Link, ZeroRotation};
+use splatsieve::outputs::kind::OutputKind;
+use splatsieve::pipeline::{Only, Request, RunOptions, Target};
+use splatsieve::player::view;
+use splatsieve::player::view::ViewOptions;
+use splatsieve::progress::Events;
+use splatsieve::scene::pictures::ViewSet;
+use splatsieve::scene::{InputOptions, scratch_beside};
+
+/// Returns the request of `compress`. Options that the command line leaves open are taken from the run that the recipe
+/// file was written beside.
+///
+/// # Errors
+/// Fails if the recipe is invalid, if it names cameras, times or photographs that do not exist, or if its search goal
+/// is invalid.
+pub(super) fn compress_options(args: Compress, quiet: bool, events: &Events) -> Result<Request> {
+    let recipe = args.recipe.recipe()?;
+    let kind = args.kind.map(output_kind);
+    let record = args.recipe.record()?;
+    let (has_split, has_cameras) = (args.cameras.split.is_some(), args.cameras.file.cameras.is_some());
+    let is_flipped = args.input.trained.rot4d == Some(Rot4d::Flipped);
+    let mut input = input_options(args.input, Some(args.cameras), Some(&args.output), events);
+    input.work = cache_request(args.kept);
+    if input.memory.tell == Verbosity::Nothing && !quiet {
+        input.memory.tell = Verbosity::Time;
+    }
+    // The recipe may come with the options of the run that it was written beside.
+    let run = match record.run {
+        Some(run) => {
+            if !has_split {
+                input.split = run.split;
+            }
+            // The number of frames replaces the times of the cameras, so it is taken only with them.
+            if !has_cameras {
+                input.frames = input.frames.or(run.frames);
+            }
+            if let (None, Some(cameras)) = (&input.cameras, &run.cameras) {
+                args.recipe.check_recorded_path("cameras", cameras)?;
+                input.cameras = Some(cameras.clone());
+            }
+            input.size = input.size.or(run.size);
+            if let (Times::Own, Some(times)) = (&input.times, &run.times) {
+                input.times = Times::named(times);
+                if let Times::Table(table) = &input.times {
+                    args.recipe.check_recorded_path("times", table)?;
+                }
+            }
+            input.iteration = input.iteration.or(run.iteration);
+            let conventions = &mut input.conventions;
+            conventions.time_duration = conventions.time_duration.or(run.time_duration);
+            conventions.rot4d_unflipped |= run.rot4d_unflipped && !is_flipped;
+            conventions.zero_rotation = conventions.zero_rotation.or(run.zero_rotation);
+            if let (Link::Auto, Some(link)) = (input.link, run.link) {
+                input.link = link;
+            }
+            run
+        }
+        None => RunOptions::default(),
+    };
+    let OutputSize { ratio, count, size, min_psnr, max_loss, ground_truth } = args.size;
+    let given = RunOptions {
+        target_count: count,
+        target_ratio: ratio,
+        min_psnr,
+        max_loss,
+        target_size: size,
+        ground_truth,
+        ..RunOptions::default()
+    };
+    // A target on the command line replaces the target of the recorded run.
+    let is_open = given == RunOptions::default();
+    let target_options = if is_open { &run } else { &given };
+    if let (true, Some(photographs)) = (is_open, &run.ground_truth) {
+        args.recipe.check_recorded_path("ground-truth", photographs)?;
+    }
+    let (target, goal) = (target_options.target(), target_options.goal().map_err(Error::usage)?);
+    Ok(Request {
+        input,
+        output: args.output,
+        kind: kind.or(run.output),
+        recipe,
+        archive_psnr: args.archive_psnr.or(run.archive_psnr),
+        made_for: record.provenance.map(|from| from.input_digest),
+        only: match (args.prune_only, args.merge_only) {
+            (true, _) => Only::Prune,
+            (_, true) => Only::Merge,
+            _ => run.mode,
+        },
+        target,
+        goal,
+        keep_ids: args.overrides.keep_ids.or(run.keep_ids),
+        drop_ids: args.overrides.drop_ids.or(run.drop_ids),
+        keep_box: args.overrides.keep_box.or(run.keep_box),
+        overwrite: args.earlier.replace(),
+    })
+}
+
+/// Returns the options of `render` without `--video`.
+///
+/// # Errors
+/// Fails if an option of `--video` is given.
+pub(super) fn render_options(args: Render, events: &Events) -> Result<RenderOptions> {
+    // The parser accepts these options without --video.
+    let video_flags =
+        [("--path", args.path.is_some()), ("--fps", args.fps.is_some()), ("--beside", args.beside.is_some())];
+    if let Some((flag, _)) = video_flags.into_iter().find(|(_, given)| *given) {
+        return Err(Error::usage(format!("{flag} needs --video FILE")));
+    }
+    let format = match args.format {
+        Some(ImageKind::Npy) => ImageFormat::Npy,
+        Some(ImageKind::Png) | None => ImageFormat::Png,
+    };
+    let (selection, views) = match args.frame.zip(args.view) {
+        Some((frame, view)) => (RenderSelection::One { frame: frame as usize, view }, ViewSet::All),
+        None => (RenderSelection::All(format), ViewSet::HeldOut),
+    };
+    let output = args.output.unwrap_or_default();
+    let mut input = input_options(args.input, None, Some(&output), events);
+    args.cameras.apply_to(&mut input);
+    input.work = cache_request(args.kept);
+    Ok(RenderOptions {
+        input,
+        selection,
+        views: args.split.map_or(views, view_set),
+        background: args.background.background,
+        output,
+        overwrite: args.earlier.replace(),
+    })
+}
+
+/// Returns the options of `render --video`, with the video written to `output`.
+pub(super) fn video_options(args: Render, output: PathBuf, events: &Events) -> VideoOptions {
+    let (path, views) = match args.path {
+        Some(views) => (FilmPath::Path(views), ViewSet::HeldOut),
+        None => (FilmPath::View(args.view), ViewSet::All),
+    };
+    let mut input = input_options(args.input, None, Some(&output), events);
+    args.cameras.apply_to(&mut input);
+    input.work = cache_request(args.kept);
+    VideoOptions {
+        input,
+        beside: args.beside,
+        path,
+        views: args.split.map_or(views, view_set),
+        fps: args.fps.unwrap_or(25),
+        background: args.background.background,
+        output,
+        overwrite: args.earlier.replace(),
+    }
+}
+
+/// Returns the options of a comparison, without a file for the scores.
+pub(super) fn evaluate_options(args: CompareArgs, events: &Events) -> EvaluateOptions {
+    let mut original = InputOptions { path: args.original, iteration: args.iteration, ..InputOptions::default() };
+    original.allow_gaps = args.allow_gaps;
+    original.link = args.link.map_or(Link::Auto, Link::from);
+    original.conventions = conventions(&args.trained);
+    args.cameras.apply_to(&mut original);
+    original.memory = memory_budget(args.memory);
+    original.events = events.clone();
+    EvaluateOptions {
+        original,
+        compressed: args.compressed,
+        ground_truth: args.ground_truth,
+        views: args.split.map_or(ViewSet::HeldOut, view_set),
+        max_frames: args.max_frames.map(|frames| frames as usize),
+        max_views: args.max_views.map(|views| views as usize),
+        background: args.background.background,
+        flip: args.flip,
+        csv: None,
+        overwrite: Replace::Never,
+    }
+}
+
+/// Returns the options of `view`.
+pub(super) fn view_options(args: ViewArgs, events: &Events) -> ViewOptions {
+    let mut original = input_options(args.input, None, Some(&args.output), events);
+    args.cameras.apply_to(&mut original);
+    ViewOptions {
+        original,
+        compressed: args.compressed,
+        max_frames: args.max_frames as usize,
+        original_frames: args.original_frames.map(|frames| frames as usize),
+        original_degree: args.original_degree.map(usize::from),
+        background: args.background.background,
+        page_limit: args.page_limit,
+        output: args.output,
+        overwrite: args.earlier.replace(),
+    }
+}
+
+/// Returns the options of the page that shows the result of `request` beside its input (`compress --view`).
+///
+/// # Errors
+/// Fails if the input is a stream, or if the page cannot be written. Both are checked before the run.
+pub(super) fn result_page_options(request: &Request, output: Option<PathBuf>) -> Result<ViewOptions> {
+    if request.input.is_stream() {
+        return Err(Error::usage(
+            "--view: a stream can be read only once, so its result cannot be shown beside it\n  leave out --view, and use \
+             `splatsieve view` on the result",
+        ));
+    }
+    let page_path = || {
+        let mut name = request.output.clone().into_os_string();
+        name.push(".html");
+        PathBuf::from(name)
+    };
+    let mut original = request.input.clone();
+    (original.work, original.memory.tell) = (None, Verbosity::Nothing);
+    let options = ViewOptions {
+        original,
+        compressed: Some(request.output.clone()),
+        max_frames: args::DEFAULT_FRAMES as usize,
+        original_frames: None,
+        original_degree: None,
+        background: None,
+        page_limit: args::default_page_limit(),
+        output: output.unwrap_or_else(page_path),
+        overwrite: request.overwrite,
+    };
+    view::check(&options)?;
+    Ok(options)
+}
+
+/// Returns the options of `sweep`.
+pub(super) fn sweep_options(args: Sweep, events: &Events) -> SweepOptions {
+    let mut input = input_options(args.input, None, Some(&args.output), events);
+    args.cameras.apply_to(&mut input);
+    let named = |name: &String| Method::ALL.into_iter().find(|method| method.name() == name);
+    SweepOptions {
+        input,
+        methods: args.methods.iter().filter_map(named).collect(),
+        fractions: args.fractions,
+        steps: args.steps,
+        steps_at: args.steps_at,
+        runs: args.repeat as usize,
+        max_frames: Some(args.max_frames as usize),
+        background: args.background.background,
+        output: args.output,
+        overwrite: args.earlier.replace(),
+    }
+}
+
+/// Returns the options of `precision`.
+///
+/// # Errors
+/// Fails if the recipe is invalid.
+pub(super) fn precision_options(args: PrecisionArgs, events: &Events) -> Result<PrecisionOptions> {
+    let mut input = input_options(args.input, None, Some(&args.output), events);
+    args.cameras.apply_to(&mut input);
+    let named = |name: &String| Knob::ALL.into_iter().find(|knob| knob.name() == name);
+    let knobs: Vec<Knob> = args.knobs.iter().filter_map(named).collect();
+    Ok(PrecisionOptions {
+        input,
+        recipe: args.recipe.recipe()?,
+        knobs: (!knobs.is_empty()).then_some(knobs),
+        target: Target::Ratio(args.ratio),
+        max_frames: args.max_frames as usize,
+        runs: args.repeat as usize,
+        output: args.output,
+        overwrite: args.earlier.replace(),
+    })
+}
+
+/// Returns the options of `demo`.
+pub(super) fn demo_options(args: Demo, events: &Events) -> DemoOptions {
+    DemoOptions {
+        gaussians: args.gaussians as usize,
+        frames: args.frames as usize,
+        steps: args.refine_steps,
+        output: args.output,
+        overwrite: args.earlier.replace(),
+        memory: memory_budget(args.memory),
+        events: events.clone(),
+    }
+}
+
+/// Returns the options of `test-scene`.
+///
+/// # Errors
+/// Fails if the recipe is invalid.
+pub(super) fn test_scene_options(args: TestScene, events: &Events) -> Result<TestSceneOptions> {
+    Ok(TestSceneOptions {
+        gaussians: args.gaussians as usize,
+        frames: args.frames as usize,
+        kept: Target::Ratio(args.ratio),
+        recipe: args.recipe.recipe()?,
+        output: args.output,
+        overwrite: args.earlier.replace(),
+        memory: memory_budget(args.memory),
+        events: events.clone(),
+    })
+}
+
+/// Returns how `convert` stores the values of a container.
+pub(super) fn storing(args: &Convert) -> Storing {
+    match (args.raw, args.max_error.clone()) {
+        (true, _) => Storing::Exact(Compression::Raw),
+        (_, bounds) if bounds.is_empty() => Storing::Exact(Compression::Zstd(args.level.unwrap_or(1))),
+        (_, bounds) => Storing::Within(bounds, args.level.unwrap_or(15)),
+    }
+}
+
+/// Returns the output format that the argument names.
+pub(super) fn output_kind(kind: OutputKindArg) -> OutputKind {
+    match kind {
+        OutputKindArg::Model => OutputKind::Model,
+        OutputKindArg::Gseq => OutputKind::Gseq,
+        OutputKindArg::PlySequence => OutputKind::PlySequence,
+        OutputKindArg::Ply => OutputKind::Ply,
+        OutputKindArg::Archive => OutputKind::Archive,
+        OutputKindArg::Splatv => OutputKind::Splatv,
+        OutputKindArg::FourDgs => OutputKind::FourDgs,
+        OutputKindArg::Spz => OutputKind::Spz,
+    }
+}
+
+/// Returns the set of views that the argument names.
+fn view_set(split: SplitArg) -> ViewSet {
+    match split {
+        SplitArg::Train => ViewSet::Split(Split::Train),
+        SplitArg::Val => ViewSet::Split(Split::Val),
+        SplitArg::Test => ViewSet::Split(Split::Test),
+        SplitArg::All => ViewSet::All,
+    }
+}
+
+/// Returns the cache folder and the shard of a run; `None` without `--cache`.
+pub(super) fn cache_request(kept: CacheArgs) -> Option<CacheRequest> {
+    kept.cache.map(|folder| CacheRequest { folder, part: kept.shard })
+}
+
+/// Returns the memory limit, and whether the memory plan is printed.
+fn memory_budget(memory: Memory) -> Budget {
+    Budget { bytes: memory.memory, tell: if memory.explain { Verbosity::Plan } else { Verbosity::Nothing } }
+}
+
+/// Returns the facts about the training that the command line states.
+fn conventions(trained: &Trained) -> Conventions {
+    let zero_rotation = trained.zero_rotation.map(|handling| match handling {
+        ZeroRotationArg::Drop => ZeroRotation::Drop,
+        ZeroRotationArg::Identity => ZeroRotation::Identity,
+    });
+    let rot4d_unflipped = trained.rot4d == Some(Rot4d::Unflipped);
+    Conventions { time_duration: trained.time_duration, rot4d_unflipped, zero_rotation }
+}
+
+/// Returns the options by which an input is opened. Temporary files go to `--scratch-dir`, otherwise beside `output`.
+/// Without `cameras`, the cameras and the split keep their defaults.
+pub(super) fn input_options(
+    input: Input,
+    cameras: Option<Cameras>,
+    output: Option<&Path>,
+    events: &Events,
+) -> InputOptions {
+    let events = events.clone();
+    let mut options = InputOptions { path: input.input, iteration: input.iteration, events, ..InputOptions::default() };
+    options.allow_gaps = input.allow_gaps;
+    options.conventions = conventions(&input.trained);
+    options.link = input.link.map_or(Link::Auto, Link::from);
+    options.memory = memory_budget(input.memory);
+    options.is_scratch_named = input.scratch_dir.is_some();
+    options.scratch = input.scratch_dir.or_else(|| output.and_then(scratch_beside));
+    if let Some(cameras) = cameras {
+        cameras.file.apply_to(&mut options);
+        options.split = match cameras.split {
+            Some(SplitArg::Train) | None => Some(Split::Train),
+            Some(SplitArg::Val) => Some(Split::Val),
+            Some(SplitArg::Test) => Some(Split::Test),
+            Some(SplitArg::All) => None,
+        };
+    }
+    options
+}
+
+impl CameraFile {
+    /// Sets cameras, resolution, times and number of frames of `options`.
+    fn apply_to(self, options: &mut InputOptions) {
+        options.cameras = self.cameras;
+        options.size = self.resolution;
+        options.times = self.times.unwrap_or_default();
+        options.frames = self.frames.map(|frames| frames as usize);
+    }
+}

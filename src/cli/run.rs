@@ -1,0 +1,333 @@
+//! Execution of the commands: calls the library and prints results.
+
+use std::path::Path;
+
+use super::args::{
+    CacheFolder, Cli, CommandArgs, Completions, Compress, Convert, Demo, Evaluate, InfoArgs, Man, PrecisionArgs,
+    Render, ReportArgs, ScoreArgs, Selfcheck, Sweep, TestScene,
+};
+use super::help;
+use super::message::tell;
+use super::options::{
+    cache_request, compress_options, demo_options, evaluate_options, input_options, output_kind, precision_options,
+    render_options, result_page_options, storing, sweep_options, test_scene_options, video_options, view_options,
+};
+use super::output::{self, print, print_as};
+use super::progress::Display;
+use splatsieve::cache::{self, Completion};
+use splatsieve::commands::video::{places, video};
+use splatsieve::commands::{container, convert, render, score};
+use splatsieve::diagnostics::{demo, precision, selfcheck, sweep, test_scene};
+use splatsieve::error::{Error, Result, ShowPath};
+use splatsieve::evaluation;
+use splatsieve::evaluation::EvaluateOptions;
+use splatsieve::pipeline::summary::Detail;
+use splatsieve::pipeline::{compress, divided_stages, foresee};
+use splatsieve::player::view;
+use splatsieve::player::view::ViewOptions;
+use splatsieve::progress::Events;
+use splatsieve::recipe::preset_text;
+use splatsieve::report::{self, ReportOptions, trade_off};
+
+/// Runs a command and prints its result.
+///
+/// # Errors
+/// Fails if the threads cannot be started, if the command fails, or if standard output cannot be written.
+pub(super) fn run(cli: Cli) -> Result<()> {
+    if let Some(threads) = cli.threads {
+        rayon::ThreadPoolBuilder::new()
+            .num_threads(threads.into())
+            .build_global()
+            .map_err(|error| Error::usage(format!("--threads {threads}: {error}")))?;
+    }
+    let events = Events::new(Display::new(cli.quiet));
+    match cli.command {
+        CommandArgs::Compress(args) => run_compress(*args, cli.quiet, &events),
+        CommandArgs::Score(args) => run_score(args, &events),
+        CommandArgs::Render(args) => run_render(args, &events),
+        CommandArgs::Evaluate(args) => run_evaluate(args, &events),
+        CommandArgs::Sweep(args) => run_sweep(args, &events),
+        CommandArgs::Precision(args) => run_precision(args, &events),
+        CommandArgs::Report(args) => run_report(args, &events),
+        CommandArgs::View(args) => print(&(write_page(&view_options(args, &events))? + "\n")),
+        CommandArgs::Convert(args) => run_convert(args, &events),
+        CommandArgs::Info(args) => run_info(args, &events),
+        CommandArgs::Cache(args) => run_cache(&args),
+        CommandArgs::Demo(args) => run_demo(args, &events),
+        CommandArgs::TestScene(args) => run_test_scene(args, &events),
+        CommandArgs::Selfcheck(args) => run_selfcheck(&args),
+        CommandArgs::Recipe(args) => print(preset_text(&args.preset)?),
+        CommandArgs::Completions(args) => run_completions(&args),
+        CommandArgs::Man(args) => run_man(&args),
+    }
+}
+
+/// Runs `compress`; with `--list-stages` or `--dry-run`, prints the stages or the plan instead.
+fn run_compress(args: Compress, quiet: bool, events: &Events) -> Result<()> {
+    let (json, list_stages, dry_run) = (args.json, args.list_stages, args.dry_run);
+    let detail = if args.verbose { Detail::All } else { Detail::Most };
+    let page_output = args.view.clone();
+    let request = compress_options(args, quiet, events)?;
+    if list_stages {
+        return print(&divided_stages(&request)?.iter().map(|stage| format!("{stage}\n")).collect::<String>());
+    }
+    if dry_run {
+        let foreseen = foresee(&request)?;
+        return print_as(json, &if json { foreseen.json() } else { foreseen.text() });
+    }
+    let page = page_output.map(|output| result_page_options(&request, output)).transpose()?;
+    let Some(summary) = completed(compress(&request)?)? else { return Ok(()) };
+    let printed = print_as(json, &if json { summary.json() } else { summary.text(detail) });
+    // The page is written even if the summary cannot be printed, for example because its reader has ended.
+    if let Some(page) = page {
+        let written = write_page(&page);
+        if written.is_err() {
+            tell(&format!("{} is complete; writing its page failed:", request.output.shown()));
+        }
+        tell(&written?);
+    }
+    printed
+}
+
+/// Runs `score`.
+fn run_score(args: ScoreArgs, events: &Events) -> Result<()> {
+    let input = input_options(args.input, Some(args.cameras), Some(&args.output), events);
+    let report = score::score(&input, &args.output, &args.recipe.recipe()?, args.earlier.replace())?;
+    tell_notes(&report.notes);
+    print(&format!(
+        "{}: {} Gaussians, of which the recipe keeps {} before merging\n",
+        report.output.shown(),
+        report.gaussians,
+        report.kept
+    ))
+}
+
+/// Runs `render`, with or without `--video`.
+fn run_render(mut args: Render, events: &Events) -> Result<()> {
+    if let Some(output) = args.video.take() {
+        let options = video_options(args, output, events);
+        let filmed = video(&options)?;
+        tell_notes(&filmed.notes);
+        let (path, (width, height), fps) = (options.output.shown(), filmed.size, options.fps);
+        let places = options.beside.as_deref().map(|right| format!("  {}\n", places(&options.input.path, right)));
+        let places = places.unwrap_or_default();
+        return print(&format!(
+            "{path}: {} frames of {width}x{height}, {fps} frames per second\n{places}",
+            filmed.frames
+        ));
+    }
+    let options = render_options(args, events)?;
+    let Some(rendered) = completed(render::render(&options)?)? else { return Ok(()) };
+    tell_notes(&rendered.notes);
+    let plural = if rendered.views == 1 { "" } else { "s" };
+    print(&format!("{}: {} view{plural}\n", options.output.shown(), rendered.views))
+}
+
+/// Runs `evaluate`.
+fn run_evaluate(args: Evaluate, events: &Events) -> Result<()> {
+    let as_json = args.json;
+    let mut options =
+        EvaluateOptions { csv: args.csv, overwrite: args.earlier.replace(), ..evaluate_options(args.models, events) };
+    options.original.work = cache_request(args.kept);
+    let Some(found) = completed(evaluation::evaluate(&options)?)? else { return Ok(()) };
+    tell_notes(&found.work_notes);
+    print_as(as_json, &if as_json { json_text(&found) } else { found.text() })
+}
+
+/// Runs `sweep`.
+fn run_sweep(args: Sweep, events: &Events) -> Result<()> {
+    let (as_json, page) = (args.json, args.output.join(trade_off::PAGE));
+    let found = sweep::sweep(&sweep_options(args, events))?;
+    print_as(as_json, &if as_json { found.json() } else { format!("{}{}\n", found.text(), page.shown()) })
+}
+
+/// Runs `precision`.
+fn run_precision(args: PrecisionArgs, events: &Events) -> Result<()> {
+    let (as_json, page) = (args.json, args.output.join(report::precision::PAGE));
+    let found = precision::precision(&precision_options(args, events)?)?;
+    print_as(as_json, &if as_json { found.json() } else { format!("{}{}\n", found.text(), page.shown()) })
+}
+
+/// Runs `report`.
+fn run_report(args: ReportArgs, events: &Events) -> Result<()> {
+    let page = args.output.join(report::PAGE);
+    let mut evaluate = evaluate_options(args.models, events);
+    evaluate.original.work = cache_request(args.kept);
+    let options = ReportOptions {
+        evaluate,
+        more: args.more,
+        sweep: args.sweep,
+        precision: args.precision,
+        render_time: args.render_time,
+        output: args.output,
+        overwrite: args.earlier.replace(),
+    };
+    let Some(found) = completed(report::report(&options)?)? else { return Ok(()) };
+    let mut verdicts = String::new();
+    for result in std::iter::once(&found.result).chain(&found.others) {
+        tell_notes(&result.work_notes);
+        tell_notes(&result.notes);
+        if !found.others.is_empty() {
+            verdicts += &format!("{}: ", Path::new(&result.evaluation.path.compressed).shown());
+        }
+        verdicts += &format!("{}\n", result.verdict);
+    }
+    print(&format!("{verdicts}{}\n", page.shown()))
+}
+
+/// Writes an HTML page and returns a line with its path, number of frames and size.
+fn write_page(options: &ViewOptions) -> Result<String> {
+    let found = view::view(options)?;
+    tell_notes(&found.notes);
+    let files = if found.files == 1 { String::new() } else { format!(" in {} files", found.files) };
+    Ok(format!("{}: {} frames, {} bytes{files}", found.page.shown(), found.frames, found.bytes))
+}
+
+/// Runs `convert`: writes an input in another format and prints what was written.
+fn run_convert(args: Convert, events: &Events) -> Result<()> {
+    let path =
+        args.output.clone().or(args.output_option.clone()).ok_or_else(|| Error::internal("convert has no output"))?;
+    let is_stdout = path.as_os_str() == "-";
+    let is_stored_differently = args.raw || args.level.is_some() || !args.max_error.is_empty();
+    let storing = storing(&args);
+    let output = (!is_stdout).then_some(path.as_path());
+    let has_cache = args.kept.cache.is_some();
+    let mut input = input_options(args.input, Some(args.cameras), output, events);
+    input.work = cache_request(args.kept);
+    let kind = args.kind.map(output_kind);
+    let is_container = !is_stdout && convert::is_container(&path, kind);
+    let refuse =
+        |options: &str| Err(Error::usage(format!("{options}: expected an output NAME.gseq, found {}", path.shown())));
+    if is_stored_differently && !is_container {
+        return refuse("--max-error, --raw and --level");
+    }
+    if has_cache && !is_container {
+        return refuse("--cache");
+    }
+    if is_stdout {
+        if output::is_terminal() {
+            return Err(Error::usage(
+                "a frame stream is binary and cannot be shown on a terminal\n  redirect standard output to a program or a file",
+            ));
+        }
+        tell_notes(&container::unpack_stream(&input, output::stdout().lock())?.notes);
+        return Ok(());
+    }
+    let converted = if is_container {
+        let Some(packed) = completed(container::pack(&input, &path, &storing, args.earlier.replace())?)? else {
+            return Ok(());
+        };
+        packed
+    } else {
+        convert::convert(&input, &path, kind, args.earlier.replace())?
+    };
+    if args.json {
+        return print_as(true, &json_text(&converted));
+    }
+    tell_notes(&converted.notes);
+    print(&converted.text())
+}
+
+/// Runs `info`: prints what an input holds, or checks or repairs a container.
+fn run_info(args: InfoArgs, events: &Events) -> Result<()> {
+    let path = args.input.input.clone();
+    if let Some(output) = args.repair {
+        let report = container::recover(&path, &output, args.earlier.replace())?;
+        let value = serde_json::json!({
+            "path": output.to_string_lossy(), "frames": report.frames, "frames_seen": report.frames_seen,
+            "tiles": report.tiles_saved,
+        });
+        let text = format!(
+            "{}: {} complete frames of {} found, {} tiles\n",
+            output.shown(),
+            report.frames,
+            report.frames_seen,
+            report.tiles_saved
+        );
+        return print_as(args.json, &if args.json { json_text(&value) } else { text });
+    }
+    if args.check {
+        let report = container::verify(&path)?;
+        let (frames, tiles) = (report.frames, report.tiles);
+        let (stored, decoded) = (report.stored_bytes, report.decoded_bytes);
+        let value = serde_json::json!({
+            "path": path.to_string_lossy(), "frames": frames, "tiles": tiles,
+            "stored_bytes": stored, "decoded_bytes": decoded,
+        });
+        let path = path.shown();
+        let text =
+            format!("{path}: no damage; {frames} frames, {tiles} tiles, {stored} bytes that decode to {decoded}\n");
+        return print_as(args.json, &if args.json { json_text(&value) } else { text });
+    }
+    let info = container::info(&input_options(args.input, None, None, events))?;
+    print_as(args.json, &if args.json { json_text(&info) } else { info.text() })
+}
+
+/// Runs `cache`: lists or removes the entries of a cache folder.
+fn run_cache(args: &CacheFolder) -> Result<()> {
+    if args.clean {
+        let (files, bytes) = cache::clean(&args.folder)?;
+        return print(&format!("{}: {files} files, {bytes} bytes removed\n", args.folder.shown()));
+    }
+    let listed = cache::list(&args.folder)?;
+    print_as(args.json, &if args.json { json_text(&listed) } else { cache::text(&listed) })
+}
+
+/// Runs `demo`.
+fn run_demo(args: Demo, events: &Events) -> Result<()> {
+    let options = demo_options(args, events);
+    print(&demo::run(&options)?.text(&options.output))
+}
+
+/// Runs `test-scene`.
+fn run_test_scene(args: TestScene, events: &Events) -> Result<()> {
+    let options = test_scene_options(args, events)?;
+    print(&test_scene::run(&options)?.text())?;
+    if let Some(folder) = options.output {
+        tell(&format!("kept in {}: scene.gseq, cameras.json, compressed.gseq", folder.shown()));
+    }
+    Ok(())
+}
+
+/// Runs `selfcheck`. Fails if a case fails; the table is printed before.
+fn run_selfcheck(args: &Selfcheck) -> Result<()> {
+    let found = selfcheck::run();
+    let printed = print_as(args.json, &if args.json { json_text(&found) } else { found.text() });
+    found.verdict()?;
+    printed
+}
+
+/// Runs `completions`.
+fn run_completions(args: &Completions) -> Result<()> {
+    let mut script = Vec::new();
+    clap_complete::generate(args.shell, &mut help::command(), "splatsieve", &mut script);
+    output::write(&script)
+}
+
+/// Runs `man`.
+fn run_man(args: &Man) -> Result<()> {
+    let pages = help::write_pages(&args.folder)?;
+    print(&format!("{}: {pages} pages\n", args.folder.shown()))
+}
+
+/// Returns the result of a complete run. For a run of one shard, prints which shard was computed and returns `None`.
+fn completed<T>(completion: Completion<T>) -> Result<Option<T>> {
+    match completion {
+        Completion::Whole(found) => Ok(Some(found)),
+        Completion::Shard(done) => print(&format!("{done}\n")).map(|()| None),
+    }
+}
+
+/// Writes notes to standard error, one per line.
+fn tell_notes(notes: &[String]) {
+    for note in notes {
+        tell(&format!("note: {note}"));
+    }
+}
+
+/// Returns `value` as indented JSON that ends with a line feed.
+fn json_text(value: &impl serde::Serialize) -> String {
+    let mut text = serde_json::to_string_pretty(value).expect("plain data");
+    text.push('\n');
+    text
+}
