@@ -140,7 +140,9 @@ fn the_page_fits_a_phone_and_the_overview_is_short() {
         page.value("document.querySelectorAll('details').forEach(details => details.open = true)");
         for (width, scheme) in [(390, "light"), (390, "dark"), (1400, "dark")] {
             page.screen(width, 800, scheme);
-            assert_eq!(page.value("document.documentElement.scrollWidth"), json!(width), "{folder}");
+            // A vertical scroll bar takes a part of the width.
+            let fits = page.value("document.documentElement.scrollWidth <= innerWidth");
+            assert_eq!(fits, json!(true), "{folder}, {width}");
             assert_eq!(page.value(UNREADABLE), json!([]), "{folder}, {width}");
             assert_eq!(page.value("document.body.textContent.includes('nothing to show')"), json!(false));
         }
