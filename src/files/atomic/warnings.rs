@@ -2,15 +2,16 @@
 
 use std::sync::{Mutex, PoisonError};
 
-/// Warnings since the last call of [`take_warnings`].
+/// Warnings recorded since the last call of [`take_warnings`].
 static WARNINGS: Mutex<Vec<String>> = Mutex::new(Vec::new());
 
-/// Records a warning for [`take_warnings`].
+/// Records a warning, to be returned by [`take_warnings`].
 pub(super) fn warn(message: String) {
     WARNINGS.lock().unwrap_or_else(PoisonError::into_inner).push(message);
 }
 
-/// Returns the warnings recorded since the last call. The results that they name are complete and in place.
+/// Returns the warnings recorded since the last call. The outputs named in them are complete and at their final paths:
+/// only later steps failed, such as removing an earlier output.
 pub fn take_warnings() -> Vec<String> {
     std::mem::take(&mut WARNINGS.lock().unwrap_or_else(PoisonError::into_inner))
 }

@@ -5,16 +5,17 @@ use glam::DVec3;
 
 use crate::model::{Camera, Rig, Shot, Split};
 
-/// Number of cameras of the rig: as many views as are used to score the static models of docs/benchmarks.md.
+/// Number of cameras around a moving scene: as many views as are used to score the static models of docs/benchmarks.md.
 const CAMERAS: u32 = 12;
-/// Distance of the cameras from the center, in extents. At 60° the image then spans 2.3 extents, so that a scene with
-/// equal sides is seen whole from every corner.
+/// Distance of the cameras from the center, as a multiple of the extent of the scene. With a field of view of 60° the
+/// image then spans 2.3 extents, so that a scene with equal sides is seen whole from every corner.
 const DISTANCE: f64 = 2.0;
 /// Horizontal field of view of the cameras around a moving scene.
 const FIELD_OF_VIEW_DEGREES: f64 = 60.0;
-/// Near plane in extents, so that visibility does not depend on the unit of length.
+/// Distance of the near plane as a multiple of the extent of the scene, so that visibility does not depend on the unit
+/// of length.
 const NEAR: f64 = 0.1;
-/// Image width and height in pixels.
+/// Image width and height in pixels, for the cameras around a moving scene.
 const SIDE_PX: u32 = 512;
 
 /// Returns cameras on a Fibonacci sphere of radius 2 × `extent` around `center`, all looking at the center. Every
@@ -43,16 +44,17 @@ pub fn virtual_rig(center: DVec3, extent: f64) -> Rig {
     }
 }
 
-/// Number of cameras around a still; enough that no part of a surface is seen only at a grazing angle.
+/// Number of cameras around a still (model without motion); enough that every part of the surface is seen at more than
+/// a grazing angle from some camera.
 const SURROUNDING_CAMERAS: u32 = 24;
-/// Distance of these cameras from the center, in radii of the surface.
+/// Distance of the cameras around a still from its center, as a multiple of the radius of the surface.
 const SURROUNDING_DISTANCE: f64 = 2.2;
-/// Field of view in degrees; the surface nearly fills the image.
+/// Field of view in degrees of the cameras around a still; the surface nearly fills the image.
 const SURROUNDING_FIELD_OF_VIEW_DEGREES: f64 = 49.0;
 /// Image width and height in pixels around a still.
 const SURROUNDING_SIDE_PX: u32 = 320;
-/// Fraction of the weight that lies within the radius. Gaussians further away, mostly floaters and ground, are seen
-/// only where they are in front.
+/// Fraction of the total weight (visible area) of a still that defines the radius: Gaussians of this weight lie within
+/// it. Gaussians further away, mostly floaters and ground, are seen only where they are in front.
 const WEIGHT_WITHIN_RADIUS: f64 = 0.9;
 
 /// Returns cameras on a Fibonacci sphere around most of the visible surface of a still, all for training.
@@ -112,8 +114,8 @@ pub fn surrounding_rig(positions: &[DVec3], weights: &[f64]) -> Rig {
     }
 }
 
-/// Returns direction `k` of `n` evenly distributed over the unit sphere: latitude asin(1 − (2k + 1)/n), longitude k·π(3
-/// − √5).
+/// Returns direction `k` of `n` directions that are evenly distributed over the unit sphere: latitude asin(1 − (2k +
+/// 1)/n), longitude k·π(3 − √5).
 fn on_sphere(k: u32, n: u32) -> DVec3 {
     let golden_angle = std::f64::consts::PI * (3.0 - 5f64.sqrt());
     let z = 1.0 - f64::from(2 * k + 1) / f64::from(n);

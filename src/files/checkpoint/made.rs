@@ -21,11 +21,11 @@ pub(crate) enum Made {
     Parameter(PickledTensor),
 }
 
-/// Tensor of f32, or of another storage class with these bytes.
+/// Tensor to be pickled: f32 values, or values of another storage class with the given bytes.
 #[derive(Debug, Clone)]
 pub(crate) struct PickledTensor {
     pub(crate) class: &'static str,
-    /// Number of the storage. A storage named by several tensors is stored once.
+    /// Number of the storage (block of values). A storage used by several tensors is stored once.
     pub(crate) storage: usize,
     pub(crate) bytes: Vec<u8>,
     pub(crate) width: usize,
@@ -34,7 +34,7 @@ pub(crate) struct PickledTensor {
     pub(crate) stride: Vec<usize>,
 }
 
-/// Returns a dense f32 tensor in the storage of that number.
+/// Returns a dense f32 tensor whose values are in storage number `storage`.
 pub(crate) fn tensor(storage: usize, shape: &[usize], values: &[f32]) -> PickledTensor {
     let mut stride = vec![1; shape.len()];
     (1..shape.len()).rev().for_each(|axis| stride[axis - 1] = stride[axis] * shape[axis].max(1));
@@ -55,7 +55,7 @@ pub(crate) fn named(items: Vec<(&'static str, Made)>) -> Vec<(Made, Made)> {
 }
 
 impl Made {
-    /// Appends the pickle of this value: protocol 2, without memo.
+    /// Appends the pickle (protocol 2, without memo) of this value to `out`.
     fn pickle(&self, out: &mut Vec<u8>) {
         let items = |items: &[(Made, Made)], out: &mut Vec<u8>| {
             out.push(b'(');
@@ -122,7 +122,7 @@ impl Made {
 }
 
 impl PickledTensor {
-    /// Appends the pickle of the tensor.
+    /// Appends the pickle of the tensor to `out`.
     fn pickle(&self, out: &mut Vec<u8>) {
         let numbers = |values: &[usize]| Made::Tuple(values.iter().map(|&x| Made::Int(x as i64)).collect());
         out.extend(b"ctorch._utils\n_rebuild_tensor_v2\n((");
@@ -141,7 +141,7 @@ impl PickledTensor {
     }
 }
 
-/// Returns a zip archive of uncompressed files in the folder `made`.
+/// Returns the bytes of a zip archive with uncompressed `files`, given as (name, content), in the folder `made`.
 pub(crate) fn zip(files: &[(String, Vec<u8>)]) -> Vec<u8> {
     let mut archive = ZipWriter::new(Cursor::new(Vec::new()));
     for (name, bytes) in files {
