@@ -13,7 +13,7 @@ impl CacheKey {
     /// Key of a run without a work folder: no result is looked up under it.
     pub const NONE: CacheKey = CacheKey(None);
 
-    /// Returns the digest of `value`, by its bits.
+    /// Returns the digest of the bits of `value`.
     pub fn new(value: &impl Serialize) -> CacheKey {
         let mut hash = Hash(Xxh3::new());
         // Every hashed value can be serialized.
@@ -38,7 +38,7 @@ impl Serialize for CacheKey {
     }
 }
 
-/// Writer that hashes the bytes.
+/// Writer that hashes the bytes written to it.
 struct Hash(Xxh3);
 
 impl Write for Hash {
