@@ -153,8 +153,8 @@ fn find_foreign(
     result
 }
 
-/// Returns an unused path for `relative` below `folder`. Appends `.kept` to each component that an existing entry
-/// prevents.
+/// Returns an unused path for `relative` below `folder`. Appends `.kept` to the name of a component if an existing
+/// entry is in the way.
 fn unused_path(folder: &Path, relative: &Path) -> PathBuf {
     let mut place = folder.to_owned();
     let mut components = relative.components().peekable();

@@ -169,7 +169,7 @@ impl Assembly {
         }
     }
 
-    /// Returns the rig of all images added. `origin` describes where its times come from.
+    /// Returns the rig of all images added. `origin` describes for the user where the cameras come from.
     ///
     /// # Errors
     /// Fails if there are no images, or if two images of one file have the same view, split and time.
@@ -233,7 +233,7 @@ impl MemoryCounter {
     }
 }
 
-/// Returns the error text for an image that has a time although the first image has none (`timed`), or the reverse.
+/// Returns the error text for an image without a time although the first image has one (`timed`), or the reverse.
 fn time_mismatch(timed: bool) -> &'static str {
     if timed { "none here, but one in the first image" } else { "one here, but none in the first image" }
 }

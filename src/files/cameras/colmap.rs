@@ -37,7 +37,7 @@ const IMAGE_BYTES: u64 = 3 * size_of::<ColmapImage>() as u64 + 160;
 const UNIT_TOLERANCE: f64 = 1e-3;
 
 /// Camera models, indexed by COLMAP's model number: name, number of parameters, index of the first distortion parameter
-/// (0 if the model is not a pinhole with distortion).
+/// (0 if the model is not a pinhole model).
 const MODELS: [(&str, usize, usize); 12] = [
     ("SIMPLE_PINHOLE", 3, 3),
     ("PINHOLE", 4, 4),

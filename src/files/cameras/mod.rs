@@ -10,10 +10,12 @@
 //! | COLMAP's `cameras` and `images`, `.bin` or `.txt` (`colmap.rs`) | from names or a table (`times.rs`) | from folders in names |
 //! | the first of several folders `colmap_K`, one for each frame, with a reconstruction in `sparse/0` (SpacetimeGaussians) | i/n | the first camera is test |
 //!
-//! "i/n" means that frame i of n frames is at time i/n. ¶ All cameras are returned in OpenCV axes, world to camera, in
-//! f64. Rotation matrices are checked to be rotations. Memory: one record per image; the size of all records is checked
-//! against the memory limit for reading before they are allocated. JSON and text files are read as streams: once for
-//! the keys outside the list of images, and once for the images.
+//! "i/n" means that frame i of n frames is at time i/n.
+//!
+//! All cameras are returned in OpenCV axes, world to camera, in f64. Rotation matrices are checked to be rotations.
+//! Memory: one record per image; the size of all records is checked against the memory limit for reading before they
+//! are allocated. JSON and text files are read as streams: once for the keys outside the list of images, and once for
+//! the images.
 
 mod assemble;
 mod cameras_json;
