@@ -1,4 +1,4 @@
-//! The built-in demo: generates a scene, compresses it, and reports the result for each kind of body in it.
+//! The built-in demo: generates a scene, compresses it, and reports the result for each kind of body in the scene.
 
 use std::fmt::Write as _;
 use std::fs;
@@ -28,14 +28,14 @@ pub struct DemoOptions {
     pub gaussians: usize,
     /// Number of frames of the scene.
     pub frames: usize,
-    /// Number of Gaussians to keep.
+    /// Number or fraction of Gaussians to keep.
     pub kept: Target,
     /// Recipe of the compression.
     pub recipe: Recipe,
-    /// Folder for `scene.gseq`, `cameras.json` and `compressed.gseq`; `None`: a temporary folder that is deleted at the
-    /// end.
+    /// Folder that gets `scene.gseq`, `cameras.json` and `compressed.gseq`. `None`: a temporary folder, which is
+    /// deleted at the end.
     pub output: Option<PathBuf>,
-    /// Policy if the folder exists.
+    /// Policy if the output folder already exists.
     pub overwrite: Replace,
     /// Memory limit of the run.
     pub memory: Budget,
@@ -46,13 +46,14 @@ pub struct DemoOptions {
 /// Result of the demo.
 #[derive(Debug)]
 pub struct DemoReport {
-    /// Summary of the compression.
+    /// Summary of the compression run.
     pub summary: Summary,
-    /// Numbers of Gaussians of every body: all, kept unchanged or as leaders, merged into another.
+    /// For every body of the scene the numbers of Gaussians: all, kept (unchanged or as leader of a merged cluster),
+    /// and merged into another.
     pub bodies: Vec<(DemoBody, usize, usize, usize)>,
 }
 
-/// Generates the scene, writes it as a container and compresses that.
+/// Generates the demo scene, writes it as a container and compresses the container.
 ///
 /// # Errors
 /// Fails if the number of Gaussians to keep is impossible, if the compression fails, or if a file cannot be written.
@@ -98,7 +99,7 @@ fn run_in(folder: &Path, options: &DemoOptions) -> Result<DemoReport> {
         .iter()
         .map(|&body| {
             let members = demo.members(body);
-            // The first Gaussian with an index of the output counts as kept; later ones with the same index count as
+            // The first Gaussian of each output index counts as kept; later ones with the same output index count as
             // merged.
             let kept = members
                 .clone()
@@ -111,7 +112,8 @@ fn run_in(folder: &Path, options: &DemoOptions) -> Result<DemoReport> {
     Ok(DemoReport { summary, bodies })
 }
 
-/// Returns the cameras as 3DGS writes them: camera-to-world rotations, every camera at every frame.
+/// Returns the cameras of `rig` as JSON in the form that 3DGS writes: with camera-to-world rotations, and every camera
+/// at every frame.
 fn cameras_json(rig: &Rig) -> String {
     let camera = |(id, camera): (usize, &Camera)| {
         let to_world = camera.rotation.transpose();

@@ -1,5 +1,5 @@
-//! Checks and experiments of the program: the demo scene, the self-check against f64 oracles, sweeps over sizes, and
-//! work-precision diagrams.
+//! Checks and experiments of the program: the demo scene, the self-check against slow f64 reference computations, runs
+//! over several sizes (sweep), and diagrams of work against precision.
 
 pub mod demo;
 pub mod demo_scene;

@@ -53,8 +53,8 @@ const CONVERGED: f64 = 1e-3;
 const MAX_OPACITY: f64 = 0.999;
 /// Weight of the term that keeps polynomial coefficients small if the frames do not determine them (ridge regression).
 const RIDGE: f64 = 1e-6;
-/// Weight of a frame below which it does not affect a curve. Weights are window × opacity, in units of the smallest
-/// visible opacity.
+/// Value of a curve's time window at a frame below which the frame does not affect the curve. The limit for window ×
+/// opacity is this times the smallest visible opacity.
 const MIN_WEIGHT: f64 = 1e-3;
 
 /// Returns the curves that represent `track`: as few as meet `tolerance` at every visible frame, or, if none do, the

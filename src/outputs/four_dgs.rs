@@ -167,7 +167,7 @@ mod tests {
                     continue;
                 }
                 let at = expected.position.row::<3>(id);
-                // The file has another order, so the test looks for the nearest Gaussian with the same opacity.
+                // The file keeps no order, so the test looks for the nearest Gaussian with the same opacity.
                 let distance =
                     |k: usize| (0..3).map(|c| f64::from(state.centers[3 * k + c] - at[c]).powi(2)).sum::<f64>();
                 let similar =
