@@ -44,7 +44,7 @@ const FIRST_FRACTION: f64 = 0.2;
 const SIZES_USUALLY_TRIED: f64 = 4.0;
 /// Maximum number of sizes (numbers of Gaussians) that are tried, apart from the full size if all of them fail.
 const MAX_SIZES: usize = 8;
-/// The search ends when the smallest size that passed is at most this factor larger than the largest that failed.
+/// The search ends when the smallest size that passed is at most this factor times the largest size that failed.
 const SAME_SIZE_RATIO: f64 = 1.04;
 /// Approximate cost of halving the number of Gaussians: the PSNR that is lost, dB, and the factor by which a loss of
 /// PSNR grows. The search guesses its next size from them.
