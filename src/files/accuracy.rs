@@ -31,7 +31,7 @@ const MAX_SH_ERROR: f64 = 1.0;
 /// Opacity below which a Gaussian is not drawn.
 const MIN_OPACITY: f64 = 1.0 / 255.0;
 
-/// Attributes of one Gaussian as a renderer uses them.
+/// Attributes of one Gaussian after activation, as a renderer uses them.
 #[derive(Debug, Clone, Copy)]
 pub struct RenderedAttributes {
     /// Position in scene units.
@@ -78,7 +78,7 @@ struct Excess {
 pub struct Accuracy {
     /// Scene size: median distance of the Gaussians from their median position, in scene units.
     scene: f64,
-    /// Index of the Gaussian furthest from the median position.
+    /// Index of the Gaussian that is furthest from the median position of all Gaussians.
     furthest: usize,
     /// Largest error of a position so far, in scene units.
     position: f64,
@@ -119,7 +119,7 @@ impl Accuracy {
         let position_error = max_difference(wanted.position, found.position);
         self.position = largest([self.position, position_error, 0.0]);
         let scales = [0, 1, 2].map(|k| (wanted.scale[k], (wanted.scale[k] - found.scale[k]).abs()));
-        // Screens show colors clamped to [0, 1].
+        // Clamp colors to [0, 1] before comparing them, as a screen does.
         let [before, after] = [wanted, found].map(|drawn| drawn.color.map(|c| c.clamp(0.0, 1.0)));
         self.check_error(
             id,

@@ -119,7 +119,8 @@ pub struct StagedFile {
 }
 
 impl StagedFile {
-    /// Prepares to write `target`, which must have passed [`check_target`]. Does not create the file yet.
+    /// Prepares to write the output file `target`, which must have passed [`check_target`]. Does not create the file
+    /// yet.
     ///
     /// # Errors
     /// Fails if the target has no name, if it exists and `replace` does not allow to replace it, or if a system call
@@ -161,8 +162,9 @@ pub struct StagedFiles {
 }
 
 impl StagedFiles {
-    /// Prepares to write `target` and its `companions`, which must have passed [`check_targets`]. The names of the
-    /// companions start with that of `target`, and the first companion is the summary.
+    /// Prepares to write the output file `target` and the files `companions` beside it, which must have passed
+    /// [`check_targets`]. The name of each companion must begin with the name of `target`, and the first companion is
+    /// the summary.
     ///
     /// # Errors
     /// Fails like [`StagedFile::new`] for each of the files.
@@ -281,7 +283,7 @@ fn scratch_workspace(folder: &Path) -> Result<Workspace> {
     Workspace::beside(&target)
 }
 
-/// Temporary file with a path, removed when this value is dropped.
+/// Path for a temporary file. The file is removed when this value is dropped.
 #[derive(Debug)]
 pub struct ScratchFile {
     content: PathBuf,
@@ -340,12 +342,12 @@ pub fn with_user_path(error: Error) -> Error {
     }
 }
 
-/// Syncs a file to disk.
+/// Syncs the file at `path` to disk.
 fn sync(path: &Path) -> Result<()> {
     splat_platform::sync_file(path).map_err(Error::io("sync", path))
 }
 
-/// Syncs all files and folders below `folder` to disk.
+/// Syncs `folder`, and all files and folders below it, to disk.
 fn sync_tree(folder: &Path) -> Result<()> {
     for path in entries(folder)?.iter().map(|entry| folder.join(entry)) {
         if path.is_dir() { sync_tree(&path)? } else { sync(&path)? }

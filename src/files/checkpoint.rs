@@ -110,7 +110,7 @@ impl ValueType {
         !matches!(self, ValueType::Other(..))
     }
 
-    /// Decodes one stored floating-point value. Returns NaN for other types.
+    /// Decodes one floating-point value from its bytes `stored`. Returns NaN for types that are not floating-point.
     fn decode(self, stored: &[u8]) -> f32 {
         match (self, stored) {
             (ValueType::F16, &[a, b]) => f16::from_le_bytes([a, b]).to_f32(),
@@ -121,7 +121,7 @@ impl ValueType {
         }
     }
 
-    /// Encodes `value` into `stored`; writes zeros for types that are not floating-point.
+    /// Encodes `value` into the bytes `stored`. Writes zeros for types that are not floating-point.
     pub(crate) fn encode(self, value: f32, stored: &mut [u8]) {
         match self {
             ValueType::F16 => stored.copy_from_slice(&f16::from_f32(value).to_le_bytes()),
@@ -438,7 +438,7 @@ impl Checkpoint {
         Ok(values)
     }
 
-    /// Calls `take` with the name, kind and bytes of every file of the archive in order.
+    /// Calls `take` with the name, kind and content of every file in the checkpoint's zip archive, in order.
     ///
     /// # Errors
     /// Fails if a file is damaged or `take` fails.
@@ -475,7 +475,8 @@ pub(crate) enum CheckpointFile<'a> {
 /// Name of the pickle file in the archive.
 const PICKLE: &str = "data.pkl";
 
-/// Returns `name` without its first folder, which PyTorch names after the file or `archive`.
+/// Returns `name`, the path of a file in the archive, without its first folder. PyTorch calls this folder `archive` or
+/// like the file.
 fn without_first_folder(name: &str) -> &str {
     name.split_once('/').map_or(name, |(_, rest)| rest)
 }

@@ -10,7 +10,7 @@ pub(crate) fn known(value: Option<impl Display>) -> String {
     value.map_or(String::new(), |value| value.to_string())
 }
 
-/// Returns `field`, with an apostrophe in front if a spreadsheet would execute it as a formula.
+/// Returns the CSV field `field`, with an apostrophe put before it if a spreadsheet would execute it as a formula.
 fn without_formula(field: String) -> String {
     // Skip leading spaces as spreadsheets do. They also treat the full-width East Asian forms of these characters like
     // the plain ones.
@@ -19,7 +19,8 @@ fn without_formula(field: String) -> String {
     if runs && field.parse::<f64>().is_err() { format!("'{field}") } else { field }
 }
 
-/// Returns a table as CSV text. Fields with delimiters are quoted according to RFC 4180.
+/// Returns a table with the column `names` and the fields of `rows` as CSV text. Fields with delimiters are quoted
+/// according to RFC 4180.
 ///
 /// # Panics
 /// Panics if a row does not have as many fields as there are names.

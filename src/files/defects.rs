@@ -15,7 +15,7 @@ pub struct Defects {
     pub defective: usize,
     /// Number of dropped rows; a row with several defects counts once.
     pub dropped: usize,
-    /// One entry per kind of defect that was found. A row with several defects counts in several entries.
+    /// Counts per kind of defect that was found. A row with several defects counts in several entries.
     pub kinds: Vec<DefectCount>,
 }
 
@@ -26,7 +26,7 @@ pub struct DefectCount {
     pub what: String,
     /// Whether rows with this defect are dropped. Otherwise they are repaired as described by `why`.
     pub dropped: bool,
-    /// Reason for the treatment, and advice for the user.
+    /// Reason why the rows are dropped or repaired, and advice for the user.
     pub why: String,
     /// Number of rows with this defect.
     pub rows: usize,

@@ -17,8 +17,8 @@ use crate::render::Image;
 
 /// Reads the PNG at `path`, which must have `width` × `height` pixels.
 ///
-/// Gray is repeated into the three channels. Transparent pixels are blended over `background`: c·a + background·(1 −
-/// a), as the D-NeRF loaders do.
+/// Gray values are copied to the three channels. Transparent pixels (color c, opacity a) are blended over `background`
+/// as c·a + background·(1 − a), as in the D-NeRF loaders.
 ///
 /// # Errors
 /// Fails if the file is not a PNG, is damaged, or has another size.
@@ -53,7 +53,7 @@ pub fn read_png(path: &Path, (width, height): (u32, u32), background: [f32; 3]) 
         ColorType::Grayscale => values.iter().flat_map(|&gray| [gray; 3]).collect(),
         ColorType::GrayscaleAlpha => values.chunks_exact(2).flat_map(|p| over([p[0]; 3], p[1])).collect(),
         ColorType::Rgba => values.chunks_exact(4).flat_map(|p| over([p[0], p[1], p[2]], p[3])).collect(),
-        // Palettes are already expanded by the decoder.
+        // The decoder has already replaced palette indices by colors.
         ColorType::Rgb | ColorType::Indexed => values,
     };
     Ok(Image { width, height, data })

@@ -88,7 +88,7 @@ pub(crate) fn read_from<T, S: for<'de> DeserializeSeed<'de, Value = T>>(
     })
 }
 
-/// Reads the whole JSON document in the file at `path`, which may hold at most `most_bytes`.
+/// Reads the whole JSON document in the file at `path`, which may have at most `most_bytes` bytes.
 ///
 /// # Errors
 /// Fails like [`read_small`] and [`read`].

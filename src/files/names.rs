@@ -45,7 +45,7 @@ pub fn from_folder(path: &Path, folder: &Path) -> PathBuf {
     found.map_or_else(|| name_of(path).into(), PathBuf::from)
 }
 
-/// Returns `path` as an absolute path whose folders contain no links and no `..`.
+/// Returns `path` as an absolute path without links and `..` in its folders; `None` if it cannot be resolved.
 fn real_path(path: &Path) -> Option<PathBuf> {
     let absolute = std::path::absolute(path).ok()?;
     match (absolute.parent(), absolute.file_name()) {

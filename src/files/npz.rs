@@ -25,7 +25,7 @@ use crate::error::{Error, Result};
 
 /// Maximum number of arrays in an `.npz` archive.
 const MAX_ARRAYS: usize = 4096;
-/// Maximum size in bytes of the list of files at the end of an archive.
+/// Maximum size in bytes of the list of files that an archive has at its end.
 const MAX_LIST: u64 = 4 << 20;
 /// Maximum number of bytes of decoded arrays, in the scratch file, per byte of the archive; [`BASE_SCRATCH_BYTES`] are
 /// allowed in addition. Trained models need 1 to 2.
@@ -76,7 +76,7 @@ pub(crate) struct Float {
 }
 
 impl Float {
-    /// Little-endian float32.
+    /// The type that can be read without decoding: little-endian float32.
     const F32: Float = Float { bytes: 4, big_endian: false };
 
     /// Returns the type of the values if the header describes floating-point numbers in C order, else `None`.
@@ -174,7 +174,7 @@ impl Npz {
         &self.entries
     }
 
-    /// Returns the array called `name`, or `None`.
+    /// Returns the array called `name`; `None` if the archive has no such array.
     pub(crate) fn entry(&self, name: &str) -> Option<&NpzArray> {
         self.entries.iter().find(|entry| entry.name == name)
     }

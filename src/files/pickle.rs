@@ -26,13 +26,13 @@ pub(crate) const MAX_DEPTH: u8 = 100;
 /// tensors takes about 30 MB.
 const MAX_MEMORY: u64 = 128 << 20;
 
-/// Index of a node in [`Pickle`].
+/// Index of a node in the object tree of a [`Pickle`].
 pub(crate) type NodeId = u32;
 
 /// Node of the object tree of a pickle: one Python value.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum Node {
-    /// The value `None`.
+    /// The Python value `None`.
     None,
     /// A boolean.
     Bool(bool),
@@ -79,7 +79,7 @@ pub(crate) enum Wrong {
 }
 
 impl Wrong {
-    /// Builds the error for malformed content at byte `at`.
+    /// Builds the error for malformed content at byte `at` of the pickle.
     fn at(at: usize, found: impl Into<String>) -> Wrong {
         Wrong::Malformed(at, found.into())
     }
@@ -103,12 +103,12 @@ impl Pickle {
         self.root
     }
 
-    /// Returns node `id`.
+    /// Returns the node with index `id`.
     pub(crate) fn node(&self, id: NodeId) -> &Node {
         &self.nodes[id as usize]
     }
 
-    /// Returns the ids of all nodes.
+    /// Returns the indices of all nodes.
     pub(crate) fn ids(&self) -> std::ops::Range<NodeId> {
         0..self.nodes.len() as NodeId
     }

@@ -25,7 +25,7 @@ pub struct PlyFrames {
     counts: Vec<u32>,
     properties: Vec<Property>,
     sh_degree: usize,
-    /// Converted rows of each text file; `None` for binary files.
+    /// Converted rows of each frame that is a text file; `None` for binary files.
     texts: Vec<Option<TextRows>>,
     memory: ReadLimit,
 }

@@ -1,6 +1,7 @@
-//! A dynamic scene as one PLY file per frame.
+//! A dynamic scene stored as one PLY file per frame.
 //!
-//! Input: PLY files with the same Gaussians in the same order. Output: a [`FrameSource`]. Memory: as in [`PlyFrames`].
+//! Input: PLY files with the same Gaussians in the same order. Output: a [`FrameSource`], which reads any Gaussians at
+//! any frame. Memory: that of [`PlyFrames`].
 
 use std::ops::Range;
 use std::path::{Path, PathBuf};
@@ -11,7 +12,7 @@ use crate::error::{Error, Result, ShowPath};
 use crate::model::{Attributes, Gaussians, SequenceInfo};
 use crate::source::{BlockReader, Count, FrameSource, Ids, Reads};
 
-/// PLY files of the same Gaussians, one per frame.
+/// Dynamic scene stored as one PLY file per frame, with the same Gaussians in every file.
 #[derive(Debug)]
 pub struct PlySequence {
     frames: PlyFrames,
@@ -72,7 +73,7 @@ impl PlySequence {
         self.note.as_deref()
     }
 
-    /// Replaces the times of the frames; there must be one per frame.
+    /// Replaces the time stamps of the T frames by `times`, one per frame.
     ///
     /// # Errors
     /// Fails if the number of times is not T, or if times are not finite or not strictly increasing; the message names

@@ -40,7 +40,7 @@ impl fmt::Display for Literal {
     }
 }
 
-/// Keyword argument of a call.
+/// Keyword argument `key=value` of a call.
 #[derive(Debug)]
 pub(crate) struct Argument {
     pub(crate) name: String,
@@ -232,7 +232,7 @@ impl<'a> Parser<'a> {
         Ok(Some(Literal::Dict(entries)))
     }
 
-    /// Parses a string with its escape sequences.
+    /// Parses a string and replaces its escape sequences.
     fn string(&mut self) -> Parsed<String> {
         let open = self.at;
         let unterminated = ParseError { byte: open, expected: "a string with a closing quote" };
@@ -270,7 +270,7 @@ impl<'a> Parser<'a> {
                     value.push(c);
                     0
                 }
-                // Python keeps unknown escape sequences unchanged.
+                // Keep unknown escape sequences unchanged, as Python does.
                 Some((_, c)) => {
                     value.extend(['\\', c]);
                     0
@@ -283,7 +283,7 @@ impl<'a> Parser<'a> {
                     let Some(digit) = digit else { return Err(bad) };
                     code = code << 4 | digit;
                 }
-                // A lone surrogate, from a path that was not UTF-8, is not a char.
+                // A lone surrogate, as Python writes for a path that is not UTF-8, cannot be a char.
                 value.push(char::from_u32(code).unwrap_or(char::REPLACEMENT_CHARACTER));
             }
         }

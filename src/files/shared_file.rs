@@ -25,7 +25,7 @@ pub(crate) struct SharedFile {
 }
 
 impl SharedFile {
-    /// Opens the file at `path`.
+    /// Opens the regular file at `path`.
     ///
     /// # Errors
     /// Fails if the file cannot be opened.

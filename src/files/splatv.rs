@@ -36,13 +36,13 @@ pub const WORDS: usize = 16;
 /// opacity is multiplied by exp(−(dt/width)²).
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct SplatvGaussian {
-    /// Position at dt = 0, in scene units.
+    /// Position at dt = 0 (the center of the temporal window), in scene units.
     pub position: [f32; 3],
     /// Coefficients of dt, dt² and dt³ in the position, x, y, z for each, in scene units.
     pub motion: [f32; 9],
     /// Quaternion wxyz at dt = 0; its length may be any.
     pub rotation: [f32; 4],
-    /// Change of `rotation` per unit of time.
+    /// Change of the quaternion `rotation` per unit of time.
     pub omega: [f32; 4],
     /// Standard deviations along the three axes, in scene units.
     pub scale: [f32; 3],
@@ -91,7 +91,7 @@ fn used_bytes(map: &FileMap, texture: Range<usize>) -> usize {
     0
 }
 
-/// Open `.splatv` file.
+/// Open `.splatv` file of moving Gaussians.
 #[derive(Debug)]
 pub struct Splatv {
     path: PathBuf,

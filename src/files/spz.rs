@@ -155,8 +155,8 @@ fn sh_byte(k: usize, value: f32) -> u8 {
     byte(nearest.floor() * step)
 }
 
-/// Encodes a unit quaternion xyzw without its largest component. q and −q are the same rotation; the sign is chosen so
-/// that the largest component is positive.
+/// Encodes a unit quaternion xyzw in 32 bits: the index of its largest component, and the other three components. q and
+/// −q are the same rotation; the sign is chosen so that the omitted largest component is positive.
 fn smallest_three(q: [f64; 4]) -> u32 {
     let largest = (1..4).fold(0, |largest: usize, i| if q[i].abs() > q[largest].abs() { i } else { largest });
     let others = (0..4).filter(|&i| i != largest);
@@ -182,7 +182,7 @@ mod tests {
     use crate::model::Attributes;
     use crate::passes::gather_all;
 
-    /// Position, opacity, color, scales, rotation wxyz and SH coefficients of a Gaussian.
+    /// One Gaussian as read: position, opacity, color, scales, rotation wxyz and SH coefficients.
     type Row = (Vec<f64>, f64, Vec<f64>, Vec<f64>, [f64; 4], Vec<f64>);
 
     /// Reads an `.spz` file as the format specifies, without code shared with the writer.

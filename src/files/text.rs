@@ -35,7 +35,7 @@ pub(super) fn not_utf_8(path: &Path, place: u64, byte: u8) -> Error {
         .hint("save it as UTF-8: it may be in Latin-1 or another encoding")
 }
 
-/// Converts `bytes`, which begin at offset `start` of the file at `path`, to text. Fails if they are not UTF-8.
+/// Converts `bytes` to text. They begin at offset `start` of the file at `path`. Fails if they are not UTF-8.
 fn utf_8<'a>(path: &Path, bytes: &'a [u8], start: u64) -> Result<&'a str> {
     str::from_utf8(bytes).map_err(|error| {
         let at = error.valid_up_to();
@@ -46,7 +46,7 @@ fn utf_8<'a>(path: &Path, bytes: &'a [u8], start: u64) -> Result<&'a str> {
 /// Maximum length in bytes of a line that [`TextLines`] returns.
 const MAX_LINE: u64 = 1 << 16;
 
-/// Reader of the lines of a text file of any length.
+/// Reader that returns the lines of a text file one by one; the file may have any length.
 #[derive(Debug)]
 pub(crate) struct TextLines {
     path: PathBuf,

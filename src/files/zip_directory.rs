@@ -5,7 +5,7 @@ use std::io::{Error, Read, Result, Seek, SeekFrom};
 
 /// Length in bytes of the record at the end of an archive, without the archive's comment.
 const END_BYTES: u64 = 22;
-/// Maximum length of an archive's comment in bytes.
+/// Maximum length in bytes of the comment at the end of a zip archive.
 const MAX_COMMENT: u64 = 0xffff;
 /// Length in bytes of the record that locates the 64-bit end record, and ([`END_64_BYTES`]) of that end record itself.
 const LOCATOR_BYTES: u64 = 20;
@@ -16,7 +16,7 @@ const END_64_BYTES: u64 = 56;
 pub(crate) struct DeclaredDirectory {
     /// Number of files in the archive.
     pub(crate) entries: u64,
-    /// Number of bytes from the start of the list to the end of the archive.
+    /// Number of bytes from the start of the list of files to the end of the archive.
     pub(crate) bytes: u64,
 }
 

@@ -1,4 +1,4 @@
-//! Output of a zip writer that reports a failed write once, when it is closed.
+//! Output for a zip writer that reports a failed write once, when it is closed.
 
 use std::io::{self, Seek, SeekFrom, Write};
 

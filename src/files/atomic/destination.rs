@@ -8,7 +8,7 @@ use splat_platform::{FileKind, is_system_folder};
 use super::named::{MARKER, Owner, entries, split_target};
 use crate::error::{Error, Result, ShowPath};
 
-/// Kind of an output.
+/// Kind of an output: file or folder.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
     /// A single file.
@@ -39,7 +39,7 @@ pub(super) enum Destination {
     File,
     /// A folder.
     Folder,
-    /// A link to a folder.
+    /// A link that leads to a folder.
     FolderLink,
     /// A character device or FIFO, or a link to one. The output is written into the device or FIFO, which is never
     /// replaced.
@@ -78,7 +78,7 @@ pub(super) fn destination(target: &Path) -> Result<Destination> {
 /// Returns whether `target`, or one of the links that it leads to, lies in a system folder, as `/dev/stdout` does.
 fn leads_through_system_link(target: &Path) -> bool {
     let mut link = target.to_owned();
-    // Linux follows at most 40 links.
+    // Follow at most 40 links, as Linux does.
     for _ in 0..40 {
         let Ok((parent, name)) = split_target(&link) else { return false };
         let Ok(parent) = fs::canonicalize(parent) else { return false };
@@ -139,7 +139,7 @@ fn is_empty_folder(target: &Path) -> bool {
         && entries(target).is_ok_and(|entries| entries.is_empty())
 }
 
-/// Returns the real path of the folder that `target` is written into.
+/// Returns the real path (without links) of the folder that `target` is written into.
 ///
 /// # Errors
 /// Fails with [`Error::Usage`] if the target has no name, or if its folder does not exist or is not a folder.

@@ -83,7 +83,7 @@ pub(super) fn add_file_list(path: &Path, files: &[String]) -> Result<()> {
     fs::write(path, text).map_err(Error::io("write", path))
 }
 
-/// Returns the paths of all files below `folder`, relative to it and sorted.
+/// Returns the paths of all files below `folder`, relative to `folder` and sorted.
 pub(super) fn files_below(folder: &Path) -> Result<Vec<String>> {
     fn visit(folder: &Path, inside: &Path, out: &mut Vec<String>) -> Result<()> {
         for entry in entries(folder)? {

@@ -11,10 +11,10 @@ use splat_platform::{is_standard_output, open_stream};
 use super::destination::{Destination, destination};
 use crate::error::{Error, Result, ShowPath};
 
-/// Maximum time to wait for a program to open the other end of a FIFO.
+/// Maximum time to wait for another program to open a FIFO for reading.
 const MAX_WAIT: Duration = Duration::from_secs(10);
 
-/// Whether an output was written to standard output.
+/// Whether this process has written an output to standard output.
 static IS_STANDARD_OUTPUT_USED: AtomicBool = AtomicBool::new(false);
 
 /// Returns whether an output was written to the device or pipe that is standard output. The caller must then not print

@@ -1,4 +1,4 @@
-//! Warnings about failures after a result was put in place.
+//! Warnings about failures that leave an output complete, such as a failure to remove an earlier output.
 
 use std::sync::{Mutex, PoisonError};
 

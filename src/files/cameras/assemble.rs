@@ -29,7 +29,7 @@ pub(super) struct ListedImage {
     pub(super) time: Option<f64>,
     /// Split to which the image belongs: training, validation or test.
     pub(super) split: Split,
-    /// Path of the image file.
+    /// Path of the image file; `None` if the camera file states none.
     pub(super) image: Option<PathBuf>,
     /// View number, if the camera file states one.
     pub(super) view: Option<u32>,
@@ -256,7 +256,7 @@ pub(super) fn check(camera: &Camera) -> std::result::Result<(), (String, String)
         return Err(("a finite principal point".into(), format!("{cx} and {cy}")));
     }
     let defect = (rotation.transpose() * *rotation - DMat3::IDENTITY).to_cols_array();
-    // `all` rather than a maximum, because a maximum ignores NaN.
+    // Test `all` entries rather than their maximum, because a maximum would ignore NaN.
     if !defect.iter().all(|x| x.abs() <= ROTATION_TOLERANCE) {
         let worst = defect.iter().fold(0.0, |worst: f64, x| worst.max(x.abs()));
         return Err((

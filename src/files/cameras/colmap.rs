@@ -53,7 +53,7 @@ const MODELS: [(&str, usize, usize); 12] = [
     ("RAD_TAN_THIN_PRISM_FISHEYE", 16, 0),
 ];
 
-/// Size (width, height) of the images of a camera, and fx, fy, cx, cy, all in pixels.
+/// Camera of a COLMAP reconstruction: size (width, height) of its images and intrinsics fx, fy, cx, cy, all in pixels.
 #[derive(Debug, Clone, Copy)]
 struct Lens {
     size: (u32, u32),
@@ -306,7 +306,7 @@ impl<'a> Binary<'a> {
             .hint("it is cut short: copy it again")
     }
 
-    /// Reads `W` bytes; `what` names them in the error.
+    /// Reads the next `W` bytes. `what` names them in the error for a file that ends too early.
     fn bytes<const W: usize>(&mut self, what: &str) -> Result<[u8; W]> {
         if self.len - self.at < W as u64 {
             return Err(self.truncated(what));
@@ -317,17 +317,17 @@ impl<'a> Binary<'a> {
         Ok(bytes)
     }
 
-    /// Reads a `u32`.
+    /// Reads the next `u32`. `what` names it in errors.
     fn u32(&mut self, what: &str) -> Result<u32> {
         self.bytes(what).map(u32::from_le_bytes)
     }
 
-    /// Reads a `u64`.
+    /// Reads the next `u64`. `what` names it in errors.
     fn u64(&mut self, what: &str) -> Result<u64> {
         self.bytes(what).map(u64::from_le_bytes)
     }
 
-    /// Reads `W` values of type `f64`.
+    /// Reads the next `W` values of type `f64`. `what` names them in errors.
     fn f64s<const W: usize>(&mut self, what: &str) -> Result<[f64; W]> {
         let mut values = [0.0; W];
         for value in &mut values {
@@ -351,7 +351,7 @@ impl<'a> Binary<'a> {
     /// Skips `bytes` bytes. `None` stands for a length that overflowed and is an error.
     fn skip(&mut self, bytes: Option<u64>, what: &str) -> Result<()> {
         let Some(bytes) = bytes.filter(|&bytes| bytes <= self.len - self.at) else { return Err(self.truncated(what)) };
-        // File sizes fit into i64.
+        // The cast cannot overflow, because file sizes fit into i64.
         self.file.seek_relative(bytes as i64).map_err(Error::io("read", self.path))?;
         self.at += bytes;
         Ok(())

@@ -162,7 +162,7 @@ fn numbers<const W: usize>(value: &SmallValue) -> Option<[f64; W]> {
     Some(out)
 }
 
-/// Returns the matrix with these rows.
+/// Returns the matrix whose rows are `rows`.
 fn from_rows(rows: [[f64; 3]; 3]) -> DMat3 {
     DMat3::from_cols_array_2d(&rows).transpose()
 }

@@ -23,7 +23,7 @@ use crate::model::{Camera, Rig, Split};
 
 /// Number of values per camera: a 3 × 5 matrix and two depth bounds.
 const WIDTH: usize = 17;
-/// Number of frames of the original DyNeRF scenes.
+/// Default number of frames: that of the original DyNeRF scenes.
 const DEFAULT_FRAMES: usize = 300;
 
 /// Reads the cameras in `file`, each at every frame.

@@ -96,12 +96,13 @@ pub enum Clock {
     Given,
 }
 
-/// Reads the cameras of `path`: a file, or a folder that holds one. The format is recognized by file name and content.
+/// Reads the cameras of the data set at `path`, which is a camera file or a folder that contains one. The format is
+/// recognized by file name and content.
 ///
 /// # Errors
-/// [`Error::Input`] naming the file and the image ("frame 12" counts from 0 in file order) when a value is missing, not
-/// finite or out of range, when a matrix is not a rotation, or when a view occurs twice at the same time;
-/// [`Error::Usage`] when `options` are out of range.
+/// Fails with [`Error::Input`] if a value is missing, not finite or out of range, if a matrix is not a rotation, or if
+/// a view occurs twice at the same time. The message names the file and the image ("frame 12" counts from 0 in file
+/// order). Fails with [`Error::Usage`] if `options` are out of range.
 pub fn load(path: &Path, options: &CameraOptions) -> Result<Rig> {
     check_options(options)?;
     let Some(file) = locate(path) else {
@@ -182,17 +183,17 @@ fn is_colmap(path: &Path) -> bool {
 
 /// Format of a JSON camera file.
 enum Kind {
-    /// NeRF: camera to world, OpenGL axes.
+    /// `transforms*.json` of NeRF: camera-to-world poses in OpenGL axes, one entry per image.
     Transforms,
     /// This project's `cameras.json`: one entry per image.
     PerImage,
     /// 3DGS `cameras.json`: one entry per camera. Holds the number of cameras.
     PerCamera(usize),
-    /// Dynamic3DGaussians: one list of cameras per frame.
+    /// `train_meta.json` and `test_meta.json` of Dynamic3DGaussians: one list of cameras per frame.
     PerFrame,
 }
 
-/// Returns the format of a JSON camera file, recognized by the keys in its `outline`.
+/// Returns the format of a JSON camera file, recognized by the keys in its `outline` (the document without its images).
 fn kind(outline: &SmallValue) -> Option<Kind> {
     if let SmallValue::List(_, count) = outline {
         return Some(Kind::PerCamera(*count));

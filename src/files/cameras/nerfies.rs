@@ -95,7 +95,7 @@ fn names(file: &Path, counter: &mut MemoryCounter) -> Result<[Vec<Box<str>>; 3]>
 /// Reads the `warp_id` (time index) of each image in `ids`.
 fn warps(file: &Path, ids: &[Box<str>], counter: &mut MemoryCounter) -> Result<Vec<u32>> {
     counter.take(file, "", "the times of its images", 64 * ids.len() as u64)?;
-    // A name may occur twice in `ids`.
+    // Give each distinct name one index, because a name may occur twice in `ids`.
     let mut places: HashMap<&str, u32> = HashMap::with_capacity(ids.len());
     let mut found = Vec::new();
     for id in ids {

@@ -11,7 +11,8 @@ use serde_json::{Value, json};
 use super::{CameraOptions, find, load};
 use crate::model::{Camera, Rig, Split};
 
-/// Returns the folders of the trained models in `SPLATSIEVE_DATA`, else in `../shared/data`, which must exist.
+/// Returns the folders of three trained models, below the folder `SPLATSIEVE_DATA`, else below `../shared/data`. They
+/// must exist.
 fn shared_models() -> [PathBuf; 3] {
     let data = std::env::var_os("SPLATSIEVE_DATA")
         .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data"), PathBuf::from);
@@ -220,7 +221,7 @@ fn opengl_pose_becomes_an_opencv_camera() {
         fy: focal,
         cx: 40.0,
         cy: 30.0,
-        // Right is +x, down is −z, forward is +y.
+        // Camera axes in the world: right is +x, down is −z, forward is +y.
         rotation: DMat3::from_cols(DVec3::X, DVec3::NEG_Z, DVec3::Y).transpose(),
         translation: DVec3::new(0.0, 1.0, 4.0),
         near: Camera::NEAR,

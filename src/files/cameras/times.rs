@@ -1,9 +1,10 @@
 //! Finds the times of images whose camera file has none: from the numbers in their names, or from a table.
 //!
-//! The number of an image is NNN of a name `…tNNN_vNN…`, else the last number in its file name: 12 of
-//! `cam03/frame_00012.png`. Its time is (number − smallest)/(largest − smallest), so that the last image is at 1, as in
-//! the COLMAP loaders of the supported trainers. A table is a CSV of `name,time`. The name is the one in the camera
-//! file, or its last component, with or without extension. Times of a table are used as they are.
+//! The number of an image is NNN in a name of the form `…tNNN_vNN…`. In other names it is the last number in the file
+//! name, for example 12 in `cam03/frame_00012.png`. Its time is (number − smallest)/(largest − smallest), so that the
+//! last image is at 1, as in the COLMAP loaders of the supported trainers. A table is a CSV file with lines
+//! `name,time`. `name` is the image name in the camera file, or its last component, with or without extension. Times of
+//! a table are used as they are.
 
 use std::path::{Path, PathBuf};
 
@@ -27,7 +28,7 @@ pub enum Times {
     Own,
     /// The numbers in image names; every name must have one.
     Names,
-    /// No times: every image shows every frame.
+    /// No times: every image shows the scene at every frame.
     None,
     /// A CSV table of image names and times, at this path.
     Table(PathBuf),
@@ -43,7 +44,7 @@ impl Times {
         }
     }
 
-    /// Returns the text that [`Times::named`] parses to this value; `None` for [`Times::Own`].
+    /// Returns the text from which [`Times::named`] parses this value; `None` for [`Times::Own`].
     pub fn name(&self) -> Option<String> {
         match self {
             Times::Own => None,

@@ -66,7 +66,8 @@ fn split_of(file: &Path) -> Split {
     }
 }
 
-/// Returns the existing files of the other splits beside `file`; empty if `file` is not one of train, val and test.
+/// Returns those files of the other splits (train, val, test) that exist beside `file`; empty if `file` itself is none
+/// of the three.
 fn others(file: &Path) -> Vec<PathBuf> {
     const ALL: [&str; 3] = ["transforms_train.json", "transforms_val.json", "transforms_test.json"];
     let is_own = |name: &&str| file.file_name().is_some_and(|own| own.to_str() == Some(*name));
@@ -88,7 +89,7 @@ fn latest_in(file: &Path) -> Result<f64> {
     Ok(latest)
 }
 
-/// Adds the images of `file` to `assembly`.
+/// Adds the images listed in `file` to `assembly`.
 fn add(assembly: &mut Assembly, file: &Path, options: &CameraOptions) -> Result<()> {
     let outline = outline(file)?;
     let shared = CameraFields::new(file, None, &outline)?;
@@ -133,7 +134,7 @@ fn size(
     if let (Some(width), Some(height)) = (side("w")?, side("h")?) {
         return Ok((width, height));
     }
-    // A missing or unreadable image is not an error, because the options may give the size.
+    // Ignore a missing or unreadable image, because the options may give the size.
     image.and_then(measure).or(options.size).ok_or_else(|| {
         let tried = image.map_or_else(String::new, |image| format!(", or the image {}", image.shown()));
         own.wrong("w", format!("the image size as w and h{tried}"))

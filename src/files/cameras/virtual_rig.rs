@@ -1,5 +1,5 @@
-//! Virtual camera rigs for scenes without cameras: one around a moving scene, and one that views the surface of a still
-//! from all sides.
+//! Virtual cameras for scenes without cameras: a rig around a moving scene, and a rig that views the surface of a still
+//! (model without motion) from all sides.
 
 use glam::DVec3;
 
@@ -19,7 +19,7 @@ const NEAR: f64 = 0.1;
 const SIDE_PX: u32 = 512;
 
 /// Returns cameras on a Fibonacci sphere of radius 2 × `extent` around `center`, all looking at the center. Every
-/// camera sees every frame and is for training. [`crate::model::RobustBox`] gives `center` and `extent`.
+/// camera sees every frame and is a training view. [`crate::model::RobustBox`] gives `center` and `extent`.
 ///
 /// Camera k of n is at latitude asin(1 − (2k + 1)/n) and longitude k·π(3 − √5); z points up in the images. An extent
 /// that is zero, negative or not finite counts as 1, a center that is not finite as 0.
@@ -51,18 +51,19 @@ const SURROUNDING_CAMERAS: u32 = 24;
 const SURROUNDING_DISTANCE: f64 = 2.2;
 /// Field of view in degrees of the cameras around a still; the surface nearly fills the image.
 const SURROUNDING_FIELD_OF_VIEW_DEGREES: f64 = 49.0;
-/// Image width and height in pixels around a still.
+/// Image width and height in pixels, for the cameras around a still.
 const SURROUNDING_SIDE_PX: u32 = 320;
 /// Fraction of the total weight (visible area) of a still that defines the radius: Gaussians of this weight lie within
 /// it. Gaussians further away, mostly floaters and ground, are seen only where they are in front.
 const WEIGHT_WITHIN_RADIUS: f64 = 0.9;
 
-/// Returns cameras on a Fibonacci sphere around most of the visible surface of a still, all for training.
+/// Returns cameras on a Fibonacci sphere around most of the visible surface of a still (model without motion), all as
+/// training views.
 ///
 /// The center is the weighted median of `positions` for each axis. The radius is the distance within which nine tenths
-/// of the weight lie. `weights` are the area of each Gaussian: opacity times the product of its two larger scales.
-/// Weights above the 99th percentile are set to that percentile. The weighting ignores floaters, which are many and
-/// thin, and the limit keeps a backdrop of few huge Gaussians from dominating.
+/// of the weight lie. `weights` holds the visible area of each Gaussian: opacity times the product of its two larger
+/// scales. Weights above the 99th percentile are set to that percentile. The weights make floaters, which are many and
+/// thin, count little; their limit keeps a backdrop of few huge Gaussians from dominating.
 pub fn surrounding_rig(positions: &[DVec3], weights: &[f64]) -> Rig {
     let mut all: Vec<(DVec3, f64)> = positions
         .iter()

@@ -5,7 +5,7 @@ use std::io::{Cursor, Write};
 use zip::write::FileOptions;
 use zip::{CompressionMethod, ZipWriter};
 
-/// Value to be pickled.
+/// Python value to be written as a pickle.
 #[derive(Debug, Clone)]
 pub(crate) enum Made {
     None,
@@ -49,7 +49,7 @@ pub(crate) fn tensor(storage: usize, shape: &[usize], values: &[f32]) -> Pickled
     }
 }
 
-/// Returns dict items whose keys are texts.
+/// Converts dict items with text keys to items whose keys are pickled values.
 pub(crate) fn named(items: Vec<(&'static str, Made)>) -> Vec<(Made, Made)> {
     items.into_iter().map(|(key, value)| (Made::Text(key), value)).collect()
 }
@@ -95,7 +95,7 @@ impl Made {
         }
     }
 
-    /// Collects the storages of all tensors in this value, as (number, bytes).
+    /// Adds the storages (blocks of values) of all tensors in this value to `found`, as (number, bytes).
     fn storages(&self, found: &mut Vec<(usize, Vec<u8>)>) {
         match self {
             Made::Tensor(tensor) | Made::Parameter(tensor) => found.push((tensor.storage, tensor.bytes.clone())),
@@ -128,7 +128,7 @@ impl PickledTensor {
         out.extend(b"ctorch._utils\n_rebuild_tensor_v2\n((");
         Made::Text("storage").pickle(out);
         out.extend(format!("ctorch\n{}\n", self.class).bytes());
-        // Storage keys are numbers written as texts.
+        // The keys of storages are their numbers written as texts.
         let key = self.storage.to_string();
         out.extend([b"X", &(key.len() as u32).to_le_bytes()[..], key.as_bytes()].concat());
         Made::Text("cuda:0").pickle(out);

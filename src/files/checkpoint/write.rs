@@ -132,7 +132,7 @@ impl<'a> StoragePart<'a> {
         let row: usize = tensor.shape.iter().skip(1).product();
         let mut stride = tensor.stride.clone();
         // A tensor whose rows follow one another without gaps keeps its strides. Every other tensor keeps the order of
-        // its axes, but loses its gaps.
+        // its axes, but is stored without gaps.
         let is_dense = stride.first() == Some(&row) && {
             let row_view = TensorView {
                 offset: 0,

@@ -26,7 +26,7 @@ pub(super) struct HeldTiles {
     locks: Vec<Mutex<()>>,
     /// Maximum number of bytes of tile values kept.
     capacity: AtomicU64,
-    /// Bytes of `capacity` that are still free.
+    /// Bytes of `capacity` that are not used yet.
     left: AtomicU64,
     /// Whether a tile did not fit into the remaining bytes. From then on the sizes of further tiles are not looked up.
     full: AtomicBool,

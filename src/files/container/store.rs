@@ -28,7 +28,7 @@ pub struct Container {
     pub(super) states: Count,
 }
 
-/// Buffers for decoding a tile.
+/// Buffers in which a tile is decoded.
 #[derive(Default)]
 pub(super) struct TileScratch {
     pub(super) buffer: TileBuffer,
@@ -115,7 +115,7 @@ impl Container {
         &self.reader
     }
 
-    /// Returns the path of the file.
+    /// Returns the path of the container file.
     pub fn path(&self) -> &Path {
         &self.path
     }

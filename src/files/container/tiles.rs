@@ -40,7 +40,7 @@ pub(super) struct FrameValues {
     /// Frames whose values are stored, increasing. Empty if the values are the same in all frames of the block and
     /// stored once.
     frames: Vec<usize>,
-    /// Values, `[frames, width, len]`.
+    /// Values `[frames, width, len]` for the stored frames, the components of the column, and the Gaussians.
     pub(super) values: Vec<f32>,
 }
 
@@ -69,7 +69,7 @@ pub(super) struct TileReader<'a> {
     pub(super) whole: bool,
     /// Numbers of the frames that will be read.
     plan: ReadPlan,
-    /// Last frame block for which the operating system was told which tiles come next.
+    /// Last frame block for which the operating system was told which tiles will be read next.
     announced_block: Option<u32>,
     /// Values kept of each column, in the order of [`Container::places`].
     pub(super) kept: Vec<KeptColumn>,
@@ -82,7 +82,7 @@ pub(super) struct TileReader<'a> {
 }
 
 impl<'a> TileReader<'a> {
-    /// Returns a reader of the Gaussians `ids`.
+    /// Returns a reader of the Gaussians with the indices `ids`.
     pub(super) fn new(source: &'a Container, ids: &Ids<'_>) -> TileReader<'a> {
         let block = source.reader.layout().gaussian_block as usize;
         let mut runs: Vec<TileRun> = Vec::new();
@@ -243,7 +243,7 @@ impl<'a> TileReader<'a> {
         let (column, place) = source.places[index];
         let width = column.width(source.info.sh_degree);
         let frame_block = self.frame_block(frames[0]);
-        // A single frame of many is copied from the file, which is cheaper than mapping and releasing its pages.
+        // Copy a single frame of many from the file, which is cheaper than mapping and releasing its pages.
         let in_place = frames.len() > 1 || !source.info.varying.contains(column);
         let mut lent = source.scratch();
         let TileScratch { buffer, frames: tile, plane: plane_buffer } = &mut *lent;

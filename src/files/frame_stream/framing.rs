@@ -18,7 +18,7 @@ pub struct StreamHeader {
     pub count: usize,
     /// SH degree, 0 to 3.
     pub sh_degree: usize,
-    /// Attributes that are stored with every frame; the others are stored once.
+    /// Attributes that are stored with every frame. The others are constant and stored once, after the header.
     pub varying: Attributes,
     /// Whether frames are unlinked (version 2): every frame states its own number of Gaussians, and the same index in
     /// two frames does not mean the same Gaussian.
@@ -51,7 +51,7 @@ const FOREIGN_OUTPUT: &str = "whatever the exporter prints must go to standard e
 impl StreamHeader {
     /// Length of the header in bytes.
     pub(crate) const BYTES: usize = 32;
-    /// First bytes of every stream, chosen like those of the container.
+    /// First bytes of every stream, built like the first bytes of a container file.
     pub(crate) const MAGIC: [u8; 8] = *b"\x89GSTR\r\n\x1a";
 
     /// Returns the number of bytes that the varying attributes of one frame take if all frames have the same Gaussians.
@@ -117,7 +117,7 @@ impl StreamHeader {
 }
 
 impl FrameMark {
-    /// Length of a mark in bytes.
+    /// Length of a mark in bytes; marks precede frames and the end of the stream.
     pub(crate) const BYTES: usize = 24;
 
     /// Returns the bytes of the mark as stored in the stream.

@@ -36,7 +36,7 @@ pub struct FrameStream<R> {
 #[derive(Debug)]
 struct CountingReader<R> {
     from: R,
-    /// Name of the stream in messages.
+    /// Name of the stream in error messages.
     name: PathBuf,
     received: u64,
 }
@@ -80,7 +80,7 @@ impl<R: Read> FrameStream<R> {
         &self.constant
     }
 
-    /// Returns the constant attributes and leaves [`FrameStream::constant`] empty.
+    /// Takes the attributes that are constant over all frames. Afterwards [`FrameStream::constant`] is empty.
     pub fn take_constant(&mut self) -> Gaussians {
         std::mem::take(&mut self.constant)
     }
@@ -143,7 +143,7 @@ impl<R: Read> FrameStream<R> {
 }
 
 impl<R: Read> CountingReader<R> {
-    /// Reads until `into` is full or the stream ends. Returns the number of bytes read.
+    /// Reads bytes until `into` is full or the stream ends. Returns the number of bytes read.
     fn read_up_to(&mut self, into: &mut [u8]) -> Result<usize> {
         let mut got = 0;
         while got < into.len() {

@@ -60,7 +60,7 @@ pub fn image_bytes(image: &Image, format: ImageFormat) -> io::Result<Vec<u8>> {
     Ok(out)
 }
 
-/// Writes `image` in `format` to `out`.
+/// Encodes `image` in the file format `format` and writes the bytes to `out`.
 fn write(out: &mut impl Write, image: &Image, format: ImageFormat) -> io::Result<()> {
     match format {
         ImageFormat::Png => write_png(out, image),

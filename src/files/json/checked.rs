@@ -6,13 +6,13 @@ use std::path::{Path, PathBuf};
 use crate::error::Error;
 use crate::files::text::{not_utf_8, without_mark};
 
-/// Number of bytes that are read and checked together.
+/// Size of the buffer in bytes: this many bytes are read and checked together.
 const BUFFER: usize = 1 << 16;
 /// Maximum length in bytes of a string without its quotes.
 const MAX_TEXT: u32 = 1 << 20;
-/// Maximum length of a number in bytes.
+/// Maximum length in bytes of a number in a JSON file.
 const MAX_NUMBER: u32 = 1 << 10;
-/// Maximum nesting depth of lists and objects.
+/// Maximum nesting depth of lists and objects in a JSON file.
 const MAX_DEPTH: u32 = 64;
 
 /// Kind of token that the byte read last belongs to.

@@ -27,7 +27,7 @@ pub(crate) enum SmallValue {
     /// First elements of a list, and the number of all its elements.
     List(Vec<SmallValue>, usize),
     Object(Object),
-    /// Value too large for a camera file, replaced by a description for messages.
+    /// Value larger than any in a camera file. It is replaced by a description for messages.
     Large(Box<str>),
 }
 
@@ -91,7 +91,7 @@ impl SmallValue {
         }
     }
 
-    /// Describes the value for a message.
+    /// Returns a description of the value for messages.
     pub(crate) fn describe(&self) -> String {
         const LONGEST: usize = 120;
         match self {

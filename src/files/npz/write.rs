@@ -103,7 +103,8 @@ pub(crate) fn write_like(
     archive.finish().map_err(Into::into).and_then(ZipOutput::close).map_err(failed)
 }
 
-/// Returns the header of an array in version 1.0 of NumPy's format: a dictionary padded to a multiple of 64 bytes.
+/// Returns the header of a NumPy array file, in version 1.0 of the format: a dictionary padded to a multiple of 64
+/// bytes.
 fn header(descr: &str, is_fortran: bool, shape: &[usize]) -> Vec<u8> {
     let order = if is_fortran { "True" } else { "False" };
     let lengths: String = shape.iter().map(|length| format!("{length}, ")).collect();

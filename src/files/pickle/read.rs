@@ -94,7 +94,7 @@ impl<'a> PickleMachine<'a> {
         }
     }
 
-    /// Executes one instruction. Returns the root node after the last one.
+    /// Executes the next instruction. Returns the root node of the object tree after the last instruction, else `None`.
     fn step(&mut self) -> Result<Option<NodeId>, Wrong> {
         let start = self.at;
         self.count_instruction(start)?;

@@ -127,7 +127,8 @@ impl AsciiLines<'_> {
         Ok(())
     }
 
-    /// Reads the next line that is not blank. Returns false at the end of the file.
+    /// Reads the next line that is not blank, which should hold `numbers` numbers. Returns false at the end of the
+    /// file.
     fn read_line(&mut self, numbers: usize) -> Result<bool> {
         let most = LINE_BYTES + LINE_BYTES_PER_NUMBER * numbers as u64;
         loop {
@@ -155,7 +156,7 @@ fn place(element: &Element) -> String {
     format!("element {}", element.name)
 }
 
-/// Returns the error for a word that is not a number of the type of its property.
+/// Returns the error for `word` in a text PLY file, which is not a number of the type of `property`.
 fn unreadable(path: &Path, line: usize, property: &Property, word: &[u8]) -> Error {
     let expected = format!("a number of type {} for property {}", property.scalar.name(), quoted(&property.name));
     let word = String::from_utf8_lossy(&word[..word.len().min(60)]);

@@ -24,7 +24,7 @@ pub enum PlyEncoding {
 }
 
 impl PlyEncoding {
-    /// Returns the encoding that a `format` line calls `name`.
+    /// Returns the encoding that the `format` line of a header calls `name`.
     fn parse(name: &str) -> Option<PlyEncoding> {
         match name {
             "ascii" => Some(PlyEncoding::Ascii),
@@ -116,7 +116,7 @@ pub(crate) struct Element {
 pub(crate) struct PlyHeader {
     pub(crate) encoding: PlyEncoding,
     pub(crate) elements: Vec<Element>,
-    /// Texts of the `comment` lines, in order.
+    /// Texts of the `comment` lines of the header, in order.
     pub(crate) comments: Vec<String>,
     /// Bytes of the header, up to and including the line end of `end_header`.
     pub(crate) text: Vec<u8>,

@@ -87,7 +87,7 @@ pub struct Ply {
 /// Body of a PLY file: the tables of all elements, after the header.
 #[derive(Debug)]
 struct PlyBody {
-    /// Memory map of the whole file, or of the converted rows of a text file.
+    /// Memory map of the whole file; for a text file, of its converted rows in the scratch file.
     map: FileMap,
     /// Offset in bytes of the tables in the map.
     start: usize,
@@ -196,7 +196,7 @@ impl Ply {
         self.layout.sh_degree
     }
 
-    /// Returns the texts of the `comment` lines, in order.
+    /// Returns the texts of the `comment` lines of the header, in order.
     pub fn comments(&self) -> &[String] {
         &self.header.comments
     }
@@ -348,7 +348,7 @@ fn encoding_changed(path: &Path) -> Error {
         .hint("the file has changed since it was opened")
 }
 
-/// Checks that every id is below `count`.
+/// Checks that every index in `ids` is below the number of Gaussians `count`.
 pub(crate) fn check_ids(path: &Path, ids: &Ids<'_>, count: usize) -> Result<()> {
     let beyond = match ids {
         Ids::Range(range) => (range.end > count && !range.is_empty()).then(|| range.end - 1),

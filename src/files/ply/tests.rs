@@ -90,7 +90,7 @@ fn expected(count: usize, names: &[String]) -> Gaussians {
         out.rotation.set_row(i, [property("rot_0"), property("rot_1"), property("rot_2"), property("rot_3")]);
         out.log_scale.set_row(i, [property("scale_0"), property("scale_1"), property("scale_2")]);
         out.opacity_logit.set_row(i, [property("opacity")]);
-        // Coefficients 1, 2, 3 of red are f_rest_0..2, of green 3..5, of blue 6..8.
+        // For SH degree 1, coefficients 1, 2, 3 of red are f_rest_0..2, those of green 3..5, and those of blue 6..8.
         out.sh.set_row(
             i,
             [
@@ -319,7 +319,8 @@ fn truncated_files_are_refused() {
     let path = folder.path().join("a.ply");
     for format in ["ascii", "binary_little_endian", "binary_big_endian"] {
         let bytes = file(format, "float", &names(), 3, "\n");
-        // A text file may lose the space and line end after its last number, and some of its digits.
+        // A text file that lacks the space and line end after its last number, or some digits of this number, is still
+        // valid.
         let whole = if format == "ascii" { bytes.len() - 4 } else { bytes.len() };
         for len in 0..whole {
             assert!(!open_and_read(&bytes[..len], &path), "{format} cut to {len} of {} bytes", bytes.len());

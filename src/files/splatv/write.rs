@@ -23,7 +23,7 @@ const DEFAULT_CAMERA: usize = 4;
 /// Distance in time from the center of the temporal window, as a multiple of its width, at which an opacity of 1 has
 /// fallen to 1/255.
 const VISIBLE_WIDTHS: f64 = 2.36;
-/// Number of texels per Gaussian.
+/// Number of texels of the texture that store one Gaussian.
 const TEXELS_PER_GAUSSIAN: usize = 4;
 
 /// Returns the words that store `row` for a viewer. Values beyond the range of half precision become the largest finite
@@ -229,7 +229,8 @@ mod tests {
         let header = 8 + u32::from_le_bytes(whole[4..8].try_into().unwrap()) as usize;
         for length in (0..200).chain((200..whole.len()).step_by(997)) {
             std::fs::write(&path, &whole[..length]).unwrap();
-            // A file that ends after a whole row is not padded; one that ends within a row is truncated.
+            // A file may end after a whole row (then only the padding is missing); one that ends within a row is
+            // truncated.
             let rows = length.checked_sub(header).filter(|bytes| *bytes > 0 && bytes % ROW_BYTES == 0);
             if let Some(bytes) = rows {
                 let file = Splatv::open(&path).unwrap();

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use super::*;
 
-/// Tensor as a pickle describes it: storage class, storage bytes, offset, shape, strides.
+/// Tensor as a pickle describes it: storage class, bytes of the storage (block of values), offset, shape, strides.
 struct Entry {
     name: &'static str,
     class: &'static str,

@@ -16,7 +16,7 @@ use zip::{CompressionMethod, DateTime, ZipWriter};
 use crate::error::{Error, Result};
 use crate::files::zip_output::ZipOutput;
 
-/// Alignment of the values of each tensor in the file, in bytes, as in PyTorch.
+/// Alignment in bytes of the values of each tensor in the file, as in files that PyTorch writes.
 const ALIGNMENT: u16 = 64;
 
 /// Tensor in the layout in which it is stored: the element with indices `i` is value `offset + Σ i·stride` of `values`.
@@ -38,14 +38,14 @@ pub(crate) struct StoredTensor {
 /// Stored values of a tensor.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum TensorValues {
-    /// IEEE 754 binary32.
+    /// 32-bit floating-point values (IEEE 754 binary32).
     F32(Vec<f32>),
-    /// IEEE 754 binary16.
+    /// 16-bit floating-point values (IEEE 754 binary16).
     F16(Vec<f16>),
 }
 
 impl TensorValues {
-    /// Returns the number of values.
+    /// Returns the number of stored values.
     pub(crate) fn len(&self) -> usize {
         match self {
             TensorValues::F32(values) => values.len(),
@@ -53,7 +53,7 @@ impl TensorValues {
         }
     }
 
-    /// Returns the number of bytes of each value.
+    /// Returns the number of bytes of one value.
     pub(crate) fn width(&self) -> usize {
         match self {
             TensorValues::F32(_) => size_of::<f32>(),

@@ -1,4 +1,4 @@
-//! Tests of COLMAP reconstructions.
+//! Tests of reading cameras from COLMAP reconstructions.
 
 use std::fs;
 use std::path::Path;
@@ -63,7 +63,7 @@ fn colmap_text_and_binary_give_the_same_rig() {
     let [times, splits] =
         [&text, &binary].map(|rig| rig.shots.iter().map(|shot| (shot.time, shot.split)).collect::<Vec<_>>());
     assert_eq!(times, splits);
-    // Images are in natural order of their names, not in COLMAP's order.
+    // The images are in natural order of their names, not in the order of the COLMAP file.
     assert_eq!(times, [(Some(0.0), Split::Train), (Some(1.0), Split::Train), (Some(0.5), Split::Test)]);
     let first = &text.cameras[0];
     assert_eq!((first.width, first.height, first.fx, first.fy, first.cx, first.cy), (80, 60, 70.0, 71.0, 39.5, 31.0));
