@@ -15,7 +15,7 @@ pub type Result<T> = std::result::Result<T, Error>;
 ///
 /// | exit code | kind | meaning |
 /// |---|---|---|
-/// | 0 | – | Success. Also: the requested part of the work is done. |
+/// | 0 | – | Success, or the requested shard (part) of the work is finished. |
 /// | 1 | [`Input`](ErrorKind::Input) | An input file is missing, malformed, or larger than allowed. |
 /// | 1 | [`Output`](ErrorKind::Output) | The result or a temporary file cannot be written. |
 /// | 1 | [`Internal`](ErrorKind::Internal) | A bug in splatsieve, or the self-check failed. |

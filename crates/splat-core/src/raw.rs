@@ -7,7 +7,8 @@ use super::{AttributeValues, Attributes, Gaussians};
 /// Stored parameters of N Gaussians, from which a model format computes their attributes at every time.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct StoredParams {
-    /// Attributes that every model format has, in stored encoding.
+    /// Stored parameters that every model format has: position, rotation, log scales, opacity logit and SH
+    /// coefficients.
     pub gaussians: Gaussians,
     /// Further parameters that only this model format has (velocities, time windows, features): one plane per
     /// parameter, with its value for every Gaussian, in an order that the format defines. Has no planes if there are

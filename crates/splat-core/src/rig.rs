@@ -44,7 +44,8 @@ pub struct Rig {
     pub shots: Vec<Shot>,
     /// Background color, linear RGB in [0, 1], if the camera file gives one.
     pub background: Option<[f32; 3]>,
-    /// Source of the cameras for messages: the path of the camera file, or a description of a virtual rig.
+    /// Source of the cameras for messages: the path of the camera file, or a description of a virtual rig (cameras that
+    /// the program made up).
     pub origin: String,
 }
 

@@ -31,7 +31,7 @@ pub enum Statistic {
     Kappa,
     /// Variance of the opacity over time, see [`Rows::v`].
     V,
-    /// Number of frames in which the Gaussian is visible by its opacity, see [`Rows::life`].
+    /// Number of frames in which the opacity reaches a threshold, see [`Rows::life`].
     Life,
     /// Mean contribution to a render, see [`Rows::c`].
     C,
@@ -168,7 +168,7 @@ impl Statistic {
 pub struct Rows {
     /// Trajectory magnitude D: root mean square of the distance moved between successive frames, scene units per frame.
     pub d: Vec<f64>,
-    /// Curvature κ: mean norm of the second difference of the position, scene units per frame².
+    /// Curvature κ: mean norm of the second difference of the position over time, scene units per frame².
     pub kappa: Vec<f64>,
     /// Variance V of the opacity over the life span (the frames in which the opacity reaches a threshold).
     pub v: Vec<f64>,
@@ -183,7 +183,8 @@ pub struct Rows {
     /// Anisotropy E of the canonical (time-independent) scales: the ratio of the largest to the smallest, or in the
     /// logarithmic form ln(largest/middle).
     pub e: Vec<f64>,
-    /// Fraction of (frame, view) pairs in which the Gaussian is alive and touches the image.
+    /// Fraction of (frame, view) pairs in which the opacity of the Gaussian reaches a threshold and the Gaussian
+    /// touches the image.
     pub vis: Vec<f64>,
     /// Anomalies that the pass over all frames found.
     pub flags: Vec<Flags>,

@@ -1,7 +1,7 @@
 //! Deformation field of a 4DGaussians model: plane features, an MLP shared by all attributes (the trunk), and one small
 //! MLP per attribute (the heads).
 //!
-//! Input: tensors of a state dict, canonical positions, a time. Output: for each Gaussian the deltas of its attributes,
+//! Input: tensors of a state dict, stored positions, a time. Output: for each Gaussian the deltas of its attributes,
 //! and a mask that multiplies its stored attributes. Memory: the tensors, [`Field::bytes_per_gaussian`] per prepared
 //! Gaussian, and per reader about 4·LANES·(features + trunk + heads) bytes of buffers, where the sum is of the widths
 //! of these layers. Source: Wu et al., "4D Gaussian Splatting for Real-Time Dynamic Scene Rendering", 2024, and the
@@ -49,8 +49,8 @@ pub(super) enum Mask {
     Voxel(VoxelMask),
 }
 
-/// Small MLP that computes the deltas of one attribute, or the mask, from the output of the trunk after ReLU: hidden
-/// layer, ReLU, output layer.
+/// Small MLP that computes the deltas of one attribute, or the mask (factor on stored attributes), from the output of
+/// the trunk (the MLP shared by all attributes) after ReLU: hidden layer, ReLU, output layer.
 #[derive(Debug, Clone)]
 pub(super) struct Head {
     /// Attribute whose deltas the head computes; `None` if it computes the mask of the option `static_mlp`.
@@ -87,7 +87,7 @@ enum PreparedInput {
     Position(AttributeValues),
 }
 
-/// Reusable buffers for the outputs of the layers of a field, for one reader.
+/// Reusable buffers for the outputs of the layers of a field. Each reader of frames has its own.
 #[derive(Debug, Clone, Default)]
 pub struct Scratch {
     features: Vec<CacheLine>,
@@ -324,8 +324,8 @@ pub(super) fn position_time_features(positions: [&[f32]; 3], time: f32, features
     }
 }
 
-/// Evaluates the layers of the trunk for `input` and returns the output of the last one after ReLU, which every head
-/// reads.
+/// Evaluates the layers of the trunk (the MLP shared by all attributes) for `input`. Returns the output of the last
+/// layer after ReLU, which every head (MLP of one attribute) reads.
 #[inline(always)]
 fn run_trunk<'a, const FMA: bool>(
     layers: &[Linear],

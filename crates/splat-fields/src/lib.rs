@@ -48,7 +48,7 @@ pub use network::{Encoded, Network, PredictedMotion};
 pub use planes::{Box3, Tap, tap, unread_rows};
 pub use tensors::{Tensor, Tensors};
 
-/// Compiles the example of the README.
+/// Compiles the example in the README of this crate as a documentation test.
 #[cfg(doctest)]
 #[doc = include_str!("../README.md")]
 mod readme {}

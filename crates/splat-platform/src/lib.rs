@@ -195,7 +195,7 @@ pub struct TruncatedMapMessage {
     pub after: &'static str,
 }
 
-/// Compiles the example of the README.
+/// Compiles the example in the README of this crate as a documentation test.
 #[cfg(doctest)]
 #[doc = include_str!("../README.md")]
 mod readme {}

@@ -97,8 +97,8 @@ pub(super) struct Splat {
     /// Opacity of the Gaussian, in [0, 1].
     pub(super) opacity: f32,
     /// Depth in scene units, computed in f32 like in the original CUDA rasterizer. Its rounding decides which of two
-    /// almost equally deep Gaussians is in front (without it, one render agreed with the original to 81 instead of 116
-    /// dB).
+    /// almost equally deep Gaussians is in front (without this rounding, one render agreed with the original to 81 dB
+    /// instead of 116 dB).
     pub(super) sort_depth: f32,
     /// Color of the Gaussian in this view: red, green and blue.
     pub(super) color: [f32; 3],

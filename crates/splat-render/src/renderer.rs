@@ -51,7 +51,7 @@ impl Image {
     }
 }
 
-/// Renders `gaussians` from `camera` over the color `background`, on all threads of the pool.
+/// Renders `gaussians` from `camera` over the color `background`, on all threads of the rayon pool.
 ///
 /// An image without pixels stays empty, and without Gaussians every pixel is `background`. Scales are clamped to e^±80.
 /// A zero quaternion counts as the identity; a NaN color counts as 0.
@@ -63,7 +63,7 @@ pub fn render(gaussians: &Gaussians, camera: &Camera, background: [f32; 3]) -> I
 }
 
 /// Adds the visible contribution of each Gaussian in the view of `camera` (alpha · transmittance, summed over pixels)
-/// to `seen`, on all threads of the pool. SH coefficients are not read.
+/// to `seen`, on all threads of the rayon pool. SH coefficients are not read.
 ///
 /// Only every `stride`-th pixel in both directions is sampled: those whose coordinates have the remainder `stride / 2`
 /// modulo `stride`. Footprints are those of the full image. The sums are over the sampled pixels, so a stride of s
@@ -102,12 +102,12 @@ impl Renderer {
         Renderer::with_parallel(false)
     }
 
-    /// Creates a renderer that uses all threads of the pool. Suits views that must be rendered one after another.
+    /// Creates a renderer that uses all threads of the rayon pool. Suits views that must be rendered one after another.
     pub fn on_all_threads() -> Self {
         Renderer::with_parallel(true)
     }
 
-    /// Creates a renderer that uses all threads of the pool if `parallel`, otherwise only the calling thread.
+    /// Creates a renderer that uses all threads of the rayon pool if `parallel`, otherwise only the calling thread.
     fn with_parallel(parallel: bool) -> Self {
         Renderer {
             parallel,

@@ -1,5 +1,5 @@
-//! Handling of an input file that is mapped to memory and that another program truncates: the process ends with an
-//! error that names the file instead of the signal SIGBUS.
+//! Handling of an input file that is mapped to memory while another program truncates it: the process ends with an
+//! error message that names the file, and is not killed by the signal SIGBUS.
 //!
 //! Readers check the length of a file before they access its memory map, but the file may shrink in between. The kernel
 //! then sends SIGBUS to the thread that touches the missing page. Reading cannot continue, so the handler reports the

@@ -69,7 +69,7 @@ struct Mount {
     point: PathBuf,
     /// File system type: `cgroup2`, or `cgroup` for version 1.
     kind: String,
-    /// Whether groups of this hierarchy limit memory. Some version 1 hierarchies do not.
+    /// Whether the control groups of this hierarchy can limit memory. Some hierarchies of version 1 cannot.
     limits_memory: bool,
 }
 

@@ -157,8 +157,8 @@ static END: Mutex<Option<End>> = Mutex::new(None);
 
 /// Installs a handler for Ctrl+C, Ctrl+Break and closing the console. The handler calls `clean_up` and ends the process
 /// with the code that `exit_code` returns for the number that the signal has on Linux and macOS: 2 for Ctrl+C and
-/// Ctrl+Break, 15 for a closed console. The value that `clean_up` returns is kept until then. If the process is
-/// terminated in another way, it ends without `clean_up`.
+/// Ctrl+Break, 15 for a closed console. The value that `clean_up` returns is kept until the process ends. If the
+/// process is terminated in another way, it ends without `clean_up`.
 pub fn end_on_signals<T>(clean_up: impl FnOnce() -> T + Send + 'static, exit_code: fn(u8) -> u8) {
     let end = Box::new(move |signal| {
         let _kept = clean_up();

@@ -31,7 +31,7 @@ const SPAN: usize = 32 * BLOCK;
 
 /// Bytes of memory per visible Gaussian for a render and its gradient.
 pub const GRADIENT_BYTES_PER_VISIBLE: usize = BYTES_PER_VISIBLE + size_of::<SplatSums<f64>>();
-/// Maximum number of (splat, tile) pairs whose gradient sums are in memory. Strips of tiles with more pairs are
+/// Maximum number of (splat, tile) pairs whose gradient sums are in memory. A strip of tiles with more pairs is
 /// processed in parts.
 const SUMMED_PAIRS: usize = STRIP_PAIRS / 4;
 

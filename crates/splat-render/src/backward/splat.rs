@@ -299,7 +299,7 @@ impl GeometryGradient {
         let (ss, st, tt) = (per_s * per_s * xx, per_s * per_t * xy, per_t * per_t * yy);
         // For each axis of the Gaussian, computes ∂L/∂log scale, ∂L/∂a and ∂L/∂b.
         let by_axis = |j: usize| {
-            // Components of the axis in s and t.
+            // Components of the axis along s and t.
             let (along_s, along_t) = (per_s * (a[j] - shear * b[j]), per_t * b[j]);
             let (by_s, by_t) = (ss * along_s + st * along_t, st * along_s + tt * along_t);
             let by_a = per_s * by_s;

@@ -136,9 +136,9 @@ pub(super) trait Lanes: Copy {
 
 /// Sums over the groups with even index, and separately over those with odd index.
 ///
-/// Separate sums halve the number of additions that wait for each other, as the two groups of a vector never do. A
-/// vector of one group is always added to the first sums; the caller swaps the two sums after all groups with even
-/// index.
+/// With separate sums, an addition waits for half as many earlier ones, because the two groups of a vector are added to
+/// different sums. A vector of one group is always added to the first sums; the caller swaps the two sums after all
+/// groups with even index.
 pub(super) trait EvenOddSums: Copy {
     type Sums: Sums;
     /// Returns sums that are all 0.

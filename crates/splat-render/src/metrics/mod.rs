@@ -1,7 +1,8 @@
 //! Image metrics: PSNR, SSIM, FLIP, and the temporal error (of the differences between successive frames).
 //!
 //! Input: pairs of [`Image`]s of equal size. Output: one f64 per pair. Values are clamped to [0, 1] first, as on a
-//! screen, and all sums are in f64. Memory: [`BYTES_PER_PIXEL`] per pixel; FLIP, the code of its authors, takes more.
+//! screen, and all sums are in f64. Memory: [`BYTES_PER_PIXEL`] per pixel; FLIP takes what the code of its authors
+//! needs.
 
 mod flip;
 mod ssim;
