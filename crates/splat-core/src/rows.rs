@@ -211,7 +211,7 @@ impl Rows {
         self.d.is_empty()
     }
 
-    /// Appends the statistics of the next block of Gaussians, which are moved out of `next` and leave it empty.
+    /// Appends the statistics in `next`, those of the following block of Gaussians, and leaves `next` empty.
     pub fn append(&mut self, next: &mut Rows) {
         for statistic in Statistic::ALL {
             match statistic.values() {

@@ -64,8 +64,8 @@ pub struct Encoded {
     values: Vec<CacheLine>,
 }
 
-/// Motion that the network computes for a block of Gaussians: the outputs of its heads. An attribute is empty if the
-/// network has no head for it or it was not requested.
+/// Motion that the network computes for a block of Gaussians: the outputs of its heads. Attributes for which the
+/// network has no head, or that were not requested, are empty.
 #[derive(Debug, Clone, Default)]
 pub struct PredictedMotion {
     /// Position offset: 3 planes, scene units. If the network predicts screw motions: 6 planes, the rotation part w and

@@ -17,7 +17,7 @@ fn texels_per_unit(u: f32, size: usize) -> f32 {
 /// Number of channels of a feature plane whose derivatives are computed together.
 const CHANNEL_CHUNK: usize = 8;
 
-/// Returns [`CHANNEL_CHUNK`] channels from index `first` on, filled up with zeros after the last channel.
+/// Returns [`CHANNEL_CHUNK`] channels from index `first` on, filled up with zeros if fewer are left.
 #[inline(always)]
 fn channel_chunk(channels: &[f32], first: usize) -> [f32; CHANNEL_CHUNK] {
     let rest = &channels[first..];

@@ -6,8 +6,8 @@ pub(super) const TILE: u32 = 16;
 pub(super) const MIN_ALPHA: f32 = 1.0 / 255.0;
 /// Largest alpha (opacity of a Gaussian at a pixel). Larger ones are reduced to this value.
 pub(super) const MAX_ALPHA: f32 = 0.99;
-/// Smallest transmittance of a pixel. A Gaussian that would lower it further is not blended, and neither is any
-/// Gaussian behind it: the pixel has ended.
+/// Smallest transmittance of a pixel. A Gaussian that would lower the transmittance below this value is not blended,
+/// and neither is any Gaussian behind it: the pixel has ended.
 pub(super) const MIN_TRANSMITTANCE: f32 = 1e-4;
 /// Number of Gaussians that are projected together (a block). Their arrays fit in the first-level cache.
 pub(super) const BLOCK: usize = 128;

@@ -52,7 +52,7 @@ pub(super) struct CameraTerms {
 }
 
 impl CameraTerms {
-    /// Computes these parameters from a camera.
+    /// Computes the parameters of the projection from a camera.
     pub(super) fn new(camera: &Camera) -> Self {
         let rows = camera.rotation.transpose();
         CameraTerms {
