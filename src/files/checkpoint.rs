@@ -170,7 +170,8 @@ impl TensorView {
         self.shape.iter().try_fold(1usize, |product, &length| product.checked_mul(length))
     }
 
-    /// Calls `take` with the index in the storage of every element, the last axis fastest.
+    /// Calls `take` for every element, the last axis fastest, with the index of the element in the storage (block of
+    /// values).
     pub(crate) fn each(&self, mut take: impl FnMut(usize)) {
         if self.shape.contains(&0) {
             return;

@@ -6,7 +6,7 @@
 //!
 //! Accepted: text, and binary of either byte order; any number type per property; properties in any order, extra
 //! properties, no normals; comments; LF or CRLF; extra elements before or after `vertex`; no `scale_2` (2DGS, see
-//! [`THIN_LOG_SCALE`]); bytes after the last element. NaN values are accepted here.
+//! [`THIN_LOG_SCALE`]); bytes after the last element. This reader does not refuse NaN values.
 
 mod ascii;
 mod header;

@@ -41,10 +41,10 @@ pub fn rows_of_model(reduction: &CompressedModel) -> Vec<OutRow> {
 ///
 /// A row without a proxy keeps the bytes of the template, except that `change` (parameter deltas) is added to its
 /// values; zeros leave the bytes unchanged. A row with a proxy (Gaussian that replaces a merged cluster) is a copy of
-/// the row of the cluster's leader in which position, rotation, log_scale, opacity_logit and sh are replaced. Each is
-/// converted to the type of its property (integers: nearest, saturated). Normals and extra properties are those of the
-/// leader. A template without `scale_2` cannot store the third scale of a proxy, so callers must order the axes of
-/// proxies with the largest first.
+/// the row of the cluster's leader (most important member) in which position, rotation, log_scale, opacity_logit and sh
+/// are replaced. Each is converted to the type of its property (integers: nearest, saturated). Normals and extra
+/// properties are those of the leader. A template without `scale_2` cannot store the third scale of a proxy, so callers
+/// must order the axes of proxies with the largest first.
 ///
 /// Other elements of the template and the bytes after the last element are copied. If the template is a text file, the
 /// output is little-endian binary. Otherwise, writing all rows in order without proxies and changes reproduces the

@@ -19,7 +19,7 @@ pub enum ZeroRotation {
     /// The rows are left out, because no player draws them.
     #[default]
     Drop,
-    /// The rows are kept without a rotation, as SpacetimeGaussians does in training.
+    /// The rows are kept with the identity as rotation, as SpacetimeGaussians does in training.
     Identity,
 }
 

@@ -26,10 +26,10 @@ const VISIBLE_WIDTHS: f64 = 2.36;
 /// Number of texels of the texture that store one Gaussian.
 const TEXELS_PER_GAUSSIAN: usize = 4;
 
-/// Returns the words that store `row` for a viewer. Values beyond the range of half precision become the largest finite
-/// value; NaN becomes 0. If half precision would turn the quaternion and its rate of change into 0, both are scaled so
-/// that the quaternion has length 1, or the quaternion becomes the identity, because players divide by the length of
-/// the quaternion.
+/// Returns the 32-bit words that store the Gaussian `row` in a file for viewers. Values beyond the range of half
+/// precision become the largest finite value; NaN becomes 0. If half precision would turn the quaternion and its rate
+/// of change into 0, both are scaled so that the quaternion has length 1, or the quaternion becomes the identity,
+/// because players divide by the length of the quaternion.
 pub fn words(row: &SplatvGaussian) -> [u32; WORDS] {
     let half = |value: f32| {
         let most = f16::MAX.to_f32();
