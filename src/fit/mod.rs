@@ -46,7 +46,7 @@ pub struct Misfit {
     squares: f64,
     /// Largest distance between positions, in units of the Gaussian's middle scale.
     pub position: f64,
-    /// Largest difference of opacities.
+    /// Largest difference between the opacities of fit and Gaussian.
     pub opacity: f64,
 }
 

@@ -68,7 +68,7 @@ impl FittedTrack {
         self.opacity[frame] >= MIN_VISIBLE_OPACITY && finite(&self.position[frame]) && finite(&self.log_scale[frame])
     }
 
-    /// Returns the SH coefficients at `frame`.
+    /// Returns the SH coefficients of the Gaussian at `frame`.
     pub fn sh(&self, frame: usize) -> &[f32] {
         &self.sh[frame.min(self.sh.len() - 1)]
     }

@@ -155,7 +155,8 @@ mod tests {
             for &member in &order {
                 let free = leader_of[member as usize].is_none();
                 if free && pairs.contains(&(leader, member)) {
-                    // A join beyond the limit is not made, but no other leader may take the member either.
+                    // A join beyond the limit is not made; the member stays single, because no other leader may take it
+                    // either.
                     leader_of[member as usize] =
                         Some(if limit.is_none_or(|limit| joins < limit) { leader } else { member });
                     joins += usize::from(leader_of[member as usize] == Some(leader));

@@ -106,7 +106,7 @@ impl FrameSource for MergedSequence<'_> {
 
 /// Gaussians of the source that must be read for a selection of Gaussians of this sequence.
 struct MergedMembers {
-    /// Ids in the source of all Gaussians to be read, increasing.
+    /// Ids in the source of all Gaussians that must be read, increasing.
     ids: Vec<u32>,
     /// For every selected Gaussian, the row in `ids` of its own id.
     rows: Vec<u32>,
@@ -116,7 +116,7 @@ struct MergedMembers {
 }
 
 struct Proxy {
-    /// Index of the proxy among the selected Gaussians.
+    /// Index of this proxy (Gaussian that replaces a cluster) among the selected Gaussians.
     row: usize,
     members: Range<usize>,
 }

@@ -32,7 +32,7 @@ pub struct WeightedGaussian {
 pub struct Ellipsoid {
     /// Center, in the unit of length of the input Gaussians.
     pub mean: DVec3,
-    /// Unit quaternion with w ≥ 0.
+    /// Rotation, a unit quaternion with w ≥ 0.
     pub rotation: DQuat,
     /// Scales: standard deviations along the axes of `rotation`.
     pub scales: DVec3,
@@ -80,7 +80,7 @@ pub fn moments(parts: &[WeightedGaussian], about: Option<DVec3>) -> Ellipsoid {
 /// original rows are Σ_r axis_r ⊗ row_r.
 fn orthogonalize_rows(rows: &mut [Vec<f64>; 3]) -> [DVec3; 3] {
     let mut axes = [DVec3::X, DVec3::Y, DVec3::Z];
-    // A dot product of n terms has a rounding error of about this fraction of the product of the lengths.
+    // Relative to the product of the lengths, a dot product of n terms has about this rounding error.
     let tolerance = f64::EPSILON * (rows[0].len() as f64).sqrt().max(1.0);
     for _ in 0..MAX_SWEEPS {
         let mut rotated = false;

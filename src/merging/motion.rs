@@ -297,7 +297,7 @@ mod tests {
         let slow = path(|t| 1e-5 * t as f32);
         assert!(merges_in_paper(&path(|t| 1e-3 * t as f32), &path(|t| 1e-3 * t as f32)));
         let cosine = measure(&slow, &slow, MotionParams::Runs).cosine;
-        // 1e-10 / (1e-10 + 1e-8), from f32 coordinates.
+        // Expected cosine for steps of 1e-5: 1e-10 / (1e-10 + 1e-8); coordinates are f32.
         assert!((cosine - 1.0 / 101.0).abs() < 1e-6, "{cosine}");
         assert!(!merges_in_paper(&slow, &slow));
     }

@@ -235,7 +235,7 @@ mod tests {
             Ok(found)
         }
 
-        /// Measures all pairs from whole frames, without partitions.
+        /// Measures the motion similarity of all pairs from whole frames, without partitions.
         fn measure_whole(&self) -> Vec<(u32, u32, u64)> {
             let gate = MotionGate::new(&self.recipe.merge, 4.0);
             let reference = (0..self.ids.len()).map(|i| self.reference.row(i));

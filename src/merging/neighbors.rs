@@ -139,7 +139,8 @@ impl NeighborSearch<'_> {
             if self.last_voxel != Some(voxel) {
                 self.look_up(voxel);
             }
-            // Smallest squared distance to the neighboring voxels, by step and axis; it adds up over the axes.
+            // Returns the smallest squared distance to a neighboring voxel along one axis. These distances add up over
+            // the axes.
             let gap = |part: f64| ((part - ROUNDING).max(0.0) * index.voxels.side()).powi(2);
             let gaps: [[f64; 3]; 3] = std::array::from_fn(|c| {
                 let inside = position[c] - f64::from(voxel[c]);
@@ -277,7 +278,7 @@ mod tests {
             prop_assert_eq!(found_by_index(&points, k, epsilon), brute_force(&points, k, epsilon));
         }
 
-        // One point at the end of the range of f32 makes voxels wider than all other distances.
+        // A point at each end of the range of f32 makes voxels wider than all other distances.
         #[test]
         fn extreme_coordinates_equal_brute_force(
             points in prop::collection::vec(prop::array::uniform3(-1.0..1.0f32), 0..150),

@@ -29,7 +29,7 @@ use crate::source::{FrameSource, Ids, ReadPlan};
 /// Values of one Gaussian at one frame that test 3 of merging (motion) needs: x, y, z, opacity logit.
 pub(crate) type TrajectorySample = [f32; 4];
 
-/// Attributes of a [`TrajectorySample`].
+/// Attributes that a [`TrajectorySample`] contains.
 pub(crate) const NEEDED: Attributes = Attributes::POSITION.union(Attributes::OPACITY);
 
 /// Maximum distance in the file between two requested Gaussians that are read in one go, with those between them.

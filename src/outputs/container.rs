@@ -47,7 +47,7 @@ impl Packing {
         Packing { compression: Compression::Zstd(level), bounds }
     }
 
-    /// Returns the number of frames per tile.
+    /// Returns the number of frames per tile: more if there are error bounds.
     pub fn frame_block(&self) -> usize {
         if self.bounds == Bounds::default() { FRAME_BLOCK } else { BOUNDED_FRAME_BLOCK }
     }

@@ -22,16 +22,16 @@ use crate::statistics::score::Scores;
 /// Ids of Gaussians that the user keeps or drops whatever their scores, in any order.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Overrides {
-    /// Ids that are always kept.
+    /// Ids of Gaussians that are always kept.
     pub keep_ids: Vec<u32>,
-    /// Ids that are always dropped.
+    /// Ids of Gaussians that are always dropped.
     pub drop_ids: Vec<u32>,
 }
 
 /// Result of stage 1 (best fraction by score) and stage 2 (thresholds of the static and dynamic score).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Selection {
-    /// Whether each Gaussian stays.
+    /// For each Gaussian, whether it stays.
     pub keep: Vec<bool>,
     /// Ranking of the Gaussians that the user does not drop, best first. Its first `counts.kept` Gaussians are those
     /// that stay.

@@ -20,7 +20,7 @@ impl Ranking {
         Ranking { order }
     }
 
-    /// Returns the ids, best first.
+    /// Returns the ids of the Gaussians, best first.
     pub fn order(&self) -> &[u32] {
         &self.order
     }
@@ -103,8 +103,8 @@ impl Orders {
     }
 }
 
-/// Returns the position `place`, counted from 1, divided by `kept`, the number of Gaussians that the stage keeps. If it
-/// keeps none, it counts as half a Gaussian: every quotient then exceeds 1, and the order is unchanged.
+/// Returns the position `place`, counted from 1, divided by `kept`, the number of Gaussians that the stage keeps. If
+/// the stage keeps none, divides by one half: every quotient then exceeds 1, and the order is unchanged.
 fn rank_over(place: u32, kept: usize) -> f64 {
     (f64::from(place) + 1.0) / (kept as f64).max(0.5)
 }

@@ -51,7 +51,7 @@ pub struct ScoreStage {
     pub score: recipe::ScoreParams,
     /// Parameters of the selection: fraction kept by score, thresholds of the static and dynamic score.
     pub select: recipe::SelectParams,
-    /// Gaussians that the user keeps or drops.
+    /// Gaussians that the user keeps or drops whatever their scores.
     pub user: UserOverrides,
 }
 
@@ -77,7 +77,8 @@ pub struct Scored {
     pub selection: Selection,
     /// Ids of protected Gaussians, which are kept, not changed and not merged; increasing.
     pub protected: Vec<u32>,
-    /// Ids that were dropped because their values are not finite, increasing; the scene is read without them.
+    /// Ids of Gaussians that were dropped because a value is not finite; increasing. The scene is read without these
+    /// Gaussians.
     pub absent: Vec<u32>,
     /// Reference frame (in which most Gaussians are alive and at which they are compared with one another), and scene
     /// extent.
@@ -278,7 +279,8 @@ impl Scored {
         self.protected.binary_search(&id).is_ok()
     }
 
-    /// Returns the ids of all Gaussians that are not [absent](Scored::absent), increasing.
+    /// Returns the ids of all Gaussians except those dropped because a value is not finite ([`Scored::absent`]),
+    /// increasing.
     pub fn present(&self) -> Vec<u32> {
         (0..self.count() as u32).filter(|id| self.absent.binary_search(id).is_err()).collect()
     }

@@ -36,8 +36,8 @@ impl Visible {
         looks.then(|| Visible { recipe: recipe.clone() })
     }
 
-    /// Estimates the memory and time that this stage needs for the input `work`: the statistics of the scan, C and W,
-    /// and the views being rendered.
+    /// Estimates the memory and time that this stage needs for the input `work`: the statistics of the scan,
+    /// contribution C and peak W of every Gaussian, and the views being rendered.
     pub fn need(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
         let (mut per_gaussian, mut fixed) = work.looking(limits, Attributes::all().difference(Attributes::SH), 12);
         let every = (self.recipe.frame_stride.get() * self.recipe.view_stride.get()) as f64;
@@ -66,8 +66,8 @@ impl Visible {
         self.recipe.look_pictures == 0
     }
 
-    /// Renders views of `scene` and returns C and W of every Gaussian. `life`: number of frames in which each Gaussian
-    /// is alive.
+    /// Renders views of `scene` and returns the contribution C and the peak W of every Gaussian. `life`: number of
+    /// frames in which each Gaussian is alive.
     ///
     /// # Errors
     /// Fails if a frame cannot be read.

@@ -226,7 +226,7 @@ mod tests {
             assert_eq!(read.state.position, expected.state.position.pick(&rows));
             assert_eq!(read.state.opacity_logit, expected.state.opacity_logit.pick(&rows));
             assert_eq!(read.jacobian, expected.jacobian.pick(&rows));
-            // Attributes that do not vary come from the first frame.
+            // Attributes that do not vary with time come from the first frame.
             assert_eq!(read.state.log_scale, pushed[0].state.log_scale.pick(&rows));
         }
         let stored_columns = [6, 2, 0, 6, 1].into_iter().map(|rows| 4 * rows * (3 + 1 + 1)).sum::<u64>() + 4 * (2 + 1);

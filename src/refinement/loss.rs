@@ -13,14 +13,14 @@ const SQUARED_WEIGHT: f64 = 20.0;
 /// Loss of a render: `ssim` · (1 − SSIM) + (1 − `ssim`) · [`SQUARED_WEIGHT`] · mean square error.
 #[derive(Debug, Clone, Copy, Serialize)]
 pub(super) struct Loss {
-    /// Weight of 1 − SSIM, from 0 to 1.
+    /// Weight of 1 − SSIM in the loss, from 0 to 1.
     pub(super) ssim: f64,
 }
 
 /// Quality of renders, compared with their target views and averaged over the views.
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]
 pub(super) struct RenderQuality {
-    /// Mean PSNR in dB.
+    /// Mean PSNR over the views, in dB.
     pub(super) psnr: f64,
     /// Root mean square error of all values of all views; values are from 0 to 1.
     pub(super) error: f64,
@@ -112,7 +112,8 @@ mod tests {
                 let [square, dissimilarity] = loss.errors(&moved, &target);
                 count * (squared * square + ssim * dissimilarity)
             };
-            // Skips values near the ends of [0, 1], where a finite difference is the derivative on neither side.
+            // Skips values near 0 and 1, where the loss has a kink, so that a finite difference is the derivative on
+            // neither side.
             let clear = |k: &usize| [0.0, 1.0].iter().all(|end| (picture.data[*k] - end).abs() > 2e-3);
             for k in (0..picture.data.len()).step_by(7).filter(clear) {
                 let expected =

@@ -162,7 +162,7 @@ impl RefineStage {
         self.cuts.then_some(MIN_START_FRACTION)
     }
 
-    /// Returns with how many of `all` Gaussians refinement begins if it is to end with `wanted`.
+    /// Returns how many of the `all` Gaussians of the model refinement begins with if it is to end with `wanted`.
     pub fn first(&self, wanted: usize, all: usize) -> usize {
         start_count(self.starts_at(), wanted, all)
     }
@@ -233,8 +233,9 @@ impl RefineStage {
     }
 }
 
-/// Returns with how many of `all` Gaussians refinement begins if it is to end with `wanted`. It begins with at least
-/// the fraction `starts_at` and removes the surplus in prune steps. If `starts_at` is `None`, it begins with `wanted`.
+/// Returns how many of the `all` Gaussians of a model refinement begins with if it is to end with `wanted`. It begins
+/// with at least the fraction `starts_at` and removes the surplus in prune steps. If `starts_at` is `None`, it begins
+/// with `wanted`.
 pub(crate) fn start_count(starts_at: Option<f64>, wanted: usize, all: usize) -> usize {
     starts_at.map_or(wanted, |part| wanted.max((part * all as f64).ceil() as usize).min(all))
 }

@@ -90,7 +90,7 @@ pub(super) struct OptimizerState<'a> {
 type OptimizerCheckpoint<Stored, Added, Means> =
     (Option<(Stored, Added)>, (Added, Means, usize), usize, Vec<(Added, Means, usize)>);
 
-/// An [`OptimizerCheckpoint`] read back from the cache.
+/// Contents of a checkpoint ([`OptimizerCheckpoint`]), read back from the cache.
 pub(super) type KeptCheckpoint = OptimizerCheckpoint<StoredParams, ParamDelta, [Gaussians; 2]>;
 
 impl<'a> OptimizerState<'a> {

@@ -34,7 +34,7 @@ pub(crate) struct ViewSplit {
     pub(crate) stepped: Vec<usize>,
     /// Validation views, by which the best parameters are chosen.
     pub(crate) apart: Vec<usize>,
-    /// Test views, used only for the reported quality.
+    /// Test views, used only to report the quality, not for training or validation.
     pub(crate) held: Vec<usize>,
 }
 
@@ -86,7 +86,7 @@ impl Targets {
         ViewSplit { stepped, apart, held }
     }
 
-    /// Returns the camera of view `k`.
+    /// Returns the camera of target view `k`.
     pub(super) fn camera(&self, k: usize) -> &Camera {
         &self.cameras[self.pictures[k].camera as usize]
     }

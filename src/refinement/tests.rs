@@ -251,7 +251,7 @@ fn explicit_frames_improve_along_time_in_every_output() {
         });
         assert_eq!((constant.course.0.len(), varying.course.0.len()), (0, 4));
         assert!(varying.change == constant.change, "{name}");
-        // Some tracks join two Gaussians of this scene, with different colors.
+        // Some tracks (Gaussians linked over frames) join two Gaussians of this scene that have different colors.
         assert!(link == Link::Apart || !varying.course.columns().contains(Attributes::SH), "{name}");
         let [before, after] = [&constant, &varying].map(|reduction| test_psnr(&scene, &demo.rig(), reduction));
         // Moving Gaussians cover a small part of these views, so the gain is small; static Gaussians must stay static.

@@ -264,7 +264,7 @@ impl Bench<'_> {
     }
 }
 
-/// Returns the values in increasing order, without duplicates.
+/// Returns the distinct values of `counts` in increasing order.
 fn tried(counts: impl Iterator<Item = usize>) -> Vec<usize> {
     let mut counts: Vec<usize> = counts.collect();
     counts.sort_unstable();

@@ -9,7 +9,7 @@ use crate::error::Result;
 /// Result of one case of the self-check.
 #[derive(Debug, Serialize)]
 pub struct Case {
-    /// Short name of the case.
+    /// Short name of the self-check case.
     pub name: &'static str,
     /// Description of the values that are compared, and of what they are compared with.
     pub what: &'static str,
