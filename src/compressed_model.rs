@@ -183,7 +183,7 @@ pub struct CompressedModel {
     pub course: TrajectoryDelta,
     /// Precision in which the deformation field is written, if the model has one.
     pub field: Precision,
-    /// Highest SH degree of the output. Coefficients above it are dropped.
+    /// Highest SH degree in the output. SH coefficients above it are dropped.
     pub sh_degree: usize,
 }
 

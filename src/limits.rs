@@ -57,7 +57,7 @@ impl ReadLimit {
     /// No limit, for tests and for programs that trust their input.
     pub const NONE: ReadLimit = ReadLimit { bytes: u64::MAX };
 
-    /// Creates a limit of `bytes` bytes.
+    /// Creates a limit of `bytes` bytes of memory.
     pub fn new(bytes: u64) -> ReadLimit {
         ReadLimit { bytes }
     }

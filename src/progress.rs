@@ -38,7 +38,7 @@ pub trait TaskSink: Debug + Send + Sync {
     fn restarted(&mut self, total: u64);
 }
 
-/// Name of a stage and its expected duration in seconds.
+/// Name of a stage, and its expected duration in seconds.
 pub type ExpectedStage = (&'static str, f64);
 
 /// Task that begins, such as a stage or a step of it.
@@ -62,7 +62,7 @@ pub enum Message<'a> {
     Warning(&'a str),
     /// Notice that the computed result of a stage is not used.
     Discarded {
-        /// Name of the discarded stage.
+        /// Name of the stage whose result is not used.
         stage: &'a str,
         /// Reason for not using the result.
         why: &'a str,

@@ -13,9 +13,9 @@ use crate::model::{AttributeValues, Attributes, Gaussians, Jacobian, SequenceInf
 /// Ids of the Gaussians that a reader reads.
 #[derive(Debug, Clone)]
 pub enum Ids<'a> {
-    /// Consecutive ids.
+    /// Ids of a range of consecutive Gaussians.
     Range(Range<usize>),
-    /// List of ids, in any order.
+    /// Ids in a list, in any order.
     List(&'a [u32]),
 }
 

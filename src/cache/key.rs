@@ -5,7 +5,7 @@ use std::io::{self, Write};
 use serde::Serialize;
 use xxhash_rust::xxh3::Xxh3;
 
-/// Digest of everything that a result depends on.
+/// Cache key: digest of everything that a result depends on.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct CacheKey(Option<u128>);
 
@@ -21,7 +21,7 @@ impl CacheKey {
         CacheKey(Some(hash.0.digest128()))
     }
 
-    /// Returns the key that depends on this key and on `value`.
+    /// Returns the key that depends on everything that this key depends on, and on `value`.
     pub fn and(self, value: &impl Serialize) -> CacheKey {
         self.0.map_or(CacheKey::NONE, |before| CacheKey::new(&(before, CacheKey::new(value))))
     }

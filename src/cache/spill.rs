@@ -47,8 +47,8 @@ impl Spill {
         read_exact_at(&self.file, bytes, self.start + start).map_err(Error::io("read back values from", &self.path))
     }
 
-    /// Reads the record that [`SpillWriter::write_record`] wrote at `start` into `bytes`. Returns the start of the next
-    /// record.
+    /// Reads the record at byte `start`, written by [`SpillWriter::write_record`], into `bytes`. Returns the start of
+    /// the next record.
     ///
     /// # Errors
     /// Fails where [`Spill::read`] fails.

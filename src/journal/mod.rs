@@ -33,7 +33,7 @@ impl Clock {
         Clock { wall: Instant::now(), processors: processor_seconds() }
     }
 
-    /// Returns the wall-clock seconds since the start.
+    /// Returns the wall-clock time since the start, seconds.
     pub fn seconds(&self) -> f64 {
         self.wall.elapsed().as_secs_f64()
     }

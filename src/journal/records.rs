@@ -66,7 +66,7 @@ pub enum Saved {
 }
 
 impl Saved {
-    /// Formats the saved cost for display.
+    /// Formats the saved cost for display, such as "about 12.0 s, 1.00 full reads".
     pub fn text(self) -> String {
         match self {
             Saved::Stage { seconds, reads } => format!("about {}, {reads:.2} full reads", duration(seconds)),
@@ -101,7 +101,7 @@ pub(crate) fn number<'de, D: Deserializer<'de>>(from: D) -> std::result::Result<
 pub struct FieldSummary {
     /// Whether the field is written in half precision.
     pub half: bool,
-    /// Number of compared views.
+    /// Number of views on which renders were compared.
     pub pictures: usize,
     /// Mean PSNR of renders with the half-precision field compared with renders with the exact field, dB.
     #[serde(deserialize_with = "number")]
@@ -187,7 +187,7 @@ pub struct QualitySummary {
 pub struct BandsSummary {
     /// SH degree of the output.
     pub sh_degree: usize,
-    /// Number of compared views.
+    /// Number of views on which renders were compared.
     pub pictures: usize,
     /// Lower SH degrees that were tried, each with the mean PSNR of its renders compared with renders with all degrees,
     /// dB.
@@ -258,10 +258,10 @@ pub struct Forecast {
 pub struct TermSummary {
     /// Name of the term, as returned by [`Quantity::name`](crate::statistics::score::Quantity::name).
     pub name: String,
-    /// 1st percentile.
+    /// Value that 1% of the Gaussians do not exceed.
     #[serde(deserialize_with = "number")]
     pub p1: f64,
-    /// 99th percentile.
+    /// Value that 99% of the Gaussians do not exceed.
     #[serde(deserialize_with = "number")]
     pub p99: f64,
     /// Whether the two percentiles differ. If they are equal, the term only tells Gaussians above them from the others.

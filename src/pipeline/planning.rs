@@ -12,7 +12,7 @@ use crate::scene::Scene;
 pub struct InputMeta {
     /// Number of Gaussians, N.
     pub gaussians: usize,
-    /// Whether the cameras belong to the scene; `false` for a virtual rig.
+    /// Whether the scene has cameras of its own; `false` if the program places virtual ones.
     pub has_cameras: bool,
     /// Kind of output that is written if neither the user nor the name of the output determines one.
     pub own_output: OutputKind,

@@ -36,7 +36,7 @@ use crate::scene::pictures::{ViewSet, pictures};
 use crate::scene::stamps;
 use crate::source::FrameSource;
 
-/// Name of the stage.
+/// Name of this stage in plans, progress and summaries.
 const NAME: &str = "search";
 /// Fraction of the Gaussians in the first model that is tried.
 const FIRST_FRACTION: f64 = 0.2;
@@ -49,8 +49,8 @@ const SAME_SIZE_RATIO: f64 = 1.04;
 /// Approximate cost of halving the number of Gaussians: the PSNR that is lost, dB, and the factor by which a loss of
 /// PSNR grows. The search guesses its next size from them.
 const COST_OF_HALVING: (f64, f64) = (4.5, 3.0);
-/// The search ends with a size whose surplus of quality is at most this, in halvings of the number of Gaussians that
-/// the surplus would allow.
+/// Surplus of quality that is small enough to end the search. Unit: number of times that the surplus would allow the
+/// number of Gaussians to be halved.
 const MAX_SURPLUS: f64 = 0.03;
 /// Smallest loss of PSNR that the search distinguishes from none, dB.
 const MIN_LOSS: f64 = 1e-3;

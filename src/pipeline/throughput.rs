@@ -242,7 +242,7 @@ mod tests {
 
     #[test]
     fn hardly_seen_counts_smallest_errors_within_60_db() {
-        // 1000 values at 60 dB allow a squared error of 0.001 in total.
+        // At 60 dB, 1000 color values allow a squared error of 0.001 in total.
         let units = |error: f64| (error / RemovalError::UNIT) as u64;
         let errors = vec![0, units(0.05), units(0.0004), units(0.0005), 0, units(0.0002), units(0.1), 0];
         assert_eq!(hardly_seen(errors, 1000.0), 5.0 / 8.0);

@@ -98,7 +98,7 @@ impl Recipe {
         table.try_into().map_err(|e: toml::de::Error| e.to_string())
     }
 
-    /// Returns this recipe without refinement.
+    /// Returns this recipe with refinement turned off.
     pub fn unrefined(&self) -> Recipe {
         let mut recipe = self.clone();
         recipe.refine.refine = AttributeGroups(Attributes::empty());

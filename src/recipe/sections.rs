@@ -92,9 +92,9 @@ pub enum StaticTerm {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Anisotropy {
-    /// s_max / s_min.
+    /// s_max / s_min, the largest scale divided by the smallest.
     Ratio,
-    /// ln(s_max / s_mid).
+    /// ln(s_max / s_mid), the logarithm of the largest scale divided by the middle one.
     Log,
 }
 

@@ -32,7 +32,7 @@ use crate::progress::Progress;
 use crate::render;
 use crate::scene::Scene;
 
-/// Name of the stage.
+/// Name of this stage in plans, progress and summaries.
 const NAME: &str = "archive";
 /// Maximum quantization step of a group, in standard deviations of its values; a coarser one would erase the values.
 const MAX_STEP: f64 = 4.0;

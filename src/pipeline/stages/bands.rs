@@ -23,7 +23,7 @@ use crate::render::{self, render};
 use crate::scene::Scene;
 use crate::source::FrameSource;
 
-/// Name of the stage.
+/// Name of this stage in plans, progress and summaries.
 const NAME: &str = "bands";
 
 /// Name under which dropping SH degrees is listed as omitted, if all degrees have to stay.

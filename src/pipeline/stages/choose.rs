@@ -21,14 +21,14 @@ use crate::pruning::score::{Scored, scored_memory};
 use crate::render::{self, Image};
 use crate::scene::Scene;
 
-/// Name of the stage.
+/// Name of this stage in plans, progress and summaries.
 const NAME: &str = "choose";
 
 /// Number of scored views on which merging and pruning are compared. The mean PSNR over these differs from that over
 /// all views by less than the two alternatives usually differ from each other.
 const COMPARED_VIEWS: usize = 24;
 
-/// Number of views of a frame that are rendered at a time.
+/// Number of views of one frame that are rendered at the same time.
 const VIEWS_PER_BATCH: usize = 4;
 
 /// Bytes of memory per Gaussian for the clusters of merging, which are held twice during the comparison, and for

@@ -20,7 +20,7 @@ use crate::refinement::RefineStage;
 use crate::refinement::targets::Targets;
 use crate::scene::Scene;
 
-/// Name of the stage.
+/// Name of this stage in plans, progress and summaries.
 const NAME: &str = "degree";
 /// Fraction of the recipe's optimization steps with which an SH degree is tried.
 const TRIAL_STEPS: f64 = 0.2;

@@ -22,7 +22,7 @@ use crate::render::{self, render};
 use crate::scene::Scene;
 use crate::source::FrameSource;
 
-/// Name of the stage.
+/// Name of this stage in plans, progress and summaries.
 const NAME: &str = "field";
 /// Number of scored views on which renders with both precisions are compared.
 pub(crate) const COMPARED_VIEWS: usize = 12;

@@ -39,7 +39,7 @@ use crate::recipe;
 use crate::scene::Scene;
 use crate::source::FrameSource;
 
-/// Name of the stage.
+/// Name of this stage in plans, progress and summaries.
 const NAME: &str = "merge";
 
 /// Name under which measured motions of pairs of Gaussians are cached. The measurement can be divided into shards.
@@ -77,7 +77,7 @@ pub(crate) struct MergeStage {
     pub target: Option<usize>,
 }
 
-/// Result of merging: the compressed model, and counts.
+/// Result of merging: the compressed model, and counts of the merge passes.
 #[derive(Serialize, Deserialize)]
 pub(crate) struct MergeOutcome {
     /// Compressed model with its merged clusters.

@@ -9,7 +9,7 @@ use crate::pruning::Ranking;
 use crate::pruning::score::Scored;
 use crate::scene::Scene;
 
-/// Name of the stage.
+/// Name of this stage in plans, progress and summaries.
 const NAME: &str = "prune";
 
 /// Stage that keeps the first Gaussians of the ranking.

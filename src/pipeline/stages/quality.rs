@@ -28,7 +28,7 @@ use crate::scene::pictures::{self, ViewSet, spread_views};
 use crate::scene::{InputOptions, Scene, open_compressed};
 use crate::source::FrameSource;
 
-/// Name of the stage.
+/// Name of this stage in plans, progress and summaries.
 const NAME: &str = "quality";
 /// Maximum number of views on which quality is measured.
 const MOST_VIEWS: usize = 60;

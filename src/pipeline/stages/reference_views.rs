@@ -52,7 +52,7 @@ pub(crate) fn pictures(pixels: u64) -> u64 {
     (MAX_VIEW_BYTES / (2 * BYTES_PER_PIXEL * pixels.max(1))).clamp(fewest, most)
 }
 
-/// What the goal of the run requires of an archive; the option `--archive-psnr` may require more.
+/// What the goal of the run requires of an archive. The PSNR of the option `--archive-psnr` is passed separately.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub enum ArchiveTarget {
     /// The goal requires nothing.

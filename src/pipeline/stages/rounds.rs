@@ -28,7 +28,7 @@ use crate::pruning::score::{Scored, scored_memory};
 use crate::recipe;
 use crate::scene::Scene;
 
-/// Name of the stage.
+/// Name of this stage in plans, progress and summaries.
 const NAME: &str = "rounds";
 
 /// Stage that ranks Gaussians in pruning rounds.

@@ -12,7 +12,7 @@ use crate::statistics;
 use crate::statistics::ScanPlan;
 use crate::statistics::pass::{ScanResult, scan_blocks, scan_units};
 
-/// Name of the stage.
+/// Name of this stage in plans, progress and summaries.
 pub(crate) const NAME: &str = "scan";
 
 /// Processor time of adding one Gaussian at one frame to its statistics, seconds (`benches/scan.rs`).
@@ -23,7 +23,7 @@ const SECONDS_TO_PROJECT: f64 = 8e-9;
 /// Stage that gathers the statistics of all Gaussians.
 #[derive(Debug, Clone)]
 pub struct ScanStage {
-    /// Parameters of the scan.
+    /// Parameters of the statistics that are gathered.
     pub recipe: recipe::ScanParams,
 }
 
@@ -31,7 +31,7 @@ impl ScanStage {
     /// Returns the resource estimate of the stage. Its memory holds one block of Gaussians per thread, and the
     /// statistics rows (one per Gaussian) of all blocks.
     pub fn need(&self, work: &Workload, _: &Limits) -> ResourceEstimate {
-        // Within the stage a second reader may decode while the first is read.
+        // Frames held by readers count twice, because a second reader may decode while the first is read.
         let block = statistics::BYTES_PER_GAUSSIAN as u64 + 2 * work.held(&Limits::NONE, Attributes::all());
         // Number of alive Gaussians per frame, for the blocks of all threads, and the steps between uneven frames.
         let frames = work.frames * (4 * work.threads + 8);

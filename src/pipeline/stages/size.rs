@@ -20,7 +20,7 @@ use crate::pruning::score::Scored;
 use crate::recipe::Precision;
 use crate::scene::Scene;
 
-/// Name of the stages.
+/// Name of both stages in plans, progress and summaries.
 const NAME: &str = "size";
 /// Fraction of the byte limit that may remain unused.
 const MAX_UNUSED: f64 = 0.01;
@@ -89,7 +89,7 @@ impl Stage for ShrinkToBytes {
 struct ByteLimit {
     /// Stage that writes the output files, by which sizes are measured.
     writer: WriteStage,
-    /// Maximum number of bytes.
+    /// Maximum number of bytes of all output files together.
     most: u64,
     /// Precision of the deformation field that is assumed: half precision if the recipe allows it.
     field: Precision,

@@ -31,7 +31,7 @@ use crate::pruning::score::scored_memory;
 use crate::scene::Scene;
 use crate::source::FrameSource;
 
-/// Name of the stage.
+/// Name of this stage in plans, progress and summaries.
 const NAME: &str = "emit";
 
 /// Fraction of the Gaussians that is usually written; used for estimates of time.
@@ -68,7 +68,7 @@ pub fn beside_names(output: &Path, kind: OutputKind) -> impl Iterator<Item = Str
         .map(move |name| beside(output, kind.is_folder(), name).to_string_lossy().into_owned())
 }
 
-/// Stage that writes the result.
+/// Stage that writes the compressed model and the files beside it.
 #[derive(Debug, Clone)]
 pub struct WriteStage {
     /// Kind of output, such as archive or model folder.
