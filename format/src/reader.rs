@@ -117,7 +117,7 @@ impl<'a> Tile<'a> {
         self.frames
     }
 
-    /// Returns the number of components per Gaussian.
+    /// Returns the number of values (components) that the tile has per Gaussian and frame.
     pub fn width(&self) -> usize {
         self.width
     }

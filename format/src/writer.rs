@@ -85,7 +85,7 @@ impl Writer {
         Ok(writer)
     }
 
-    /// Returns the shape the container was created with.
+    /// Returns the shape of the container: number of Gaussians, columns and block lengths.
     pub fn layout(&self) -> &Layout {
         &self.layout
     }

@@ -41,7 +41,7 @@ pub struct Workload {
     pub sh_degree: usize,
     /// Attributes that vary in time.
     pub varying: Attributes,
-    /// Memory that the input takes while it is open.
+    /// Memory that the input and its readers take, and how it is divided into tiles.
     pub input: MemoryProfile,
     /// Number of different view numbers that the cameras use.
     pub viewpoints: u64,
@@ -53,7 +53,7 @@ pub struct Workload {
     pub pictures: u64,
     /// Bytes of memory that the cameras and the list of their shots take, see [`Rig::bytes`].
     pub rig: u64,
-    /// Number of threads.
+    /// Number of threads that share the work.
     pub threads: u64,
     /// Measured speed of these threads for the scene.
     pub pace: Throughput,
@@ -78,7 +78,7 @@ impl Workload {
         }
     }
 
-    /// Creates the workload of zero Gaussians.
+    /// Creates the workload of an input without Gaussians, frames and cameras.
     pub fn nothing() -> Workload {
         let info = SequenceInfo { count: 0, times: Vec::new(), sh_degree: 0, varying: Attributes::empty() };
         Workload::new(&info, MemoryProfile::for_tiles(0))

@@ -56,7 +56,7 @@ impl<'a> RenderedSource<'a> {
 pub struct Batch {
     /// Maximum number of different frames. For each of them, the Gaussians of every rendered source are in memory.
     pub frames: usize,
-    /// Maximum number of views.
+    /// Maximum number of views in a batch.
     pub pictures: usize,
     /// Maximum number of frames that a reader keeps in memory of those that it decodes together.
     pub held: usize,
@@ -92,7 +92,7 @@ impl Batch {
 /// View to render, with the Gaussians of `S` sources (the subjects) at the view's frame.
 #[derive(Clone, Copy)]
 pub struct ViewStates<'a, const S: usize> {
-    /// Frame, view number and camera index.
+    /// The view: its frame, view number and camera index.
     pub picture: FrameView,
     /// Camera of the view.
     pub camera: &'a Camera,

@@ -1,5 +1,5 @@
-//! Absent Gaussians: Gaussians that are dropped because some of their values are NaN or infinite. Every read of a frame
-//! leaves them out.
+//! Absent Gaussians: Gaussians that are dropped because some of their values are NaN or infinite. They are invisible in
+//! every frame that is read.
 //!
 //! Ids do not change. An absent Gaussian keeps its row in the arrays, but with invisible values ([`clear_row`]). So
 //! renders, contributions, removal errors, statistics and bounds are those of the other Gaussians. Memory: 4 bytes per

@@ -37,7 +37,7 @@ pub struct Scene {
     pub path: PathBuf,
     /// Model or sequence that was opened.
     pub input: Box<dyn InputModel>,
-    /// Cameras of all splits.
+    /// Cameras and the views they took, of all splits (training, validation, test).
     pub rig: Rig,
     /// Views at each frame, from the cameras of the chosen split.
     pub schedule: ViewSchedule,

@@ -113,7 +113,7 @@ pub fn room_to_pack(options: &InputOptions, header: &StreamHeader) -> Result<Fra
 pub struct FrameQuota {
     /// Number of frames that have arrived so far.
     arrived: u64,
-    /// Maximum number of frames within the memory budget.
+    /// Maximum number of frames for which the memory budget suffices.
     pub most: u64,
     /// Advice to the user if more frames arrive.
     hint: String,

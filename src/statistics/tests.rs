@@ -370,7 +370,7 @@ fn uneven_frames_are_measured_by_their_time_stamps() {
         .collect();
     let rows = scan_at(&stamps, &frames, &schedule(7, 0), &recipe(MotionParams::Runs)).rows;
     close("kappa", rows.kappa[0], 2.0 * unit * unit, 1e-12, 0.0);
-    // The mean velocity over a step is the sum of its two stamps.
+    // For x = τ², the mean velocity over a step is the sum of its two time stamps.
     let squares = stamps.windows(2).map(|pair| (pair[0] + pair[1]).powi(2) + 4.0).sum::<f64>();
     close("D", rows.d[0], unit * (squares / 6.0).sqrt(), 1e-12, 0.0);
     let literal = scan_at(&stamps, &frames, &schedule(7, 0), &recipe(MotionParams::Literal)).rows;

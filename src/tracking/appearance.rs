@@ -67,7 +67,7 @@ impl ComparedAppearance {
         }
     }
 
-    /// Returns the same appearance at another position.
+    /// Returns this appearance, moved to `position`.
     pub(super) fn at(self, position: [f32; 3]) -> ComparedAppearance {
         ComparedAppearance { position, ..self }
     }

@@ -28,7 +28,7 @@ const RULES: [&Round; 2] = [&ALIKE, &CLOSE];
 /// after the [`Linker`] has linked it.
 pub struct Joiner([JoinedTracks; 2]);
 
-/// Tracks joined by one rule.
+/// Tracks that are joined by one of the two rules.
 struct JoinedTracks {
     rule: &'static Round,
     /// Pairs of tracks that may still be joined, in the order of the later track, then of cost.

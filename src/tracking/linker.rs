@@ -34,7 +34,7 @@ pub struct FrameLinks {
     pub tracks: Vec<u32>,
     /// Number of Gaussians that continue a track and equal its last Gaussian bit by bit (exact repeats).
     pub repeated: usize,
-    /// Number of Gaussians that continue a track, exact repeats included.
+    /// Number of Gaussians that continue a track of earlier frames, exact repeats included.
     pub linked: usize,
     /// Number of Gaussians whose link to a track was dropped because it was probably wrong. They begin new tracks.
     pub doubtful: usize,
@@ -60,7 +60,7 @@ impl Linker {
         &self.tracks
     }
 
-    /// Returns the number of tracks so far, including those that have ended.
+    /// Returns the number of tracks that have begun so far, including those that have ended.
     pub fn tracks(&self) -> u32 {
         self.born
     }
