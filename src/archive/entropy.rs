@@ -44,7 +44,7 @@ const CERTAIN_STARTS: [[i16; SYMBOLS]; SYMBOLS] = {
 pub(super) struct SymbolModel {
     /// For each symbol, the sum of the probabilities of all lower symbols, in units of 1/2^15.
     starts: [i16; SYMBOLS],
-    /// Number of symbols seen so far.
+    /// Number of symbols that the model has seen so far; it determines the learning rate.
     seen: u32,
 }
 
@@ -78,14 +78,14 @@ impl SymbolModel {
     }
 }
 
-/// Writer of symbols and bits.
+/// Writer of entropy-coded symbols and plain bits.
 #[derive(Debug, Default)]
 pub(super) struct SymbolEncoder {
     symbols: Vec<(u16, u16)>,
     bits: Vec<u8>,
     pending: u64,
     pending_bits: u32,
-    /// Approximate number of bits written so far.
+    /// Approximate number of bits written so far, of symbols and plain bits.
     cost: f64,
 }
 
@@ -226,7 +226,7 @@ impl<'a> SymbolDecoder<'a> {
         }
     }
 
-    /// Reads a number written by [`SymbolEncoder::number`].
+    /// Reads a number below 2^63 that [`SymbolEncoder::number`] wrote.
     pub(super) fn number(&mut self) -> u64 {
         let follow = self.bits(6) as u32;
         (1 << follow | self.long_bits(follow)) - 1

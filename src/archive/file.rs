@@ -126,7 +126,8 @@ pub(super) fn write(sections: &Sections) -> Result<(Vec<u8>, ArchiveSize)> {
 pub(super) struct ArchiveHeader {
     /// Length of the whole file in bytes.
     whole: u64,
-    /// For each section: bytes in the file, bytes of content, checksum of the bytes in the file.
+    /// For each section: number of bytes in the file, number of bytes of content, and checksum of the bytes in the
+    /// file.
     sections: [[u64; 3]; SECTIONS],
 }
 
@@ -181,7 +182,7 @@ impl ArchiveHeader {
         2 * self.whole + 16 * table + 2 * blobs
     }
 
-    /// Checks that reading the archive at `path` stays within `memory`.
+    /// Fails if reading the archive at `path` takes more than `memory`.
     pub(super) fn check_memory(&self, path: &Path, memory: ReadLimit) -> Result<()> {
         memory.check(path, "head", "the archive and its content", self.bytes())
     }

@@ -119,7 +119,7 @@ struct FieldWeights<'a> {
     tensors: &'a Tensors,
 }
 
-/// Linear layer: weights `[outputs, inputs]` and a bias.
+/// Linear layer of a network: weights `[outputs, inputs]` and a bias.
 #[derive(Clone)]
 struct WeightLayer<'a> {
     name: String,
@@ -202,7 +202,7 @@ fn active_fraction(samples: &[f32], width: usize) -> Vec<f64> {
 
 /// Inputs of the trunk (the layers that all heads share) at some positions and times.
 struct Samples {
-    /// Number of inputs of the trunk.
+    /// Number of inputs of the trunk (the layers that all heads share).
     width: usize,
     /// Inputs of the trunk, `[samples, width]`.
     features: Vec<f32>,

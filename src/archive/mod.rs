@@ -76,7 +76,7 @@ pub struct Encoded {
     pub parts: ArchiveSize,
     /// For each Gaussian in the order of the archive, its index in the encoded [`Content`].
     pub order: Vec<u32>,
-    /// Approximate number of bits of each attribute and of each quantized tensor, by name.
+    /// Approximate number of bits that each attribute and each quantized tensor take, by name.
     pub bits: BTreeMap<String, f64>,
 }
 
@@ -88,7 +88,7 @@ struct Table {
     /// Bit patterns of the first and the last time (f32); decimal text would round them.
     times: [u32; 2],
     tensors: Vec<TensorEntry>,
-    /// Number of extra bytes per Gaussian.
+    /// Number of extra bytes per Gaussian that are no attributes.
     beside: usize,
     /// Names and lengths in bytes of the copied files.
     files: Vec<(String, usize)>,

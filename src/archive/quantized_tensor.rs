@@ -117,7 +117,7 @@ impl QuantizedTensor<'_> {
     #[inline(always)]
     fn visit(&self, data: &mut [f32], mut code: impl FnMut(usize, f32, &Context, QuantizationGrid) -> (f32, f32)) {
         let columns = self.columns;
-        // Two extra places at the left and one at the right.
+        // Each line has two extra places at the left and one at the right.
         let line = || vec![0.0f32; columns + 3];
         let (mut above2, mut above, mut here) = (line(), line(), line());
         let (mut sizes_above, mut sizes) = (line(), line());

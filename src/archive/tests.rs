@@ -126,8 +126,8 @@ proptest! {
                             let at = (c * rows + row as usize) * columns + column as usize;
                             let off = f64::from(content.tensors[name].data[at] - back.tensors[name].data[at]).abs();
                             let step = step(steps.field.0[name].step);
-                            // If a texel is read one octave less, its step is half an octave larger; classes are whole
-                            // octaves.
+                            // If the read weight of a texel is one octave less, its step is half an octave larger;
+                            // classes are whole octaves.
                             prop_assert!(off * weight <= 0.75 * step + 1e-4 * weight, "{name} {off} x {weight} of {step}");
                         }
                     }
@@ -151,7 +151,7 @@ proptest! {
     }
 }
 
-/// Recomputes the checksums of an archive, as far as its lengths are valid.
+/// Updates the checksums of an archive to its present bytes, as far as its lengths are valid.
 fn reseal(bytes: &mut [u8]) {
     let long = |bytes: &[u8], at: usize| u64::from_le_bytes(bytes[at..at + 8].try_into().unwrap()) as usize;
     let head: usize = 12 + 4 * 24 + 8;

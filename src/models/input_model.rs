@@ -269,7 +269,7 @@ pub struct MemoryProfile {
     pub fixed: u64,
     /// Number of frames that are decoded together, which a reader may keep in memory; 0 if each frame is read alone.
     pub frame_block: u64,
-    /// Number of Gaussians that are decoded together.
+    /// Number of Gaussians that are decoded together, in one block.
     pub gaussian_block: u64,
     /// Number of columns (attributes) of a container.
     pub columns: u64,
@@ -304,7 +304,7 @@ impl MemoryProfile {
 /// Size and value range of one column (attribute) of a container.
 #[derive(Debug, Serialize)]
 pub struct ColumnInfo {
-    /// Name of the column.
+    /// Name of the column (attribute).
     pub name: String,
     /// Number of f32 components of the column per Gaussian.
     pub width: u32,
@@ -315,7 +315,7 @@ pub struct ColumnInfo {
     pub tiles: usize,
     /// Number of these tiles that store one frame, as their values are the same in all frames.
     pub constant_tiles: usize,
-    /// Number of these tiles stored without compression.
+    /// Number of these tiles that are stored without compression.
     pub raw_tiles: usize,
     /// Bytes that the column takes in the file; bytes that several tiles share count once.
     pub stored_bytes: u64,

@@ -99,7 +99,7 @@ fn refuse_inside_a_model(path: &Path) -> Result<()> {
     let Ok(real) = fs::canonicalize(path) else { return Ok(()) };
     let iteration = |folder: &Path| folder.file_name()?.to_str()?.strip_prefix("iteration_")?.parse::<u32>().ok();
     let is_point_cloud_folder = |folder: &Path| folder.file_name().is_some_and(|name| name == "point_cloud");
-    // A PLY without deformation in such a folder is a model by itself.
+    // A PLY file in such a folder is a model by itself unless the Gaussians are deformed.
     let is_deformed_model = |folder: &Path| {
         folder.join("deformation.pth").exists()
             || spacetime_gaussians::has_marker_property(&folder.join("point_cloud.ply"))

@@ -18,7 +18,7 @@ pub struct Size {
     pub field: u64,
     /// Bytes of the states of Gaussians that are stored frame by frame.
     pub frames: u64,
-    /// Bytes of everything else.
+    /// Bytes of everything else, such as the configuration.
     pub rest: u64,
 }
 

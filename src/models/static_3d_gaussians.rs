@@ -22,7 +22,7 @@ use crate::source::FrameSource;
 
 /// Name of the folder that holds the folders `iteration_K`.
 const POINT_CLOUD_FOLDER: &str = "point_cloud";
-/// Name of the point cloud file in an iteration folder.
+/// Name of the point cloud file in a folder `iteration_K`.
 const POINT_CLOUD_FILE: &str = "point_cloud.ply";
 
 /// Model folder with a point cloud file and no deformation field.
@@ -70,7 +70,7 @@ impl StaticModel {
         COPIED_FILES.iter().map(|name| self.root.join(name)).filter(|path| path.is_file())
     }
 
-    /// Returns the path of the point cloud file in a model folder `root`.
+    /// Returns the path of the point cloud file in the model folder `root`.
     fn cloud_path(&self, root: &Path) -> PathBuf {
         root.join(POINT_CLOUD_FOLDER).join(format!("iteration_{}", self.iteration)).join(POINT_CLOUD_FILE)
     }

@@ -39,7 +39,7 @@ use crate::progress::Events;
 use crate::recipe::MergeParams;
 use crate::source::FrameSource;
 
-/// Minimum scale, so that its logarithm is finite.
+/// Minimum scale of a Gaussian in scene units, so that its logarithm is finite.
 pub(super) const MIN_SCALE: f64 = 1e-7;
 
 /// Motion model that computes the states of Gaussians at a time from the outputs of a network.
@@ -71,7 +71,7 @@ pub(super) struct ModelParts<'a> {
     pub(super) file: &'a Path,
     /// Number of features of a Gaussian (properties `fea_*` in the point cloud file).
     pub(super) features: usize,
-    /// Path of the point cloud file.
+    /// Path of the point cloud file, for error messages.
     pub(super) cloud: &'a Path,
 }
 

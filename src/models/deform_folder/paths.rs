@@ -30,7 +30,7 @@ pub(in crate::models) struct Paths {
     pub(super) network: PathBuf,
 }
 
-/// Returns whether a folder contains a network `deform/iteration_K/deform.pth`.
+/// Returns whether the folder `root` contains a network in a file `deform/iteration_K/deform.pth`.
 pub(in crate::models) fn has_network(root: &Path) -> bool {
     iterations(&root.join(NETWORK_FOLDER), NETWORK_FILE).is_ok_and(|found| !found.is_empty())
 }

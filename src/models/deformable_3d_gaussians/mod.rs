@@ -175,7 +175,7 @@ impl NetworkMotionModel for DeformableMotion {
         Network::BYTES_PER_GAUSSIAN
     }
 
-    /// Returns the seconds measured by `benches/families.rs`, as a function of the size of the network.
+    /// Returns the CPU seconds per state, measured by `benches/families.rs`, as a function of the size of the network.
     fn seconds_per_state(&self) -> f64 {
         1e-6 + 2e-11 * self.network.multiplications() as f64
     }

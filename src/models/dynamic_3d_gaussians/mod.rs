@@ -30,7 +30,7 @@ use proxies::MergedSource;
 /// Name of the file that holds the model.
 const FILE: &str = "params.npz";
 
-/// `params.npz`, or the folder that holds it.
+/// File `params.npz` of Dynamic3DGaussians, or the folder that contains it.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
     recognizes: |found| {
         let named = |path: &Path| path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("npz"));
@@ -92,7 +92,7 @@ impl InputModel for Params {
         Ok(Box::new(Params::with_times(*self, times)?))
     }
 
-    /// Returns black, which the authors' training uses.
+    /// Returns black as the background color, which the authors' training uses.
     fn background(&self) -> Option<[f32; 3]> {
         Some([0.0; 3])
     }

@@ -12,7 +12,7 @@ use crate::files::python_literal::{Literal, parse_call};
 
 /// Maximum bytes of a `cfg_args` file, more than any namespace that an argument parser prints.
 const MAX_BYTES: u64 = 1 << 20;
-/// Name of the Python call in the file.
+/// Name of the Python call that a `cfg_args` file consists of.
 pub(in crate::models) const CALL_NAME: &str = "Namespace";
 /// Key of the SH degree in `cfg_args`.
 const SH_DEGREE: &str = "sh_degree";
@@ -20,11 +20,11 @@ const SH_DEGREE: &str = "sh_degree";
 /// Hyperparameters of a 4DGaussians model. Keys that `cfg_args` lacks have the defaults of the original code.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ModelConfig {
-    /// Maximum SH degree; default 3.
+    /// Maximum SH degree of the Gaussians; default 3.
     pub sh_degree: i64,
     /// Path of the folder with the training data.
     pub source_path: Option<String>,
-    /// Whether the background is white rather than black; default false.
+    /// Whether the background of the training images is white rather than black; default false.
     pub white_background: bool,
     /// Width of the deformation network; default 64. The shapes of the tensors take precedence.
     pub net_width: i64,

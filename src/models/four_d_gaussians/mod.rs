@@ -73,7 +73,7 @@ impl InputModel for ModelFolder {
                 size_of(&folder.join("point_cloud.ply"), &folder.join("deformation.pth"), &path.join("cfg_args"))
             }
             OutputKind::Ply => Ok(Size { cloud: bytes_read_for([path])?, ..Size::default() }),
-            // Archives and `.splatv` are written elsewhere.
+            // Other functions write archives and `.splatv` files.
             _ => Ok(Size::of_frames(bytes_below(path)?)),
         }
     }
@@ -95,7 +95,7 @@ impl InputModel for ModelFolder {
             frame_block: 0,
             gaussian_block: GAUSSIAN_BLOCK as u64,
             columns: 0,
-            // Measured by `benches/deform.rs`, as a function of the size of the network.
+            // Seconds measured by `benches/deform.rs`, as a function of the size of the network.
             seconds_per_state: 1e-7 + 2e-11 * self.field().multiplications() as f64,
             decoded: 0,
         }

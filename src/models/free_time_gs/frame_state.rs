@@ -53,7 +53,7 @@ fn rate(duration: f32) -> f64 {
     0.5 / deviation(duration).powi(2)
 }
 
-/// Returns the logit of the minimum opacity.
+/// Returns the opacity logit that belongs to the minimum opacity of a Gaussian.
 fn min_logit() -> f64 {
     (MIN_OPACITY / (1.0 - MIN_OPACITY)).ln()
 }

@@ -82,7 +82,7 @@ fn choose(path: &Path, options: &OpenOptions) -> Result<(PathBuf, Vec<String>)> 
     Ok((file.clone(), if found.len() > 1 && options.iteration.is_none() { vec![note] } else { Vec::new() }))
 }
 
-/// Returns whether the checkpoint at `path` holds Gaussians under the names of gsplat.
+/// Returns whether the checkpoint at `path` holds Gaussians in tensors with the names that gsplat uses.
 fn splats_in(path: &Path, memory: ReadLimit) -> bool {
     let Ok(checkpoint) = Checkpoint::open(path, memory) else { return false };
     let pickle = checkpoint.pickle();

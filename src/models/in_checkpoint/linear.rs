@@ -25,13 +25,13 @@ const OPACITY_RANGE: [f64; 2] = [1e-3, 1.0 - 1e-4];
 /// opacity: exp(−½((t − center)/deviation)²).
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(in crate::models) struct LinearPath {
-    /// Position at the center, scene units.
+    /// Position at the time `center`, scene units.
     pub(in crate::models) position: [f64; 3],
     /// Velocity, scene units per unit of time.
     pub(in crate::models) velocity: [f64; 3],
     /// Center of the window in time, where its value is 1.
     pub(in crate::models) center: f64,
-    /// Standard deviation of the window in time.
+    /// Standard deviation of the window in time, in the model's time unit.
     pub(in crate::models) deviation: f64,
 }
 
@@ -70,7 +70,7 @@ pub(in crate::models) struct Matched {
 pub(in crate::models) struct ProxyAtFrame<'a> {
     /// Index of the proxy's cluster.
     pub(in crate::models) proxy: usize,
-    /// Path and window of the proxy.
+    /// Path and temporal window of the proxy.
     pub(in crate::models) line: &'a LinearPath,
     /// Time stamp of the frame.
     pub(in crate::models) time: f64,
@@ -130,11 +130,11 @@ pub(in crate::models) fn match_proxies(
 /// Sums over the frames of one proxy, where m is its window and α the opacity of its moment match.
 #[derive(Debug, Clone, Default)]
 struct FrameSums {
-    /// Σ m·α.
+    /// Sum of m·α over the frames.
     product: f64,
-    /// Σ m².
+    /// Sum of m² over the frames.
     square: f64,
-    /// Sum of the covariances, each weighted by m·α.
+    /// Sum over the frames of the spatial covariances, each weighted by m·α.
     covariance: [f64; 6],
 }
 

@@ -57,7 +57,7 @@ pub(super) trait ProxyRule: MotionModel {
         None
     }
 
-    /// Returns notes for the user.
+    /// Returns notes for the user about the motion model; by default none.
     fn notes(&self) -> Vec<String> {
         Vec::new()
     }
@@ -75,13 +75,13 @@ pub(super) struct ModelDescription {
     pub(super) kind: &'static str,
     /// Path of the model folder if the user gave one; `None` if the user gave the checkpoint.
     pub(super) root: Option<PathBuf>,
-    /// Path of the checkpoint.
+    /// Path of the checkpoint file.
     pub(super) file: PathBuf,
     /// Notes for the user.
     pub(super) notes: Vec<String>,
     /// Path of the folder with the training data.
     pub(super) data_folder: Option<String>,
-    /// Whether the training background is white.
+    /// Whether the background of the training images is white.
     pub(super) white_background: bool,
     /// CPU seconds on one core to compute the state of one Gaussian at one frame (`benches/families.rs`).
     pub(super) seconds_per_state: f64,

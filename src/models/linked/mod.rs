@@ -62,7 +62,7 @@ struct Origin {
     kind: &'static str,
     /// Size of the original input in bytes.
     bytes: u64,
-    /// Peak bytes of memory while the frames were received or unpacked.
+    /// Peak bytes of memory that receiving or unpacking the frames took.
     memory: u64,
 }
 

@@ -54,7 +54,7 @@ struct NodeMotion {
     nodes: Option<CachedNodes>,
 }
 
-/// Control nodes with cached network outputs.
+/// Control nodes of a model, and network outputs for them that were computed before.
 #[derive(Debug)]
 struct CachedNodes {
     nodes: Nodes,

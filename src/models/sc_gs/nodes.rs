@@ -94,7 +94,7 @@ impl Nodes {
         AttributeValues::from_planes(3, planes.collect())
     }
 
-    /// Appends the nodes that move Gaussian `row` of `raw` to `out`, nearest first.
+    /// Appends to `out` the K nodes that move the Gaussian in row `row` of `raw`, nearest first, with their weights.
     pub(super) fn shares(&self, raw: &StoredParams, row: usize, out: &mut Vec<Share>) {
         let mut at: Vec<f32> = raw.gaussians.position.row::<3>(row).to_vec();
         at.extend((0..self.features()).map(|k| raw.own.plane(k)[row]));

@@ -19,11 +19,11 @@ const HIDDEN: usize = 6;
 /// Function applied to a color as the last step.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum ColorActivation {
-    /// Logistic function.
+    /// Logistic function, 1/(1 + exp(−x)).
     Sigmoid,
     /// Clamp to the range from 0 to 1.
     Clamp,
-    /// Identity.
+    /// Identity: the color stays unchanged.
     None,
 }
 
@@ -111,7 +111,7 @@ pub(crate) mod tests {
     use crate::deform::Tensor;
     use crate::model::opacity;
 
-    /// Returns the weights of a small network as in a state dict.
+    /// Returns the weights of a small network in the form of a state dict.
     pub(in super::super) fn weights() -> Tensors {
         let ramp = |n: usize, by: f32| (0..n).map(|i| by * ((i * 7 % 11) as f32 - 5.0)).collect::<Vec<f32>>();
         [

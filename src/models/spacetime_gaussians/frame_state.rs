@@ -61,7 +61,7 @@ impl SpacetimeMotion {
 /// [`StoredParams::gaussians`], computed without the network.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Spacetime {
-    /// Whether pixel colors are computed from features by a network (full model).
+    /// Whether this is the full model, where a network computes pixel colors from features.
     pub(super) is_full: bool,
     /// Network that computes pixel colors; `None` if it is not known.
     pub(super) decoder: Option<ColorDecoder>,

@@ -76,7 +76,7 @@ pub(super) fn has_marker_property(path: &Path) -> bool {
     read && header.windows(MARKER_PROPERTY.len()).any(|bytes| bytes == MARKER_PROPERTY.as_bytes())
 }
 
-/// Paths of the files of a model.
+/// Paths of the files of a SpacetimeGaussians model.
 #[derive(Debug, Clone)]
 struct Files {
     cloud: PathBuf,
@@ -103,7 +103,7 @@ impl Files {
         self.folder.as_ref().map(|(root, _)| root.join(name)).filter(|path| path.is_file())
     }
 
-    /// Returns the files that a renderer opens in addition to the point cloud file.
+    /// Returns the paths of the files that a renderer opens in addition to the point cloud file.
     fn other_files(&self) -> Vec<PathBuf> {
         self.decoder.clone().into_iter().chain(self.root_file(CFG_ARGS)).collect()
     }
@@ -119,7 +119,7 @@ struct SpacetimeConfig {
 }
 
 impl SpacetimeConfig {
-    /// Reads the `Namespace(…)` of `cfg_args`.
+    /// Reads the used values from the `cfg_args` file at `path`.
     fn read(path: &Path) -> Result<SpacetimeConfig> {
         let text = read_text(path, 1 << 20)?;
         let arguments = parse_call(&text, "Namespace").map_err(|error| error.in_file(path, &text))?;

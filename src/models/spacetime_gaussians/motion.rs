@@ -23,7 +23,7 @@ pub(super) struct SpacetimeMotion {
 }
 
 impl SpacetimeMotion {
-    /// Returns the position at `time`.
+    /// Returns the position at `time`, scene units.
     pub(super) fn position(&self, time: f64) -> [f64; 3] {
         let (dt, [p0, p1, p2, p3]) = (time - self.center, self.path);
         std::array::from_fn(|c| p0[c] + dt * (p1[c] + dt * (p2[c] + dt * p3[c])))

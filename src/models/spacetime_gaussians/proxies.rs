@@ -55,7 +55,7 @@ struct ClusterMembers<'a> {
     model: &'a MotionModelFrames<Spacetime>,
     raw: StoredParams,
     prepared: <Spacetime as MotionModel>::Prepared,
-    /// Weight and motion of each member.
+    /// Weight in the proxy, and motion, of each member.
     motions: Vec<(f64, SpacetimeMotion)>,
     /// Row in `raw` and weight in the proxy of each member.
     rows: Vec<(u32, f64)>,
@@ -64,7 +64,7 @@ struct ClusterMembers<'a> {
 }
 
 impl ClusterMembers<'_> {
-    /// Collects the members of `cluster`.
+    /// Collects the members of `cluster` from `model`.
     fn new<'a>(model: &'a MotionModelFrames<Spacetime>, cluster: &Cluster) -> ClusterMembers<'a> {
         let ids: Vec<u32> = cluster.members.iter().map(|&(id, _)| id).collect();
         let raw = model.raw().pick(&ids);
@@ -202,7 +202,7 @@ fn shape(members: &ClusterMembers<'_>, states: &[Gaussians], times: &[f64], moti
     parts.iter_mut().for_each(|part| part.weight /= total);
     let found = align_axes(&moments(&parts, Some(DVec3::ZERO)), DQuat::IDENTITY);
     let turn = [found.rotation.w, found.rotation.x, found.rotation.y, found.rotation.z];
-    // A quaternion product is linear in either factor, so the quaternion stays linear in time.
+    // The product of two quaternions is linear in each factor, so the quaternion stays linear in time.
     (motion.rotation, motion.omega) = (product(motion.rotation, turn), product(motion.omega, turn));
     found.scales.to_array().map(|scale| scale.max(1e-7).ln())
 }
