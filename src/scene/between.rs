@@ -75,7 +75,7 @@ pub(super) fn meeting_point(cameras: &[Camera]) -> DVec3 {
 }
 
 /// Pseudo-random number generator SplitMix64 (Steele, Lea and Flood, 2014; its mixer is Stafford's variant 13). The
-/// field is the state; the numbers depend on its first value, the seed, only.
+/// field is the state of the generator, at first the seed. The numbers depend on the seed only.
 #[derive(Debug, Clone)]
 pub struct SplitMix64(pub u64);
 
