@@ -130,11 +130,11 @@ pub(in crate::models) fn match_proxies(
 /// Sums over the frames of one proxy, where m is its window and α the opacity of its moment match.
 #[derive(Debug, Clone, Default)]
 struct FrameSums {
-    /// Sum of m·α over the frames.
+    /// Sum over the frames of m·α: window times opacity of the moment match.
     product: f64,
-    /// Sum of m² over the frames.
+    /// Sum over the frames of m², the square of the window.
     square: f64,
-    /// Sum over the frames of the spatial covariances, each weighted by m·α.
+    /// Sum over the frames of the spatial covariances, each weighted by m·α (window times opacity).
     covariance: [f64; 6],
 }
 

@@ -54,7 +54,7 @@ pub struct LinkedFrames {
     origin: Option<Origin>,
 }
 
-/// Where frames came from that were not PLY files of the user.
+/// Origin of frames that were not read from PLY files of the user.
 struct Origin {
     /// Owner of the temporary PLY files of the frames; deletes them when it is dropped.
     _folder: ScratchFolder,

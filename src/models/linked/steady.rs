@@ -134,15 +134,17 @@ impl HeldMeans {
 /// frame.
 pub(super) struct TrackSums {
     sh_width: usize,
-    /// For each track Σ 1 (number of frames), Σ α and Σ α².
+    /// For each track its number of frames, the sum over these frames of the opacity α, and the sum of α².
     opacity: Vec<[f64; 3]>,
-    /// For each track Σ α·v, for each component v of the attributes [`STEADY_COLUMNS`].
+    /// For each track the sum over frames of α·v, where α is the opacity, for each component v of the attributes
+    /// [`STEADY_COLUMNS`].
     values: Vec<f64>,
-    /// For each track Σ α·q/|q|, where q is the quaternion.
+    /// For each track the sum over frames of α·q/|q|, where α is the opacity and q the quaternion.
     rotations: Vec<[f64; 4]>,
-    /// For each track Σ α·v², where v are the log scales.
+    /// For each track the sum over frames of α·v² for the three log scales v, where α is the opacity.
     scales: Vec<[f64; 3]>,
-    /// For each track and color channel Σ α·Σₖ vₖ², where vₖ are the SH coefficients.
+    /// For each track and color channel the sum over frames of α·Σₖ vₖ², where α is the opacity and vₖ are the SH
+    /// coefficients.
     colors: Vec<[f64; 3]>,
     /// First quaternion of each track; later quaternions get the sign nearest to it.
     first: Vec<[f32; 4]>,

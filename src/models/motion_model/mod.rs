@@ -103,7 +103,7 @@ impl<L: MotionModel> MotionModelFrames<L> {
         MotionModelFrames { motion_model: Arc::new(motion_model), raw: Arc::new(raw), info, states: Count::default() }
     }
 
-    /// Returns the motion model.
+    /// Returns the motion model, which computes states from stored parameters.
     pub(super) fn motion_model(&self) -> &L {
         &self.motion_model
     }

@@ -161,7 +161,7 @@ impl ModelFolder {
         ModelFolder { canonical: Arc::new(canonical.into()), info, ..self.clone() }
     }
 
-    /// Returns the model with the deformation field that it has after storage in half precision.
+    /// Returns the model with its deformation field rounded as storage in half precision rounds it.
     ///
     /// # Errors
     /// Fails if the field can no longer be read.
